@@ -1,0 +1,3 @@
+"""On-line accuracy maintenance for industrial robots."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,1 @@
+"""Algorithms: numpy, scipy and numba only, importable without ROS."""
