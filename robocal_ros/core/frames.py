@@ -1,0 +1,85 @@
+"""Rigid transforms as 4 x 4 arrays, batched in the leading dimensions.
+
+``T_a_b`` maps coordinates in frame b to frame a: ``p_a = T_a_b @ p_b``.
+Rotations are scipy's; quaternions are x, y, z, w.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
+    """Assemble (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
+    R = np.asarray(rotation, dtype=np.float64)
+    t = np.asarray(translation, dtype=np.float64)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def transform_from_quat(xyz: ArrayLike, quat_xyzw: ArrayLike) -> Array:
+    """Assemble (..., 4, 4) from positions (..., 3), m, and unit quaternions (..., 4)."""
+    quat = np.asarray(quat_xyzw, dtype=np.float64)
+    R = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix().reshape(*quat.shape[:-1], 3, 3)
+    return transform(R, xyz)
+
+
+def invert(T: Array) -> Array:
+    """Inverse (..., 4, 4) of rigid transforms (..., 4, 4)."""
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
+
+
+def quat_xyzw(T: Array) -> Array:
+    """Unit quaternions (..., 4), w >= 0, of transforms (..., 4, 4) or rotations (..., 3, 3)."""
+    R = T[..., :3, :3]
+    quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
+    quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
+    return np.asarray(quat.reshape(*R.shape[:-2], 4))
+
+
+def exp_rotation(rotvec: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
+    w = np.asarray(rotvec, dtype=np.float64)
+    return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape, 3))
+
+
+def log_rotation(rotation: Array) -> Array:
+    """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3)."""
+    R = np.asarray(rotation, dtype=np.float64)
+    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
+
+
+def skew(v: ArrayLike) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    x = np.asarray(v, dtype=np.float64)
+    S = np.zeros((*x.shape, 3))
+    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -x[..., 2], x[..., 1], -x[..., 0]
+    return np.asarray(S - np.swapaxes(S, -1, -2))
+
+
+def left_jacobian_inverse(rotvec: ArrayLike) -> Array:
+    """Inverse left Jacobian (..., 3, 3) of SO(3) at rotation vectors (..., 3).
+
+    ``log(exp(w) R) = log(R) + J_l^-1(log R) w`` to first order in w
+    (Solà, Deray, Atchuthan 2018, eq. 146).
+    """
+    w = np.asarray(rotvec, dtype=np.float64)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    half = 0.5 * angle
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = np.where(angle < 1e-4, 1.0 / 12.0, (1.0 - half / np.tan(half)) / angle**2)
+    W = skew(w)
+    return np.asarray(np.eye(3) - 0.5 * W + factor * (W @ W))
+
+
+def nearest_rotation(matrix: ArrayLike) -> Array:
+    """Rotation (3, 3) nearest to a matrix in the Frobenius norm, with determinant +1."""
+    U, _, Vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
+    return np.asarray(U @ Vt)

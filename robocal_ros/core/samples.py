@@ -1,0 +1,165 @@
+"""Typed samples: what sensors and the robot deliver, whatever brought them.
+
+The builders accept any object with the attributes of the ROS message, so that live nodes and
+bag readers make the same samples from the same bytes.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import InputError
+
+Array = NDArray[np.float64]
+
+DEFAULT_TARGET = "tool"
+
+
+@dataclass(frozen=True, slots=True)
+class JointSample:
+    """Joint readings at one instant: ``position`` (n,) in rad (prismatic: m)."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    position: Array
+
+
+@dataclass(frozen=True, slots=True)
+class PointSample:
+    """A target's position (3,) in the measuring frame, in m."""
+
+    stamp_ns: int
+    frame: str
+    target: str
+    position_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSample:
+    """A target's pose ``T_frame_target`` (4, 4) in the measuring frame."""
+
+    stamp_ns: int
+    frame: str
+    target: str
+    T_frame_target: Array
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """Joint readings paired with measured positions or poses of named targets on the flange.
+
+    Attributes
+    ----------
+    q : (m, n) joint readings, rad (prismatic: m).
+    position : (m, 3) target position in the measuring frame, m.
+    target : m names; each name is one point (or frame) fixed to the flange.
+    sample : m unique ids, for naming rejected samples.
+    rotation : (m, 3, 3) R_frame_target, or None when only positions were measured.
+    sigma : (m,) standard deviation of each position coordinate, m, or None when unknown.
+    stamp_ns : (m,) int64, or None.
+    """
+
+    q: Array
+    position: Array
+    target: tuple[str, ...]
+    sample: tuple[str, ...]
+    rotation: Array | None = None
+    sigma: Array | None = None
+    stamp_ns: NDArray[np.int64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The distinct target names, in order of first appearance."""
+        return tuple(dict.fromkeys(self.target))
+
+    def target_index(self, targets: tuple[str, ...]) -> NDArray[np.int64]:
+        """Index (m,) of each sample's target in ``targets``."""
+        lookup = {name: i for i, name in enumerate(targets)}
+        unknown = next((name for name in self.target if name not in lookup), None)
+        if unknown is not None:
+            raise InputError(f"target '{unknown}' is not one of {', '.join(targets)}")
+        return np.array([lookup[name] for name in self.target], dtype=np.int64)
+
+    def take(self, rows: NDArray[Any]) -> "Measurements":
+        """Return the samples at ``rows`` (index or boolean mask)."""
+        index = np.arange(len(self))[rows]
+        return Measurements(
+            q=self.q[index],
+            position=self.position[index],
+            target=tuple(self.target[i] for i in index),
+            sample=tuple(self.sample[i] for i in index),
+            rotation=None if self.rotation is None else self.rotation[index],
+            sigma=None if self.sigma is None else self.sigma[index],
+            stamp_ns=None if self.stamp_ns is None else self.stamp_ns[index],
+        )
+
+
+def stamp_ns(stamp: Any) -> int:
+    """Nanoseconds of a ``builtin_interfaces/Time``-like object."""
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def joint_sample(message: Any) -> JointSample:
+    """Build a sample from a ``sensor_msgs/JointState``.
+
+    Raises
+    ------
+    InputError
+        When names and positions differ in number, a name is doubled or a value is not finite.
+    """
+    names = tuple(message.name)
+    position = np.array(message.position, dtype=np.float64)
+    if len(names) != len(position):
+        raise InputError(f"joint state has {len(names)} names but {len(position)} positions")
+    if len(set(names)) != len(names):
+        raise InputError(f"joint state names a joint twice: {', '.join(names)}")
+    if not np.all(np.isfinite(position)):
+        bad = names[int(np.flatnonzero(~np.isfinite(position))[0])]
+        raise InputError(f"joint state of '{bad}' is not finite")
+    return JointSample(stamp_ns(message.header.stamp), names, position)
+
+
+def _frame_and_target(frame_id: str, default_target: str) -> tuple[str, str]:
+    frame, _, target = frame_id.partition("/")
+    return frame, target or default_target
+
+
+def _finite(values: Array, what: str) -> Array:
+    if not np.all(np.isfinite(values)):
+        raise InputError(f"{what} is not finite: {values.tolist()}")
+    return values
+
+
+def point_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PointSample:
+    """Build a sample from a ``geometry_msgs/PointStamped`` (frame_id ``frame[/target]``)."""
+    frame, target = _frame_and_target(message.header.frame_id, default_target)
+    p = message.point
+    position = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured point")
+    return PointSample(stamp_ns(message.header.stamp), frame, target, position)
+
+
+def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSample:
+    """Build a sample from a ``geometry_msgs/PoseStamped`` (frame_id ``frame[/target]``).
+
+    Raises
+    ------
+    InputError
+        When a value is not finite or the quaternion is not of unit length (tolerance 1e-3).
+    """
+    from robocal_ros.core.frames import transform_from_quat
+
+    frame, target = _frame_and_target(message.header.frame_id, default_target)
+    p, o = message.pose.position, message.pose.orientation
+    xyz = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured position")
+    quat = _finite(np.array([o.x, o.y, o.z, o.w], dtype=np.float64), "measured orientation")
+    norm = float(np.linalg.norm(quat))
+    if abs(norm - 1.0) > 1e-3:
+        raise InputError(f"measured orientation has a quaternion of length {norm:.6g}, not 1")
+    return PoseSample(
+        stamp_ns(message.header.stamp), frame, target, transform_from_quat(xyz, quat)
+    )
