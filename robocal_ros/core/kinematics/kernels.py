@@ -1,0 +1,188 @@
+"""Compiled kinematics of serial arms: forward kinematics and Jacobians over many poses.
+
+Every kernel takes ``links`` (n, 9): d, theta, a, cos/sin alpha, cos/sin beta, sign, prismatic
+(see ``pack_links``), and walks the chain
+``Trans(z, d) Rot(z, theta) Trans(x, a) Rot(x, alpha) Rot(y, beta)`` (Hayati's five-parameter
+form) column by column, so that no matrix product is formed. Angles in rad, lengths in m.
+"""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+def pack_links(mdh: Array, sign: Array, prismatic: NDArray[np.bool_]) -> Array:
+    """Constants of each joint for the kernels: (n, 9) from ``mdh`` (n, 5)."""
+    d, theta, a, alpha, beta = mdh.T
+    trig = (np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta))
+    return np.ascontiguousarray(
+        np.stack((d, theta, a, *trig, sign, prismatic.astype(np.float64)), axis=1)
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> None:
+    """Forward kinematics that keeps each joint's axes.
+
+    ``frames`` (n, 5, 3) receives per joint: z of the joint axis and its point, x of the link
+    (after theta), the link frame's origin, and the y axis about which beta turns.
+    """
+    x0, x1, x2 = T_root[0, 0], T_root[1, 0], T_root[2, 0]
+    y0, y1, y2 = T_root[0, 1], T_root[1, 1], T_root[2, 1]
+    z0, z1, z2 = T_root[0, 2], T_root[1, 2], T_root[2, 2]
+    p0, p1, p2 = T_root[0, 3], T_root[1, 3], T_root[2, 3]
+    for i in range(links.shape[0]):
+        d, theta = links[i, 0], links[i, 1]
+        if links[i, 8] > 0.5:
+            d += links[i, 7] * q[i]
+        else:
+            theta += links[i, 7] * q[i]
+        frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = z0, z1, z2
+        frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = p0, p1, p2
+        c, s = np.cos(theta), np.sin(theta)
+        # fmt: off
+        x0, x1, x2, y0, y1, y2 = (
+            c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2,
+            c * y0 - s * x0, c * y1 - s * x1, c * y2 - s * x2,
+        )
+        # fmt: on
+        a = links[i, 2]
+        p0 += d * z0 + a * x0
+        p1 += d * z1 + a * x1
+        p2 += d * z2 + a * x2
+        frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = x0, x1, x2
+        frames[i, 3, 0], frames[i, 3, 1], frames[i, 3, 2] = p0, p1, p2
+        ca, sa, cb, sb = links[i, 3], links[i, 4], links[i, 5], links[i, 6]
+        # fmt: off
+        y0, y1, y2, z0, z1, z2 = (
+            ca * y0 + sa * z0, ca * y1 + sa * z1, ca * y2 + sa * z2,
+            ca * z0 - sa * y0, ca * z1 - sa * y1, ca * z2 - sa * y2,
+        )
+        # fmt: on
+        frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = y0, y1, y2
+        # fmt: off
+        x0, x1, x2, z0, z1, z2 = (
+            cb * x0 - sb * z0, cb * x1 - sb * z1, cb * x2 - sb * z2,
+            cb * z0 + sb * x0, cb * z1 + sb * x1, cb * z2 + sb * x2,
+        )
+        # fmt: on
+    T_out[0, 0], T_out[0, 1], T_out[0, 2], T_out[0, 3] = x0, y0, z0, p0
+    T_out[1, 0], T_out[1, 1], T_out[1, 2], T_out[1, 3] = x1, y1, z1, p1
+    T_out[2, 0], T_out[2, 1], T_out[2, 2], T_out[2, 3] = x2, y2, z2, p2
+    T_out[3, 0], T_out[3, 1], T_out[3, 2], T_out[3, 3] = 0.0, 0.0, 0.0, 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fk_batch(q: Array, links: Array, T_root: Array, T_out: Array) -> None:
+    """Flange poses (m, 4, 4) of joint vectors (m, n)."""
+    frames = np.empty((links.shape[0], 5, 3))
+    for k in range(q.shape[0]):
+        walk(q[k], links, T_root, frames, T_out[k])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _turn(axis: Array, centre: Array, p0: float, p1: float, p2: float, J: Array, c: int) -> None:
+    """Column ``c`` of ``J``: velocity of p (and, in six rows, the turn) about an axis."""
+    r0, r1, r2 = p0 - centre[0], p1 - centre[1], p2 - centre[2]
+    J[0, c] = axis[1] * r2 - axis[2] * r1
+    J[1, c] = axis[2] * r0 - axis[0] * r2
+    J[2, c] = axis[0] * r1 - axis[1] * r0
+    if J.shape[0] == 6:
+        J[3, c], J[4, c], J[5, c] = axis[0], axis[1], axis[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _slide(axis: Array, J: Array, c: int) -> None:
+    """Column ``c`` of ``J``: translation along an axis."""
+    J[0, c], J[1, c], J[2, c] = axis[0], axis[1], axis[2]
+    if J.shape[0] == 6:
+        J[3, c], J[4, c], J[5, c] = 0.0, 0.0, 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def jacobian_batch(q: Array, links: Array, T_root: Array, T_out: Array, J: Array) -> None:
+    """Flange poses (m, 4, 4) and geometric Jacobians (m, 6, n): [v; w] of the flange in base."""
+    n = links.shape[0]
+    frames = np.empty((n, 5, 3))
+    for k in range(q.shape[0]):
+        walk(q[k], links, T_root, frames, T_out[k])
+        p0, p1, p2 = T_out[k, 0, 3], T_out[k, 1, 3], T_out[k, 2, 3]
+        for i in range(n):
+            if links[i, 8] > 0.5:
+                _slide(frames[i, 0], J[k], i)
+            else:
+                _turn(frames[i, 0], frames[i, 1], p0, p1, p2, J[k], i)
+            if links[i, 7] < 0.0:
+                for r in range(6):
+                    J[k, r, i] = -J[k, r, i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def parameter_batch(
+    q: Array,
+    links: Array,
+    T_root: Array,
+    tools: Array,
+    target: Index,
+    slot: Index,
+    base_column: int,
+    tool_column: Index,
+    T_out: Array,
+    J: Array,
+) -> None:
+    """Target poses and their derivatives by model, base and tool parameters.
+
+    ``tools`` (t, 4, 4) T_flange_target; ``target`` (m,) index into it; ``slot`` (n, 5) column of
+    each (d, theta, a, alpha, beta) or -1; ``base_column`` first of six columns (translation of
+    the root, turn about it, both in the measuring frame) or -1; ``tool_column`` (t,) first of
+    three columns (six when ``J`` has six rows) in flange axes, or -1. ``T_out`` (m, 4, 4) is
+    T_frame_target; ``J`` (m, 3 or 6, k), zeroed by the caller, is its twist [v; w] at the target.
+    """
+    n = links.shape[0]
+    rows = J.shape[1]
+    frames = np.empty((n, 5, 3))
+    T_flange = np.empty((4, 4))
+    root = T_root[:3, 3].copy()
+    for k in range(q.shape[0]):
+        walk(q[k], links, T_root, frames, T_flange)
+        tool = tools[target[k]]
+        for r in range(3):
+            for c in range(4):
+                value = T_flange[r, 3] if c == 3 else 0.0
+                for j in range(3):
+                    value += T_flange[r, j] * tool[j, c]
+                T_out[k, r, c] = value
+        T_out[k, 3, 0], T_out[k, 3, 1], T_out[k, 3, 2], T_out[k, 3, 3] = 0.0, 0.0, 0.0, 1.0
+        p0, p1, p2 = T_out[k, 0, 3], T_out[k, 1, 3], T_out[k, 2, 3]
+        Jk = J[k]
+        for i in range(n):
+            f = frames[i]
+            if slot[i, 0] >= 0:
+                _slide(f[0], Jk, slot[i, 0])
+            if slot[i, 1] >= 0:
+                _turn(f[0], f[1], p0, p1, p2, Jk, slot[i, 1])
+            if slot[i, 2] >= 0:
+                _slide(f[2], Jk, slot[i, 2])
+            if slot[i, 3] >= 0:
+                _turn(f[2], f[3], p0, p1, p2, Jk, slot[i, 3])
+            if slot[i, 4] >= 0:
+                _turn(f[4], f[3], p0, p1, p2, Jk, slot[i, 4])
+        if base_column >= 0:
+            r0, r1, r2 = p0 - root[0], p1 - root[1], p2 - root[2]
+            b = base_column
+            Jk[0, b], Jk[1, b + 1], Jk[2, b + 2] = 1.0, 1.0, 1.0
+            Jk[1, b + 3], Jk[2, b + 3] = -r2, r1
+            Jk[0, b + 4], Jk[2, b + 4] = r2, -r0
+            Jk[0, b + 5], Jk[1, b + 5] = -r1, r0
+            if rows == 6:
+                Jk[3, b + 3], Jk[4, b + 4], Jk[5, b + 5] = 1.0, 1.0, 1.0
+        t = tool_column[target[k]]
+        if t >= 0:
+            for r in range(3):
+                for c in range(3):
+                    Jk[r, t + c] = T_flange[r, c]
+                    if rows == 6:
+                        Jk[3 + r, t + 3 + c] = T_flange[r, c]
