@@ -89,8 +89,10 @@ class SerialArm:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def with_mdh(self, mdh: ArrayLike) -> "SerialArm":
-        """Return the same arm with other model parameters (n, 5)."""
-        return replace(self, mdh=np.asarray(mdh, dtype=np.float64))
+        """Return the same arm with other model parameters (n, 5) and the same free ones."""
+        arm = replace(self, mdh=np.asarray(mdh, dtype=np.float64))
+        arm.__dict__["parameters"] = self.parameters
+        return arm
 
     def _batch(self, q: ArrayLike) -> tuple[Array, tuple[int, ...]]:
         joints = np.asarray(q, dtype=np.float64)

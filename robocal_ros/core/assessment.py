@@ -1,0 +1,145 @@
+"""Is it good, in mm? Errors on data not used to solve, and the decision with its reason."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import TooFewSamplesError
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+SAME_POSE_RAD = 1e-3
+FEWEST_GROUPS = 5
+SIGNIFICANCE = 0.05
+LARGEST_RMS_M = 5e-3
+
+
+@dataclass(frozen=True)
+class ErrorSummary:
+    """Distances between predicted and measured points, m."""
+
+    mean_m: float
+    rms_m: float
+    p95_m: float
+    max_m: float
+    n: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A decision and why."""
+
+    code: Code
+    reason: str
+
+    @property
+    def accept(self) -> bool:
+        """Whether the candidate may be accepted."""
+        return self.code is Code.ACCEPT
+
+
+def summarise(error: Array) -> ErrorSummary:
+    """Summarise distances (m,) or error vectors (m, 3)."""
+    e = np.linalg.norm(error, axis=1) if error.ndim == 2 else error
+    return ErrorSummary(
+        float(e.mean()),
+        float(np.sqrt(np.mean(e**2))),
+        float(np.quantile(e, 0.95)),
+        float(e.max()),
+        len(e),
+    )
+
+
+def pose_groups(q: Array) -> Index:
+    """Group number (m,) of each joint vector: visits of one pose share a group.
+
+    Two readings belong together when all joints agree within 1e-3 rad (0.06 deg; or 1 mm).
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(q).query_pairs(SAME_POSE_RAD, p=np.inf, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(q),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def hold_out(groups: Index, share: float, seed: int) -> NDArray[np.bool_]:
+    """Mark the samples (m,) to hold out: whole groups, about ``share`` of them.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When fewer than two groups are there.
+    """
+    count = int(groups.max()) + 1 if len(groups) else 0
+    if count < 2:
+        raise TooFewSamplesError(
+            f"{len(groups)} samples of {count} distinct pose(s) cannot be split: measure more poses"
+        )
+    held = int(np.clip(round(share * count), 1, count - 1))
+    chosen = np.random.default_rng(seed).permutation(count) < held
+    return np.asarray(chosen[groups])
+
+
+def judge(
+    current: Array, candidate: Array, groups: Index, predicted_rms_m: float | None = None
+) -> Verdict:
+    """Decide whether a candidate replaces the model in force.
+
+    Parameters
+    ----------
+    current, candidate : (m,) distances, m, at the same samples, none used to solve.
+    groups : (m,) pose group of each sample; visits of one pose count once.
+    predicted_rms_m : error of the candidate's prediction from its covariance, rms over the
+        same samples.
+
+    The gain in squared error must be positive at 5 % significance (one-sided t over groups).
+    """
+    before, after = summarise(current), summarise(candidate)
+    what = (
+        f"held-out rms {after.rms_m * 1e3:.3f} mm (mean {after.mean_m * 1e3:.3f}) against "
+        f"{before.rms_m * 1e3:.3f} mm (mean {before.mean_m * 1e3:.3f}) of the model in force"
+    )
+    _, group = np.unique(groups, return_inverse=True)
+    size = np.bincount(group)
+    gain = np.bincount(group, current**2 - candidate**2) / size
+    if len(gain) < FEWEST_GROUPS:
+        return Verdict(
+            Code.TOO_FEW_SAMPLES,
+            f"{len(gain)} held-out poses cannot judge: at least {FEWEST_GROUPS} are needed; {what}",
+        )
+    if after.rms_m > LARGEST_RMS_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{what}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
+            "robot file, units, joint signs and target names",
+        )
+    if predicted_rms_m is not None and predicted_rms_m > before.rms_m:
+        return Verdict(
+            Code.POSES_NOT_INFORMATIVE,
+            f"the measured poses predict these ones only to {predicted_rms_m * 1e3:.3f} mm rms, "
+            f"no better than the model in force ({before.rms_m * 1e3:.3f} mm); {what}",
+        )
+    if after.rms_m >= before.rms_m or after.mean_m >= before.mean_m:
+        return Verdict(Code.WORSE_THAN_CURRENT, what)
+    p = _one_sided_p(gain)
+    if p > SIGNIFICANCE:
+        return Verdict(
+            Code.NO_SIGNIFICANT_GAIN, f"{what}; chance alone would give this in {p:.0%} of cases"
+        )
+    return Verdict(Code.ACCEPT, what)
+
+
+def _one_sided_p(gain: Array) -> float:
+    """Chance of a mean this large where the true mean gain is zero (Student's t)."""
+    from scipy.special import stdtr
+
+    spread = float(np.std(gain, ddof=1))
+    if spread == 0.0:
+        return 0.0 if gain.mean() > 0.0 else 1.0
+    t = float(gain.mean()) / (spread / np.sqrt(len(gain)))
+    return float(1.0 - stdtr(len(gain) - 1, t))

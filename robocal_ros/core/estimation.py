@@ -1,0 +1,312 @@
+"""Robust maximum likelihood and maximum a posteriori estimation on manifolds.
+
+Gauss-Newton with Levenberg damping over a problem that linearises itself. A first pass with
+Huber's loss finds a scale that outliers cannot inflate; samples beyond it are rejected by name
+and the rest is solved by plain (efficient) least squares.
+"""
+
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
+
+Array = NDArray[np.float64]
+S = TypeVar("S")
+
+RANK_TOLERANCE = 1e-8  # of the largest singular value, columns scaled to unit length
+FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
+MOST_ITERATIONS = 50
+STEP_TOLERANCE = 1e-4  # of a standard deviation
+SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
+
+
+class Problem(Protocol[S]):
+    """Residuals of m samples with c components each, linearised at a state."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names (k) of the increments, for reports."""
+
+    def linearise(self, state: S) -> tuple[Array, Array]:
+        """Residual (m, c), prediction minus measurement over sigma, and Jacobian (m, c, k)."""
+
+    def retract(self, state: S, step: Array) -> S:
+        """Move the state by an increment (k,)."""
+
+    @property
+    def scale_components(self) -> int:
+        """How many of the c components tell the noise when it is unknown (the first ones)."""
+
+    def deviation(self, state: S) -> Array:
+        """Distance (k,) of the state from the prior's mean; zero where the prior is flat."""
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What the data alone determine, with every column scaled to unit length.
+
+    Attributes
+    ----------
+    rank, condition : of the scaled Jacobian; the condition leaves out the null space.
+    null : (k, k - rank) unobservable directions in the problem's own units, each of unit
+        length after scaling.
+    """
+
+    rank: int
+    condition: float
+    null: Array
+
+
+@dataclass(frozen=True)
+class Estimate(Generic[S]):
+    """Outcome of ``solve``.
+
+    Attributes
+    ----------
+    state : the estimate.
+    covariance : (k, k) of the increments at the estimate, in the problem's units.
+    scale : standard deviation of the whitened residual: 1 where sigmas were given.
+    residual : (m, c) whitened; ``rejected`` (m,) marks samples not used.
+    """
+
+    state: S
+    names: tuple[str, ...]
+    covariance: Array
+    scale: float
+    residual: Array
+    rejected: NDArray[np.bool_]
+    observability: Observability
+    iterations: int
+    converged: bool
+
+
+def observability(jacobian: Array) -> Observability:
+    """Rank, condition and null space of a Jacobian (N, k)."""
+    length = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(length > 0.0, length, 1.0)
+    triangle = np.linalg.qr(jacobian / scale, mode="r")
+    _, s, Vt = np.linalg.svd(triangle)
+    s = np.concatenate([s, np.zeros(Vt.shape[0] - len(s))])
+    rank = int(np.sum(s > RANK_TOLERANCE * max(s[0], np.finfo(float).tiny)))
+    condition = float(s[0] / s[rank - 1]) if rank else np.inf
+    return Observability(rank, condition, _sparse(Vt[rank:].T) / scale[:, None])
+
+
+def _sparse(null: Array) -> Array:
+    """Basis (k, r) of the same space in which r unknowns appear in one direction each."""
+    chosen: list[int] = []
+    rest = null.copy()
+    for _ in range(null.shape[1]):
+        pivot = int(np.argmax(np.einsum("ij,ij->i", rest, rest)))
+        chosen.append(pivot)
+        row = rest[pivot] / np.linalg.norm(rest[pivot])
+        rest = rest - np.outer(rest @ row, row)
+    basis = null @ np.linalg.inv(null[chosen]) if chosen else null
+    return np.asarray(basis / np.maximum(np.linalg.norm(basis, axis=0), np.finfo(float).tiny))
+
+
+def describe(direction: Array, names: tuple[str, ...], size: Array | None = None) -> str:
+    """Put a direction (k,) into words: the members above a tenth of the largest, with weights.
+
+    ``size`` (k,) scales the members so that lengths and angles compare.
+    """
+    weight = direction if size is None else direction * size
+    weight = weight / np.max(np.abs(weight))
+    order = [int(i) for i in np.argsort(-np.abs(weight)) if abs(weight[i]) > 0.1]
+    sign = np.sign(weight[order[0]])
+    terms = [f"{sign * weight[i]:+.2g} {names[i]}" for i in order[:6]]
+    return " ".join(terms).removeprefix("+1 ") + (" …" if len(order) > 6 else "")
+
+
+def chi2_quantile(probability: float, dof: int) -> float:
+    """Quantile of the chi-square distribution."""
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(0.5 * dof, probability))
+
+
+def solve(
+    problem: Problem[S],
+    start: S,
+    *,
+    prior_information: Array | None = None,
+    noise_known: bool = True,
+    robust: bool = True,
+) -> Estimate[S]:
+    """Find the most likely state.
+
+    Parameters
+    ----------
+    prior_information : (k, k) inverse covariance of the prior, or None for a flat one.
+    noise_known : whether residuals are in units of their true sigma; otherwise a common scale
+        is estimated with them.
+    robust : whether to look for outliers.
+
+    Raises
+    ------
+    TooFewSamplesError
+        Without a prior, fewer equations than unknowns.
+    RankDeficientError
+        Without a prior, when the data leave a direction undetermined.
+    """
+    residual, jacobian = problem.linearise(start)
+    m, c, k = jacobian.shape
+    flat = prior_information is None
+    if flat:
+        if m * c < k:
+            raise TooFewSamplesError(f"{m} samples give {m * c} equations for {k} unknowns")
+        _require_full_rank(observability(jacobian.reshape(-1, k)), problem.names)
+    prior = np.zeros((k, k)) if prior_information is None else prior_information
+    descent = _Descent(problem, prior, 0 if noise_known else problem.scale_components)
+    keep = np.ones(m, dtype=np.bool_)
+    run = _Run(start, residual, jacobian, 0, False)
+    if robust:
+        run = descent.run(run, keep, huber=float(np.sqrt(chi2_quantile(0.95, c))))
+        keep = descent.inliers(run, keep)
+    for _ in range(10):
+        run = descent.run(run, keep)
+        update = descent.inliers(run, keep) if robust else keep
+        if np.array_equal(update, keep):
+            break
+        keep = update
+    seen = observability(run.jacobian[keep].reshape(-1, k))
+    if flat:
+        _require_full_rank(seen, problem.names)
+    scale = descent.plain_scale(run.residual, keep)
+    return Estimate(
+        state=run.state,
+        names=problem.names,
+        covariance=descent.posterior(run, keep, scale),
+        scale=scale,
+        residual=run.residual,
+        rejected=~keep,
+        observability=seen,
+        iterations=run.iterations,
+        converged=run.converged,
+    )
+
+
+def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:
+    if seen.null.shape[1]:
+        words = [describe(column, names) for column in seen.null.T]
+        raise RankDeficientError(
+            f"the data determine {seen.rank} of {len(names)} unknowns; not determined: "
+            + "; ".join(words),
+            words,
+        )
+
+
+@dataclass(frozen=True)
+class _Run(Generic[S]):
+    state: S
+    residual: Array
+    jacobian: Array
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True)
+class _Descent(Generic[S]):
+    """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known."""
+
+    problem: Problem[S]
+    prior: Array
+    scale_components: int
+
+    def run(self, run: _Run[S], keep: NDArray[np.bool_], huber: float = np.inf) -> _Run[S]:
+        """Minimise the (Huber) cost until a step is far below a standard deviation."""
+        k = run.jacobian.shape[2]
+        state, residual, jacobian = run.state, run.residual, run.jacobian
+        damping = 0.0
+        for iteration in range(1, MOST_ITERATIONS + 1):
+            scale = self._scale(residual, keep, huber)
+            normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
+            while True:
+                step = _damped_step(normal, gradient, damping)
+                trial = self.problem.retract(state, step)
+                new_residual, new_jacobian = self.problem.linearise(trial)
+                small = float(step @ normal @ step) < STEP_TOLERANCE**2 * k
+                if small or self._cost(trial, new_residual, keep, scale, huber) <= cost:
+                    break
+                damping = max(10.0 * damping, 1e-4)
+            state, residual, jacobian = trial, new_residual, new_jacobian
+            damping /= 10.0
+            if small:
+                break
+        return _Run(state, residual, jacobian, run.iterations + iteration, small)
+
+    def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: float) -> float:
+        return self.plain_scale(residual, keep) if huber == np.inf else self.robust_scale(residual, keep)
+
+    def plain_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
+        """Standard deviation of the kept residuals, unknowns counted; 1 where it is known."""
+        if not self.scale_components:
+            return 1.0
+        used = residual[keep, : self.scale_components]
+        freedom = max(used.size - len(self.problem.names), 1)
+        return max(float(np.sqrt(np.sum(used**2) / freedom)), SMALLEST_SCALE)
+
+    def robust_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
+        """The same from the median, which outliers cannot inflate."""
+        if not self.scale_components:
+            return 1.0
+        used = residual[keep, : self.scale_components]
+        spread = np.median(np.sum(used**2, axis=1)) / chi2_quantile(0.5, self.scale_components)
+        spread *= used.size / max(used.size - len(self.problem.names), 1)
+        return max(float(np.sqrt(spread)), SMALLEST_SCALE)
+
+    def _normal(
+        self,
+        state: S,
+        residual: Array,
+        jacobian: Array,
+        keep: NDArray[np.bool_],
+        scale: float,
+        huber: float,
+    ) -> tuple[Array, Array, float]:
+        distance = np.linalg.norm(residual, axis=1)
+        pull = np.minimum(1.0, huber * scale / np.maximum(distance, np.finfo(float).tiny))
+        root = np.sqrt(np.where(keep, pull, 0.0)) / scale
+        J = (jacobian * root[:, None, None]).reshape(-1, jacobian.shape[2])
+        gradient = J.T @ (residual * root[:, None]).ravel()
+        gradient += self.prior @ self.problem.deviation(state)
+        return J.T @ J + self.prior, gradient, self._cost(state, residual, keep, scale, huber)
+
+    def _cost(
+        self, state: S, residual: Array, keep: NDArray[np.bool_], scale: float, huber: float
+    ) -> float:
+        distance = np.linalg.norm(residual[keep], axis=1) / scale
+        near = np.minimum(distance, huber)
+        away = self.problem.deviation(state)
+        return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
+
+    def posterior(self, run: _Run[S], keep: NDArray[np.bool_], scale: float) -> Array:
+        """Covariance (k, k) of the unknowns."""
+        J = run.jacobian[keep].reshape(-1, run.jacobian.shape[2]) / scale
+        information = J.T @ J + self.prior
+        unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        inverse = np.linalg.inv(information * np.outer(unit, unit))
+        return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
+
+    def inliers(self, run: _Run[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Samples whose residual fits its own predicted covariance (studentised, chi-square)."""
+        m, c, _ = run.jacobian.shape
+        scale = self.robust_scale(run.residual, keep)
+        J = run.jacobian
+        spread = J @ self.posterior(run, keep, scale) @ np.swapaxes(J, 1, 2)
+        sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
+        expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
+        whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
+        inlier = np.sum(run.residual * whitened, axis=1) < chi2_quantile(1.0 - FALSE_REJECTION / m, c)
+        enough = 2 * np.sum(inlier) > m
+        return np.asarray(inlier) if enough else keep
+
+
+def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+    scaled = normal * np.outer(scale, scale)
+    scaled[np.diag_indices_from(scaled)] += damping
+    return np.asarray(np.linalg.solve(scaled, -gradient * scale) * scale)

@@ -1,0 +1,230 @@
+"""Base, targets and model parameters from measurements: least squares or maximum a posteriori."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import estimation
+from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.core.identification.cell import CellModel, CellProblem, Layout, make_layout
+from robocal_ros.core.identification.start import linear_start
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+
+Array = NDArray[np.float64]
+Part = Literal["base", "tool", "geometry"]
+Method = Literal["map", "lsq"]
+
+# Spread of a new robot's parameters about the nominal ones: machining and mastering tolerances.
+TOLERANCE_LENGTH_M = 3e-3
+TOLERANCE_ANGLE_RAD = float(np.radians(0.5))
+_STILL_RAD = float(np.radians(5.0))
+_SHORTEST_LEVER_M = 0.05
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified cell model with its uncertainty.
+
+    Attributes
+    ----------
+    nominal : the arm that was started from.
+    cell : the identified model, base and targets.
+    held : model parameters kept at their start because base or targets (or other parameters)
+        have the same effect on every measurement.
+    unobservable : directions, in words, that the data leave to the prior or to ``held``.
+    """
+
+    nominal: SerialArm
+    cell: CellModel
+    layout: Layout
+    method: Method
+    estimate: estimation.Estimate[CellModel]
+    held: tuple[str, ...]
+    unobservable: tuple[str, ...]
+    rejected: tuple[str, ...]
+
+    def sigma(self) -> dict[str, float]:
+        """Standard deviation, SI, of each unknown by name."""
+        spread = np.sqrt(np.diag(self.estimate.covariance))
+        return dict(zip(self.layout.names, spread.tolist(), strict=True))
+
+    def predicted_variance(
+        self, q: Array, target: NDArray[np.int64], without: Collection[Part] = ()
+    ) -> Array:
+        """Covariance (m, 3, 3), m^2, of the predicted target positions.
+
+        ``without``: parts whose share is projected out because they are solved anew elsewhere.
+        """
+        _, J = self.layout.jacobian(self.cell, np.ascontiguousarray(q), target)
+        J = np.ascontiguousarray(J[:, :3])
+        refitted = self._columns(without)
+        if np.any(refitted):
+            own = J[:, :, refitted].reshape(-1, int(np.sum(refitted)))
+            rows = J.reshape(-1, J.shape[2])
+            rows = rows - own @ np.linalg.lstsq(own, rows, rcond=None)[0]
+            J = rows.reshape(J.shape)
+        return np.asarray(J @ self.estimate.covariance @ np.swapaxes(J, 1, 2))
+
+    def _columns(self, parts: Collection[Part]) -> NDArray[np.bool_]:
+        """Mask (k,) of the unknowns that belong to base or tool."""
+        mask = np.zeros(len(self.layout.names), dtype=np.bool_)
+        if "base" in parts and self.layout.base >= 0:
+            mask[self.layout.base : self.layout.base + 6] = True
+        if "tool" in parts and self.layout.tool[0] >= 0:
+            mask[self.layout.tool[0] :] = True
+        return mask
+
+
+def default_prior(arm: SerialArm) -> Array:
+    """Variances (k,) of the free parameters of an arm as built."""
+    return np.where(arm.parameters.is_length, TOLERANCE_LENGTH_M, TOLERANCE_ANGLE_RAD) ** 2
+
+
+def identify(
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    fit: Collection[Part] = ("base", "tool", "geometry"),
+    method: Method = "map",
+    prior_covariance: Array | None = None,
+    start: CellModel | None = None,
+    robust: bool = True,
+) -> Identification:
+    """Identify the parts named in ``fit``.
+
+    Parameters
+    ----------
+    arm : nominal arm; the mean of the prior.
+    data : m samples of one or several targets; poses when ``data.rotation`` is given.
+    method : ``map`` keeps every free parameter, with a Gaussian prior about the nominal one;
+        ``lsq`` has no prior and holds parameters whose effect base or targets have too.
+    prior_covariance : (k, k) of the arm's free parameters, SI; default: building tolerances.
+    start : known base and targets; where a part of them is not in ``fit`` it is held there.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer; the message names the missing motion.
+    """
+    parts = frozenset(fit)
+    base, tool = "base" in parts, "tool" in parts
+    initial = linear_start(arm, data, base=base, tool=tool) if start is None else start
+    names = arm.parameters.names if "geometry" in parts else ()
+    orientation = data.rotation is not None
+
+    def layout_of(geometry: tuple[str, ...]) -> Layout:
+        return make_layout(
+            arm, initial.targets, geometry=geometry, base=base, tool=tool, orientation=orientation
+        )
+
+    complete = layout_of(names)
+    held: tuple[str, ...] = ()
+    if method == "lsq":
+        held = _redundant(complete, initial, arm, len(names))
+    layout = layout_of(tuple(n for n in names if n not in held)) if held else complete
+    prior = None
+    if method == "map" and names:
+        prior = np.zeros((len(layout.names), len(layout.names)))
+        covariance = np.diag(default_prior(arm)) if prior_covariance is None else prior_covariance
+        prior[: len(names), : len(names)] = np.linalg.inv(covariance)
+    try:
+        estimate, lever = _solve(arm, data, layout, initial, prior, robust)
+    except RankDeficientError as error:
+        raise RankDeficientError(f"{error}{_still_joints(arm, data)}", error.directions) from error
+    return _report(arm, data, estimate, layout, complete, method, held, lever)
+
+
+def _solve(
+    arm: SerialArm,
+    data: Measurements,
+    layout: Layout,
+    initial: CellModel,
+    prior: Array | None,
+    robust: bool,
+) -> tuple[estimation.Estimate[CellModel], float]:
+    """Solve; an orientation error counts as what it moves over the target's own distance.
+
+    Unmodelled bending and eccentricity shift and tilt the flange together, so orientations
+    measured finely add less than their noise suggests; where they scatter more than that,
+    their own scatter is their weight.
+    """
+    sigma = np.ones(len(data)) if data.sigma is None else data.sigma
+    reach = float(np.linalg.norm(initial.T_flange_target[:, :3, 3], axis=1).mean())
+    lever, state = max(reach, _SHORTEST_LEVER_M), initial
+    while True:
+        problem = CellProblem(layout, data, initial.targets, sigma, lever, arm.mdh)
+        estimate = estimation.solve(
+            problem,
+            state,
+            prior_information=prior,
+            noise_known=data.sigma is not None,
+            robust=robust,
+        )
+        if layout.tool_size == 3:
+            return estimate, lever
+        used = estimate.residual[~estimate.rejected]
+        excess = float(np.sqrt(np.mean(used[:, 3:] ** 2) / np.mean(used[:, :3] ** 2)))
+        if excess < 1.1:
+            return estimate, lever
+        lever, state = lever / excess, estimate.state
+
+
+def _random_postures(arm: SerialArm, count: int = 60) -> Array:
+    rng = np.random.default_rng(0)
+    span = np.where(arm.prismatic, 0.5, np.pi)
+    lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
+    upper = np.where(np.isfinite(arm.upper), arm.upper, span)
+    return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
+
+
+def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> tuple[str, ...]:
+    """Model parameters whose effect base, targets or earlier parameters have at every posture."""
+    q = _random_postures(arm)
+    blocks = [
+        layout.jacobian(cell, q, np.full(len(q), t, dtype=np.int64))[1]
+        for t in range(len(cell.targets))
+    ]
+    J = np.vstack(blocks).reshape(-1, len(layout.names))
+    order = [*range(count, J.shape[1]), *range(count)]
+    J = J[:, order] / np.linalg.norm(J[:, order], axis=0)
+    dependent = np.abs(np.diag(np.linalg.qr(J, mode="r"))) < 1e-9
+    return tuple(layout.names[i] for i, d in zip(order, dependent, strict=True) if d)
+
+
+def _still_joints(arm: SerialArm, data: Measurements) -> str:
+    span = np.ptp(data.q, axis=0)
+    still = [
+        f"{name} moves only {np.degrees(s):.2g} deg"
+        for name, s, slides in zip(arm.joint_names, span, arm.prismatic, strict=True)
+        if s < _STILL_RAD and not slides
+    ]
+    return f"; in these data {', '.join(still)}: move it" if still else ""
+
+
+def _report(
+    arm: SerialArm,
+    data: Measurements,
+    estimate: estimation.Estimate[CellModel],
+    layout: Layout,
+    complete: Layout,
+    method: Method,
+    held: tuple[str, ...],
+    lever: float,
+) -> Identification:
+    seen = estimate.observability
+    if held:
+        sigma = np.ones(len(data)) if data.sigma is None else data.sigma
+        problem = CellProblem(complete, data, estimate.state.targets, sigma, lever, arm.mdh)
+        _, J = problem.linearise(estimate.state)
+        seen = estimation.observability(J[~estimate.rejected].reshape(-1, J.shape[2]))
+    words = tuple(
+        estimation.describe(column, complete.names, complete.to_display) for column in seen.null.T
+    )
+    rejected = tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected))
+    return Identification(
+        arm, estimate.state, layout, method, estimate, held, words, rejected
+    )
