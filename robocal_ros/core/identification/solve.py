@@ -22,7 +22,9 @@ Method = Literal["map", "lsq"]
 TOLERANCE_LENGTH_M = 3e-3
 TOLERANCE_ANGLE_RAD = float(np.radians(0.5))
 _STILL_RAD = float(np.radians(5.0))
-_SHORTEST_LEVER_M = 0.05
+_ORIENTATION_SHARE = 0.25
+_SHORTEST_LEVER_M = 0.02
+_LEVER_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -146,16 +148,19 @@ def _solve(
     prior: Array | None,
     robust: bool,
 ) -> tuple[estimation.Estimate[CellModel], float]:
-    """Solve; an orientation error counts as what it moves over the target's own distance.
+    """Solve; orientations settle what positions leave open and weigh little beside them.
 
-    Unmodelled bending and eccentricity shift and tilt the flange together, so orientations
-    measured finely add less than their noise suggests; where they scatter more than that,
-    their own scatter is their weight.
+    Unmodelled bending and eccentricity shift and tilt the flange together, so orientations add
+    less than their fine noise suggests: a turn counts as a quarter of what it moves over the
+    target's own distance, and less where orientations scatter more than that.
     """
     sigma = np.ones(len(data)) if data.sigma is None else data.sigma
     reach = float(np.linalg.norm(initial.T_flange_target[:, :3, 3], axis=1).mean())
-    lever, state = max(reach, _SHORTEST_LEVER_M), initial
-    while True:
+    most = max(_ORIENTATION_SHARE * reach, _SHORTEST_LEVER_M)
+    unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm.mdh)
+    lever = _lever(unit.linearise(initial)[0] * sigma[:, None], 1.0, most)
+    state = initial
+    for _ in range(_LEVER_ROUNDS):
         problem = CellProblem(layout, data, initial.targets, sigma, lever, arm.mdh)
         estimate = estimation.solve(
             problem,
@@ -164,13 +169,21 @@ def _solve(
             noise_known=data.sigma is not None,
             robust=robust,
         )
-        if layout.tool_size == 3:
-            return estimate, lever
-        used = estimate.residual[~estimate.rejected]
-        excess = float(np.sqrt(np.mean(used[:, 3:] ** 2) / np.mean(used[:, :3] ** 2)))
-        if excess < 1.1:
-            return estimate, lever
-        lever, state = lever / excess, estimate.state
+        used = (estimate.residual * sigma[:, None])[~estimate.rejected]
+        state, settled = estimate.state, _lever(used, lever, most)
+        if abs(settled / lever - 1.0) < 0.1:
+            break
+        lever = settled
+    return estimate, lever
+
+
+def _lever(residual: Array, lever: float, most: float) -> float:
+    """Length, m, by which a turn counts: ``most``, or the scatters' ratio where that is less."""
+    if residual.shape[1] == 3:
+        return most
+    position = np.median(np.linalg.norm(residual[:, :3], axis=1))
+    turn = np.median(np.linalg.norm(residual[:, 3:], axis=1)) / lever
+    return float(min(most, max(position, 1e-9) / max(turn, 1e-9)))
 
 
 def _random_postures(arm: SerialArm, count: int = 60) -> Array:

@@ -1,0 +1,118 @@
+"""Results as plain documents (JSON), in the units people read: the form that is kept and shown."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.assessment import ErrorSummary, Verdict
+from robocal_ros.core.identification import CellModel, JudgedIdentification
+from robocal_ros.core.kinematics import SerialArm
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+
+
+def transform_document(T: Array) -> Document:
+    """A pose (4, 4) as ``xyz_mm`` and ``quat_xyzw``."""
+    return {"xyz_mm": (T[:3, 3] * 1e3).tolist(), "quat_xyzw": frames.quat_xyzw(T).tolist()}
+
+
+def errors_document(errors: ErrorSummary) -> Document:
+    """Held-out errors in mm."""
+    return {
+        "mean_mm": errors.mean_m * 1e3,
+        "rms_mm": errors.rms_m * 1e3,
+        "p95_mm": errors.p95_m * 1e3,
+        "max_mm": errors.max_m * 1e3,
+        "n": errors.n,
+    }
+
+
+def verdict_document(verdict: Verdict) -> Document:
+    """Decision, its code's name and its reason."""
+    return {"accept": verdict.accept, "code": verdict.code.name, "reason": verdict.reason}
+
+
+def model_document(arm: SerialArm) -> Document:
+    """A model in full precision, SI; ``arm_of`` reads it back to the last bit."""
+    return {
+        "robot": arm.name,
+        "joint_names": list(arm.joint_names),
+        "sign": arm.sign.tolist(),
+        "prismatic": arm.prismatic.tolist(),
+        "mdh": arm.mdh.tolist(),
+        "T_base_root": arm.T_base_root.tolist(),
+    }
+
+
+def arm_of(model: Document, nominal: SerialArm) -> SerialArm:
+    """The nominal arm with the parameters of a model document."""
+    return nominal.with_mdh(np.array(model["mdh"], dtype=np.float64))
+
+
+def cell_document(cell: CellModel) -> Document:
+    """Base and targets of a cell model."""
+    return {
+        "T_frame_base": transform_document(cell.T_frame_base),
+        "T_flange_target": {
+            name: transform_document(T)
+            for name, T in zip(cell.targets, cell.T_flange_target, strict=True)
+        },
+    }
+
+
+def parameters_document(nominal: SerialArm, identified: SerialArm, sigma: dict[str, float]) -> Document:
+    """Nominal value, identified value and standard deviation of every free parameter.
+
+    ``sigma`` in SI by name; a parameter without one was held at its nominal value (null).
+    """
+    chosen = nominal.parameters
+    factor = chosen.to_display
+    rows = zip(
+        chosen.names,
+        (chosen.read(nominal.mdh) * factor).tolist(),
+        (chosen.read(identified.mdh) * factor).tolist(),
+        factor.tolist(),
+        strict=True,
+    )
+    return {
+        name: {
+            "nominal": before,
+            "value": after,
+            "sigma": sigma[name] * unit if name in sigma else None,
+        }
+        for name, before, after, unit in rows
+    }
+
+
+def identification_document(judged: JudgedIdentification) -> Document:
+    """The ``identify`` document: errors before and after, parameters, rank, verdict."""
+    result = judged.identification
+    seen = result.estimate.observability
+    return {
+        "robot": result.nominal.name,
+        "model_hash": result.nominal.model_hash,
+        "method": result.method,
+        "nominal": {"held_out": errors_document(judged.current)},
+        "calibrated": {
+            "held_out": errors_document(judged.candidate),
+            "predicted": {
+                "model_rms_mm": judged.predicted_rms_m * 1e3,
+                "total_rms_mm": judged.predicted_total_rms_m * 1e3,
+            },
+        },
+        "parameters": parameters_document(result.nominal, result.cell.arm, result.sigma()),
+        **cell_document(result.cell),
+        "noise_mm": result.estimate.scale * 1e3,
+        "samples": len(result.estimate.rejected),
+        "rank": seen.rank,
+        "unknowns": len(result.layout.names) + len(result.held),
+        "condition": seen.condition,
+        "unobservable": list(result.unobservable),
+        "held": list(result.held),
+        "rejected": list(result.rejected),
+        "converged": result.estimate.converged,
+        "verdict": verdict_document(judged.verdict),
+    }
