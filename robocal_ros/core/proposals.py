@@ -124,7 +124,7 @@ class Entry(Candidate):
     """A calibration in the history, with where it stands.
 
     ``revision`` is the one under which it was accepted, 0 if never; ``decisions`` are those that
-    name it, oldest first.
+    rejected it or brought it into or out of force, oldest first.
     """
 
     id: int

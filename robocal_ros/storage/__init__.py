@@ -1,0 +1,1 @@
+"""Files: calibration history, bags, tables and robot descriptions."""
