@@ -1,0 +1,45 @@
+"""Package robocal_ros for ament and pip."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "robocal_ros"
+SHARE = Path("share", NAME)
+
+
+def config_files() -> list[tuple[str, list[str]]]:
+    """List every file below config/, folder by folder, with its place in the share folder."""
+    folders: dict[str, list[str]] = {}
+    for path in sorted(Path("config").rglob("*")):
+        if path.is_file():
+            folders.setdefault(str(SHARE / path.parent), []).append(str(path))
+    return list(folders.items())
+
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="On-line accuracy maintenance for industrial robots",
+    license="Apache-2.0",
+    maintainer="robocal_ros maintainers",
+    maintainer_email="maintainers@robocal-ros.example",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={"": ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (str(SHARE), ["package.xml"]),
+        *config_files(),
+    ],
+    python_requires=">=3.11",
+    install_requires=["setuptools"],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": [
+            "robocal = robocal_ros.cli.main:main",
+            "thermal_node = robocal_ros.nodes.thermal_node:main",
+            "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
+            "replay_node = robocal_ros.nodes.replay_node:main",
+        ]
+    },
+)
