@@ -1,0 +1,37 @@
+"""Point the ROS wheels' CMake files at this machine's Python and NumPy headers.
+
+The wheels were built elsewhere and name that machine's paths. Run once with the venv's Python;
+a second run finds nothing to do.
+"""
+
+import sys
+import sysconfig
+from pathlib import Path
+
+import numpy as np
+
+BUILT_AT = "/opt/python/cp311-cp311"
+HERE = {
+    f"{BUILT_AT}/include/python3.11": sysconfig.get_path("include"),
+    f"{BUILT_AT}/lib/python3.11/site-packages/numpy/_core/include": np.get_include(),
+}
+
+
+def mend(share: Path) -> int:
+    """Mend every CMake file under ``share``; return how many were changed."""
+    changed = 0
+    for path in share.rglob("*.cmake"):
+        text = path.read_text()
+        mended = text
+        for there, here in HERE.items():
+            mended = mended.replace(there, here)
+        if BUILT_AT in mended:
+            raise SystemExit(f"{path} names a path of its build machine that is not known here")
+        if mended != text:
+            path.write_text(mended)
+            changed += 1
+    return changed
+
+
+if __name__ == "__main__":
+    print(f"mended {mend(Path(sys.prefix, 'share'))} CMake files")
