@@ -86,7 +86,7 @@ def hold_out(groups: Index, share: float, seed: int) -> NDArray[np.bool_]:
 
 
 def judge(
-    current: Array, candidate: Array, groups: Index, predicted_rms_m: float | None = None
+    current: Array, candidate: Array, groups: Index, uninformative: str = ""
 ) -> Verdict:
     """Decide whether a candidate replaces the model in force.
 
@@ -94,8 +94,7 @@ def judge(
     ----------
     current, candidate : (m,) distances, m, at the same samples, none used to solve.
     groups : (m,) pose group of each sample; visits of one pose count once.
-    predicted_rms_m : error of the candidate's prediction from its covariance, rms over the
-        same samples.
+    uninformative : why the measured poses do not carry over to other ones; empty if they do.
 
     The gain in squared error must be positive at 5 % significance (one-sided t over groups).
     """
@@ -118,14 +117,10 @@ def judge(
             f"{what}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
             "robot file, units, joint signs and target names",
         )
-    if predicted_rms_m is not None and predicted_rms_m > before.rms_m:
-        return Verdict(
-            Code.POSES_NOT_INFORMATIVE,
-            f"the measured poses predict these ones only to {predicted_rms_m * 1e3:.3f} mm rms, "
-            f"no better than the model in force ({before.rms_m * 1e3:.3f} mm); {what}",
-        )
     if after.rms_m >= before.rms_m or after.mean_m >= before.mean_m:
         return Verdict(Code.WORSE_THAN_CURRENT, what)
+    if uninformative:
+        return Verdict(Code.POSES_NOT_INFORMATIVE, f"{uninformative}; {what}")
     p = _one_sided_p(gain)
     if p > SIGNIFICANCE:
         return Verdict(

@@ -9,6 +9,8 @@ from robocal_ros.core import frames
 from robocal_ros.core.assessment import ErrorSummary, Verdict
 from robocal_ros.core.identification import CellModel, JudgedIdentification
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.identification import ColdReference
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -95,17 +97,19 @@ def identification_document(judged: JudgedIdentification) -> Document:
         "robot": result.nominal.name,
         "model_hash": result.nominal.model_hash,
         "method": result.method,
-        "nominal": {"held_out": errors_document(judged.current)},
+        "nominal": {"held_out": errors_document(judged.nominal)},
+        "in_force": {"held_out": errors_document(judged.current)},
         "calibrated": {
             "held_out": errors_document(judged.candidate),
             "predicted": {
                 "model_rms_mm": judged.predicted_rms_m * 1e3,
                 "total_rms_mm": judged.predicted_total_rms_m * 1e3,
+                "workspace_rms_mm": judged.workspace_rms_m * 1e3,
             },
         },
         "parameters": parameters_document(result.nominal, result.cell.arm, result.sigma()),
         **cell_document(result.cell),
-        "noise_mm": result.estimate.scale * 1e3,
+        "noise_mm": result.noise_m * 1e3,
         "samples": len(result.estimate.rejected),
         "rank": seen.rank,
         "unknowns": len(result.layout.names) + len(result.held),
@@ -116,3 +120,35 @@ def identification_document(judged: JudgedIdentification) -> Document:
         "converged": result.estimate.converged,
         "verdict": verdict_document(judged.verdict),
     }
+
+
+def reference_document(reference: ColdReference) -> Document:
+    """A cold reference in full precision, SI; ``reference_of`` reads it back to the last bit."""
+    cell, data = reference.cell, reference.data
+    return {
+        "mdh": cell.arm.mdh.tolist(),
+        "T_frame_base": cell.T_frame_base.tolist(),
+        "targets": list(cell.targets),
+        "T_flange_target": cell.T_flange_target.tolist(),
+        "q": data.q.tolist(),
+        "position": data.position.tolist(),
+        "target": list(data.target),
+        "sample": list(data.sample),
+    }
+
+
+def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
+    """Read a cold reference back from its document."""
+    cell = CellModel(
+        nominal.with_mdh(document["mdh"]),
+        np.array(document["T_frame_base"]),
+        tuple(document["targets"]),
+        np.array(document["T_flange_target"]),
+    )
+    data = Measurements(
+        q=np.array(document["q"]),
+        position=np.array(document["position"]),
+        target=tuple(document["target"]),
+        sample=tuple(document["sample"]),
+    )
+    return ColdReference(cell, data)

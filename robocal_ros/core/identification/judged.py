@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import ErrorSummary, Verdict, judge, pose_groups, summarise
-from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.identification.solve import Identification, Method, Part, identify
+from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 
@@ -23,16 +23,20 @@ class JudgedIdentification:
 
     Attributes
     ----------
-    current, candidate : held-out errors of the model in force and of the identified one.
+    nominal, current, candidate : held-out errors of the nominal model (for a drift: the cold
+        one), of the model in force and of the identified one.
     predicted_rms_m : the candidate's error expected from its covariance alone.
     predicted_total_rms_m : the same with the noise of the measurements added.
+    workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
     """
 
     identification: Identification
+    nominal: ErrorSummary
     current: ErrorSummary
     candidate: ErrorSummary
     predicted_rms_m: float
     predicted_total_rms_m: float
+    workspace_rms_m: float
     verdict: Verdict
 
 
@@ -59,20 +63,52 @@ def identify_and_judge(
         raise InputError("the geometry is what is checked: refit only base and tool")
     result = identify(arm, train, fit=fit, method=method)
     set_up = frozenset(fit) - {"geometry"}
-    rival = identify(arm if in_force is None else in_force, train, fit=set_up, method="map")
-    before = _check_error(rival.cell, check, check_refit)
+    plain = _check_error(_set_up(arm, train, set_up), check, check_refit)
+    before = plain
+    if in_force is not None:
+        before = _check_error(_set_up(in_force, train, set_up), check, check_refit)
     after = _check_error(result.cell, check, check_refit)
-    predicted, total = _predicted(result, train, check, check_refit)
-    verdict = judge(before, after, pose_groups(check.q), predicted)
-    if verdict.accept and not result.estimate.converged:
-        verdict = Verdict(
-            Code.POSES_NOT_INFORMATIVE,
-            f"the solution still crept after {result.estimate.iterations} iterations along "
-            f"directions that the poses hardly show; {verdict.reason}",
-        )
+    predicted, total = _predicted(result, check, check_refit)
+    doubt = uninformative(result, summarise(before).rms_m)
+    verdict = judge(before, after, pose_groups(check.q), doubt)
     return JudgedIdentification(
-        result, summarise(before), summarise(after), predicted, total, verdict
+        identification=result,
+        nominal=summarise(plain),
+        current=summarise(before),
+        candidate=summarise(after),
+        predicted_rms_m=predicted,
+        predicted_total_rms_m=total,
+        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
+        verdict=verdict,
     )
+
+
+def uninformative(result: Identification, current_rms_m: float) -> str:
+    """Say why the poses do not carry over to the workspace; empty when they do.
+
+    The error expected throughout the joint limits must be below the present one, or, with a
+    prior, at most half of what the prior alone leaves.
+    """
+    if not result.estimate.converged:
+        return (
+            f"the solution still crept after {result.estimate.iterations} iterations along "
+            "directions that the poses hardly show"
+        )
+    after = result.workspace_rms(result.estimate.covariance)
+    prior = result.prior_covariance
+    before = np.inf if prior is None else result.workspace_rms(prior)
+    if after <= max(current_rms_m, 0.0 if prior is None else 0.5 * before):
+        return ""
+    so_far = "" if prior is None else f" ({before * 1e3:.3f} mm without any measurement)"
+    return (
+        f"over the whole workspace the measured poses leave {after * 1e3:.3f} mm rms{so_far}: "
+        "spread them and turn every joint, the wrist too"
+    )
+
+
+def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:
+    """Base and targets for a given geometry."""
+    return identify(arm, train, fit=fit).cell if fit else linear_start(arm, train)
 
 
 def _check_error(cell: CellModel, check: Measurements, refit: Collection[Part]) -> Array:
@@ -87,15 +123,15 @@ def _start(cell: CellModel, refit: Collection[Part]) -> CellModel | None:
 
 
 def _predicted(
-    result: Identification, train: Measurements, check: Measurements, refit: Collection[Part]
+    result: Identification, check: Measurements, refit: Collection[Part]
 ) -> tuple[float, float]:
     """Rms error expected at the check poses: of the model, and with measurement noise."""
     known = {name: i for i, name in enumerate(result.cell.targets)}
     target = np.array([known.get(name, 0) for name in check.target], dtype=np.int64)
     variance = result.predicted_variance(check.q, target, without=refit)
     model = float(np.mean(np.trace(variance, axis1=1, axis2=2)))
-    sigma = check.sigma if check.sigma is not None else train.sigma
-    noise = result.estimate.scale if sigma is None else float(np.sqrt(np.mean(sigma**2)))
+    sigma = check.sigma
+    noise = result.noise_m if sigma is None else float(np.sqrt(np.mean(sigma**2)))
     return float(np.sqrt(model)), float(np.sqrt(model + 3.0 * noise**2))
 
 

@@ -1,14 +1,14 @@
 """Base, targets and model parameters from measurements: least squares or maximum a posteriori."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import estimation
-from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.core.errors import RankDeficientError
 from robocal_ros.core.identification.cell import CellModel, CellProblem, Layout, make_layout
 from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
@@ -38,6 +38,8 @@ class Identification:
     held : model parameters kept at their start because base or targets (or other parameters)
         have the same effect on every measurement.
     unobservable : directions, in words, that the data leave to the prior or to ``held``.
+    prior_covariance : (g, g), SI, of the model parameters before the data, or None.
+    noise_m : standard deviation of a measured coordinate, as given or as found.
     """
 
     nominal: SerialArm
@@ -46,8 +48,10 @@ class Identification:
     method: Method
     estimate: estimation.Estimate[CellModel]
     held: tuple[str, ...]
+    prior_covariance: Array | None
     unobservable: tuple[str, ...]
     rejected: tuple[str, ...]
+    noise_m: float
 
     def sigma(self) -> dict[str, float]:
         """Standard deviation, SI, of each unknown by name."""
@@ -61,15 +65,31 @@ class Identification:
 
         ``without``: parts whose share is projected out because they are solved anew elsewhere.
         """
-        _, J = self.layout.jacobian(self.cell, np.ascontiguousarray(q), target)
-        J = np.ascontiguousarray(J[:, :3])
-        refitted = self._columns(without)
-        if np.any(refitted):
-            own = J[:, :, refitted].reshape(-1, int(np.sum(refitted)))
-            rows = J.reshape(-1, J.shape[2])
-            rows = rows - own @ np.linalg.lstsq(own, rows, rcond=None)[0]
-            J = rows.reshape(J.shape)
+        J = self._jacobian(q, target, without)
         return np.asarray(J @ self.estimate.covariance @ np.swapaxes(J, 1, 2))
+
+    def workspace_rms(self, covariance: Array) -> float:
+        """Rms target position error, m, over postures throughout the joint limits.
+
+        ``covariance`` is of the unknowns, or of the leading ones (the model parameters). What
+        another base or target would explain does not count: it belongs to the set-up.
+        """
+        q = random_postures(self.nominal)
+        total = 0.0
+        for t in range(len(self.cell.targets)):
+            J = self._jacobian(q, np.full(len(q), t, dtype=np.int64), ("base", "tool"))
+            rows = J.reshape(-1, J.shape[2])[:, : len(covariance)]
+            total += float(np.einsum("nk,kl,nl->", rows, covariance, rows))
+        return float(np.sqrt(total / (len(q) * len(self.cell.targets))))
+
+    def _jacobian(self, q: Array, target: NDArray[np.int64], without: Collection[Part]) -> Array:
+        """Position rows (m, 3, k); what ``without`` could explain over all of them is removed."""
+        _, J = self.layout.jacobian(self.cell, np.ascontiguousarray(q), target)
+        rows = J[:, :3].reshape(-1, J.shape[2])
+        own = rows[:, self._columns(without)]
+        if own.shape[1]:
+            rows = rows - own @ np.linalg.lstsq(own, rows, rcond=None)[0]
+        return np.asarray(rows.reshape(len(q), 3, -1))
 
     def _columns(self, parts: Collection[Part]) -> NDArray[np.bool_]:
         """Mask (k,) of the unknowns that belong to base or tool."""
@@ -128,7 +148,7 @@ def identify(
     if method == "lsq":
         held = _redundant(complete, initial, arm, len(names))
     layout = layout_of(tuple(n for n in names if n not in held)) if held else complete
-    prior = None
+    prior, covariance = None, None
     if method == "map" and names:
         prior = np.zeros((len(layout.names), len(layout.names)))
         covariance = np.diag(default_prior(arm)) if prior_covariance is None else prior_covariance
@@ -137,7 +157,8 @@ def identify(
         estimate, lever = _solve(arm, data, layout, initial, prior, robust)
     except RankDeficientError as error:
         raise RankDeficientError(f"{error}{_still_joints(arm, data)}", error.directions) from error
-    return _report(arm, data, estimate, layout, complete, method, held, lever)
+    result = _report(arm, data, estimate, layout, complete, method, held, lever)
+    return replace(result, prior_covariance=covariance)
 
 
 def _solve(
@@ -186,7 +207,8 @@ def _lever(residual: Array, lever: float, most: float) -> float:
     return float(min(most, max(position, 1e-9) / max(turn, 1e-9)))
 
 
-def _random_postures(arm: SerialArm, count: int = 60) -> Array:
+def random_postures(arm: SerialArm, count: int = 60) -> Array:
+    """The same postures (count, n) at every call, throughout the joint limits."""
     rng = np.random.default_rng(0)
     span = np.where(arm.prismatic, 0.5, np.pi)
     lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
@@ -196,7 +218,7 @@ def _random_postures(arm: SerialArm, count: int = 60) -> Array:
 
 def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> tuple[str, ...]:
     """Model parameters whose effect base, targets or earlier parameters have at every posture."""
-    q = _random_postures(arm)
+    q = random_postures(arm)
     blocks = [
         layout.jacobian(cell, q, np.full(len(q), t, dtype=np.int64))[1]
         for t in range(len(cell.targets))
@@ -237,7 +259,16 @@ def _report(
     words = tuple(
         estimation.describe(column, complete.names, complete.to_display) for column in seen.null.T
     )
-    rejected = tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected))
+    known = data.sigma
     return Identification(
-        arm, estimate.state, layout, method, estimate, held, words, rejected
+        nominal=arm,
+        cell=estimate.state,
+        layout=layout,
+        method=method,
+        estimate=estimate,
+        held=held,
+        prior_covariance=None,
+        unobservable=words,
+        rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
+        noise_m=estimate.scale if known is None else float(np.sqrt(np.mean(known**2))),
     )

@@ -15,7 +15,9 @@ _SMALLEST_SPREAD = 1e-6  # of the largest singular value: below it a direction i
 _ADVICE = "turn the flange about a second axis between the samples"
 
 
-def linear_start(arm: SerialArm, data: Measurements, *, base: bool, tool: bool) -> CellModel:
+def linear_start(
+    arm: SerialArm, data: Measurements, *, base: bool = False, tool: bool = False
+) -> CellModel:
     """Solve base and targets linearly with the arm's present parameters.
 
     ``R^T p = p_base + c - R_flange p_target`` is linear in R^T (nine numbers), c and p_target;
@@ -80,9 +82,11 @@ def _base_and_points(
         )
     R_base_frame = frames.nearest_rotation(x[:9].reshape(3, 3))
     points = x[12:].reshape(count, 3)
-    T_points = T_base_flange[:, :3, 3] + (T_base_flange[:, :3, :3] @ points[index][..., None])[..., 0]
+    in_base = T_base_flange[:, :3, 3] + np.einsum(
+        "mij,mj->mi", T_base_flange[:, :3, :3], points[index]
+    )
     R = R_base_frame.T
-    return frames.transform(R, centre - R @ T_points.mean(axis=0)), points
+    return frames.transform(R, centre - R @ in_base.mean(axis=0)), np.asarray(points)
 
 
 def _aligned(points: Array, measured: Array) -> Array:

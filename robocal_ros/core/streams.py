@@ -1,0 +1,134 @@
+"""Joint readings by time stamp: interpolation and the standstill check."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import JointSample
+
+Array = NDArray[np.float64]
+
+CLOCK_JUMP_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class StandstillRule:
+    """When a robot counts as standing still around an instant.
+
+    Attributes
+    ----------
+    before_s, after_s : the window about the instant.
+    tolerance_rad : largest range of any joint in the window (prismatic: m).
+    gap_s : longest pause between two joint readings in the window.
+    """
+
+    before_s: float = 0.3
+    after_s: float = 0.1
+    tolerance_rad: float = float(np.radians(0.02))
+    gap_s: float = 0.25
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Joints (n,) interpolated at an instant, and the stamp of the reading that completed it."""
+
+    q: Array
+    ready_ns: int
+
+
+class NotStill(InputError):
+    """The joints cannot be given at that instant; the message says why."""
+
+
+class JointStream:
+    """The latest joint readings of one arm, in its joint order, oldest first.
+
+    Content depends on the readings alone, not on when they arrive between other topics.
+    """
+
+    def __init__(self, joint_names: tuple[str, ...], capacity: int = 16384) -> None:
+        self._names = joint_names
+        self._stamp = np.zeros(2 * capacity, dtype=np.int64)
+        self._q = np.zeros((2 * capacity, len(joint_names)))
+        self._capacity = capacity
+        self._size = 0
+        self._order: dict[tuple[str, ...], NDArray[np.int64]] = {}
+        self.gap_count = 0
+        self.longest_gap_ns = 0
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest reading."""
+        return int(self._stamp[self._size - 1]) if self._size else None
+
+    def add(self, sample: JointSample, gap_ns: int) -> None:
+        """Append a reading; joints may come in any order and beside others.
+
+        A pause longer than ``gap_ns`` is counted. A clock that jumps back by a second or more
+        starts the stream anew.
+
+        Raises
+        ------
+        InputError
+            When a joint is missing, or the stamp is not after the newest one.
+        """
+        order = self._order.get(sample.names)
+        if order is None:
+            order = self._order[sample.names] = self._column_order(sample.names)
+        newest = self.newest_ns
+        if newest is not None and sample.stamp_ns <= newest:
+            if newest - sample.stamp_ns < CLOCK_JUMP_NS:
+                raise InputError(f"joint state at {sample.stamp_ns} ns is not after {newest} ns")
+            self._size = 0
+        elif newest is not None and sample.stamp_ns - newest > gap_ns:
+            self.gap_count += 1
+            self.longest_gap_ns = max(self.longest_gap_ns, sample.stamp_ns - newest)
+        if self._size == len(self._stamp):
+            self._stamp[: self._capacity] = self._stamp[self._capacity :]
+            self._q[: self._capacity] = self._q[self._capacity :]
+            self._size = self._capacity
+        self._stamp[self._size] = sample.stamp_ns
+        self._q[self._size] = sample.position[order]
+        self._size += 1
+
+    def _column_order(self, names: tuple[str, ...]) -> NDArray[np.int64]:
+        missing = [name for name in self._names if name not in names]
+        if missing:
+            raise InputError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names)}")
+        return np.array([names.index(name) for name in self._names], dtype=np.int64)
+
+    def standstill(self, stamp_ns: int, rule: StandstillRule) -> Reading | None:
+        """Joints at an instant at which the robot stands still; None while readings are to come.
+
+        Raises
+        ------
+        NotStill
+            When the robot moved, or readings are missing around the instant.
+        """
+        first_ns = stamp_ns - int(rule.before_s * 1e9)
+        last_ns = stamp_ns + int(rule.after_s * 1e9)
+        stamps = self._stamp[: self._size]
+        if not self._size or stamps[-1] < last_ns:
+            return None
+        low = int(np.searchsorted(stamps, first_ns, side="right")) - 1
+        high = int(np.searchsorted(stamps, last_ns, side="left"))
+        if low < 0:
+            raise NotStill("no joint readings from before the measurement")
+        gap = float(np.max(np.diff(stamps[low : high + 1]))) * 1e-9
+        if gap > rule.gap_s:
+            raise NotStill(f"joint readings pause for {gap:.3f} s (allowed {rule.gap_s:.3f} s)")
+        window = self._q[low : high + 1]
+        spread = np.ptp(window, axis=0)
+        worst = int(np.argmax(spread))
+        if spread[worst] > rule.tolerance_rad:
+            raise NotStill(
+                f"{self._names[worst]} moved by {np.degrees(spread[worst]):.3f} deg "
+                f"(allowed {np.degrees(rule.tolerance_rad):.3f} deg)"
+            )
+        at = int(np.searchsorted(stamps, stamp_ns, side="right"))
+        before, after = int(stamps[at - 1]), int(stamps[min(at, high)])
+        share = 0.0 if after == before else (stamp_ns - before) / (after - before)
+        q = (1.0 - share) * self._q[at - 1] + share * self._q[min(at, high)]
+        return Reading(q, int(stamps[high]))

@@ -1,0 +1,1 @@
+"""Thermal drift of the kinematic model."""

@@ -1,0 +1,177 @@
+"""Drift of the model parameters between a cold reference and a warm visit of the same poses."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import estimation
+from robocal_ros.core.assessment import judge, pose_groups, summarise
+from robocal_ros.core.errors import InputError, TooFewSamplesError
+from robocal_ros.core.identification.cell import CellModel, CellProblem, make_layout
+from robocal_ros.core.identification.judged import JudgedIdentification, uninformative
+from robocal_ros.core.identification.solve import Identification, Method, identify
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+
+Array = NDArray[np.float64]
+
+EXPANSION_PER_K = 12e-6  # steel and cast iron; aluminium links drift up to twice as much
+PLAUSIBLE_WARMING_K = 20.0
+SMALLEST_LENGTH_M = 0.2  # a joint whose nominal length is zero still has a housing that grows
+DRIFT_ANGLE_RAD = float(np.radians(0.005))
+SAME_VISIT_RAD = float(np.radians(0.5))
+
+
+@dataclass(frozen=True)
+class ColdReference:
+    """Cold visit of the measuring poses.
+
+    Attributes
+    ----------
+    cell : the cold model with base and targets as fitted to the cold visit.
+    data : the cold measurements.
+    """
+
+    cell: CellModel
+    data: Measurements
+
+
+def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
+    """Place base and targets from a cold visit with the cold model ``arm``.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        When the visit cannot place them.
+    """
+    return ColdReference(identify(arm, data, fit=("base", "tool"), method="lsq").cell, data)
+
+
+def drift_prior(arm: SerialArm) -> Array:
+    """Covariance (k, k), SI, of the free parameters' thermal drift before it is learned.
+
+    Lengths: link length times expansion coefficient times plausible warming; angles: a fixed
+    small value.
+    """
+    length = np.maximum(np.abs(arm.parameters.read(arm.mdh)), SMALLEST_LENGTH_M)
+    grown = length * EXPANSION_PER_K * PLAUSIBLE_WARMING_K
+    return np.diag(np.where(arm.parameters.is_length, grown, DRIFT_ANGLE_RAD) ** 2)
+
+
+def against_reference(reference: ColdReference, warm: Measurements) -> Measurements:
+    """Warm measurements less the cold residual of the same pose (static errors cancel).
+
+    Poses are the same when all joints agree within 0.5 deg; the joints measured in each visit
+    are used for its own prediction.
+
+    Raises
+    ------
+    InputError
+        When a warm sample has no cold counterpart.
+    """
+    cold = reference.cell.residual(reference.data)
+    position = warm.position.copy()
+    for i in range(len(warm)):
+        same = np.array([t == warm.target[i] for t in reference.data.target], dtype=np.bool_)
+        near = same & (np.max(np.abs(reference.data.q - warm.q[i]), axis=1) < SAME_VISIT_RAD)
+        if not np.any(near):
+            raise InputError(
+                f"sample {warm.sample[i]} of target '{warm.target[i]}' was not measured in the "
+                "cold reference: visit the reference poses, or capture a new reference"
+            )
+        position[i] += cold[near].mean(axis=0)
+    return replace(warm, position=position, rotation=None)
+
+
+def identify_drift(
+    nominal: SerialArm,
+    reference: ColdReference,
+    warm: Measurements,
+    *,
+    sigma_m: float,
+    in_force: SerialArm,
+    method: Method = "map",
+) -> JudgedIdentification:
+    """Identify the drifted model and judge it by leaving out one pose at a time.
+
+    Parameters
+    ----------
+    sigma_m : standard deviation of one coordinate of one visit (sensor and repeatability);
+        the difference of two visits has sqrt(2) of it.
+    in_force : the model that the candidate must beat at the left-out poses.
+
+    Raises
+    ------
+    TooFewSamplesError
+        With fewer than two poses.
+    """
+    noise = float(np.sqrt(2.0)) * sigma_m
+    data = against_reference(reference, warm)
+    data = replace(data, sigma=np.full(len(data), noise))
+    groups = pose_groups(data.q)
+    if groups.max() < 1:
+        raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
+    prior = drift_prior(nominal) if method == "map" else None
+    result = _identify(nominal, reference, data, method, prior)
+    after, model = np.empty(len(data)), np.empty(len(data))
+    for group in range(int(groups.max()) + 1):
+        left = groups == group
+        part, others = data.take(left), data.take(~left)
+        without = _identify(nominal, reference, others, method, prior)
+        after[left] = np.linalg.norm(without.cell.residual(part), axis=1)
+        variance = without.predicted_variance(part.q, part.target_index(without.cell.targets))
+        model[left] = np.trace(variance, axis1=1, axis2=2)
+    current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
+    before = np.linalg.norm(current.residual(data), axis=1)
+    predicted = float(np.sqrt(model.mean()))
+    return JudgedIdentification(
+        identification=result,
+        nominal=summarise(reference.cell.residual(data)),
+        current=summarise(before),
+        candidate=summarise(after),
+        predicted_rms_m=predicted,
+        predicted_total_rms_m=float(np.sqrt(model.mean() + 3.0 * noise**2)),
+        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
+        verdict=judge(before, after, groups, uninformative(result, summarise(before).rms_m)),
+    )
+
+
+def _identify(
+    nominal: SerialArm,
+    reference: ColdReference,
+    data: Measurements,
+    method: Method,
+    prior: Array | None,
+) -> Identification:
+    """The model parameters alone, about the cold model; base and targets are the reference's."""
+    cell = reference.cell
+    layout = make_layout(
+        nominal,
+        cell.targets,
+        geometry=nominal.parameters.names,
+        base=False,
+        tool=False,
+        orientation=False,
+    )
+    if data.sigma is None:
+        raise ValueError("drift needs the measurements' sigma")
+    start = replace(cell, arm=nominal.with_mdh(cell.arm.mdh))
+    problem = CellProblem(layout, data, cell.targets, data.sigma, 0.0, cell.arm.mdh)
+    information = None if prior is None else np.linalg.inv(prior)
+    estimate = estimation.solve(problem, start, prior_information=information, noise_known=True)
+    return Identification(
+        nominal=nominal,
+        cell=estimate.state,
+        layout=layout,
+        method=method,
+        estimate=estimate,
+        held=(),
+        prior_covariance=prior,
+        unobservable=tuple(
+            estimation.describe(direction, layout.names, layout.to_display)
+            for direction in estimate.observability.null.T
+        ),
+        rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
+        noise_m=float(np.sqrt(np.mean(data.sigma**2))),
+    )

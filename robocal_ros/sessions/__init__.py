@@ -1,0 +1,1 @@
+"""Stateful, clock-free objects: samples and commands in, estimates and events out."""

@@ -1,0 +1,59 @@
+"""Commands to a session and what came of them: the record that replay obeys."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from robocal_ros.core.codes import Code
+
+CONFIGURE = "configure"
+CAPTURE_REFERENCE = "capture_reference"
+IDENTIFY = "identify"
+ACCEPT = "accept"
+REJECT = "reject"
+ROLLBACK = "rollback"
+
+
+@dataclass(frozen=True)
+class Command:
+    """Something asked of a session.
+
+    Attributes
+    ----------
+    name : one of the constants of this module.
+    arguments : plain values (JSON).
+    stamp_ns : data time of the command: only samples up to it count. None: the newest stamp
+        known when the session takes the command.
+    marks : newest stamp taken from each topic when the command was carried out; None until
+        then. A recorded command carries them, so that replay uses the same samples.
+    """
+
+    name: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    stamp_ns: int | None = None
+    marks: Mapping[str, int] | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A command carried out.
+
+    Attributes
+    ----------
+    status : ACCEPT when done, else why not.
+    document : the identification, where one was made.
+    calibration_id, revision : what was proposed or decided, and the revision now in force.
+    """
+
+    command: Command
+    status: Code
+    message: str
+    document: Mapping[str, Any] | None = None
+    calibration_id: int = 0
+    revision: int = 0
+    samples: int = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether the command did what was asked."""
+        return self.status is Code.ACCEPT

@@ -1,0 +1,47 @@
+"""What a session needs of a calibration history, whoever keeps it."""
+
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from robocal_ros.core.proposals import Entry, Head, Proposal
+
+
+class History(Protocol):
+    """The part of ``storage.calibrations.CalibrationHistory`` that sessions use."""
+
+    serial: str
+
+    def propose(self, proposal: Proposal) -> int:
+        """Keep a candidate and return its id."""
+
+    def accept(
+        self, calibration_id: int, *, by: str, reason: str, expected_head: int | None, wall_ns: int
+    ) -> Head:
+        """Bring a candidate into force."""
+
+    def reject(self, calibration_id: int, *, by: str, reason: str, wall_ns: int) -> None:
+        """Refuse a candidate for good."""
+
+    def rollback(
+        self,
+        to: int | None,
+        *,
+        by: str,
+        reason: str,
+        expected_head: int | None,
+        wall_ns: int,
+        kind: str = ...,
+    ) -> Head:
+        """Return to an earlier calibration, or to nominal."""
+
+    def head(self, kind: str = ...) -> Head:
+        """What is in force."""
+
+    def pending(self, kind: str = ...) -> Sequence[Entry]:
+        """Candidates that wait for a decision."""
+
+    def get(self, calibration_id: int) -> Entry:
+        """One calibration with its decisions."""
+
+    def data_version(self) -> Any:
+        """A value that changes when the history does."""

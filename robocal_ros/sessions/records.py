@@ -1,0 +1,91 @@
+"""Commands and outcomes as the texts of ``robocal_msgs/SessionEvent``, and back."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.sessions.events import CONFIGURE, Command, Outcome
+from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
+
+
+def _text(document: Mapping[str, Any]) -> str:
+    return json.dumps(document, allow_nan=False, sort_keys=True)
+
+
+def digest(document: Mapping[str, Any] | None) -> str:
+    """Fingerprint of a document, equal when every number is equal to the last bit."""
+    if document is None:
+        return ""
+    return hashlib.sha256(_text(document).encode()).hexdigest()[:16]
+
+
+def arguments_text(command: Command) -> str:
+    """Arguments and marks of a command as JSON."""
+    return _text({"arguments": dict(command.arguments), "marks": dict(command.marks or {})})
+
+
+def outcome_text(outcome: Outcome) -> str:
+    """What came of a command as JSON; the document by its fingerprint."""
+    return _text(
+        {
+            "status": int(outcome.status),
+            "message": outcome.message,
+            "id": outcome.calibration_id,
+            "revision": outcome.revision,
+            "samples": outcome.samples,
+            "digest": digest(outcome.document),
+        }
+    )
+
+
+def read_command(name: str, stamp_ns: int, arguments: str) -> Command:
+    """Read a recorded command.
+
+    Raises
+    ------
+    InputError
+        When the text is no such record.
+    """
+    try:
+        record = json.loads(arguments)
+        marks = {str(topic): int(mark) for topic, mark in record["marks"].items()}
+        return Command(name, dict(record["arguments"]), stamp_ns, marks)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"session event '{name}' cannot be read: {error}") from error
+
+
+def configuration(session: ThermalSession) -> Command:
+    """The session's settings and what it started from, so that replay starts from the same."""
+    reference = session.reference_model
+    return Command(
+        CONFIGURE,
+        {
+            "robot": session.nominal.name,
+            "model_hash": session.nominal.model_hash,
+            "config": asdict(session.config),
+            "model": session.in_force.model,
+            "reference": reference,
+        },
+        0,
+        {},
+    )
+
+
+def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
+    """Read the settings back from a configuration record.
+
+    Raises
+    ------
+    InputError
+        When the record has other settings than this version knows.
+    """
+    try:
+        values = dict(arguments["config"])
+        rule = StandstillRule(**values.pop("standstill"))
+        return ThermalConfig(standstill=rule, **values)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"the recorded configuration cannot be read: {error}") from error

@@ -1,0 +1,202 @@
+"""A recorded stream through the thermal session: the live node's results, off line."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import joint_sample, point_sample, pose_sample, stamp_ns
+from robocal_ros.core.thermal.identification import SAME_VISIT_RAD
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.observations import JOINTS, POINT, POSE, Observation
+from robocal_ros.sessions.records import digest, read_command
+from robocal_ros.sessions.thermal import ThermalSession
+
+EVENTS = "session_events"
+LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
+
+
+class Recorded(Protocol):
+    """A message of a bag: its topic and the message with the attributes of the ROS type."""
+
+    @property
+    def topic(self) -> str:
+        """Name of the topic."""
+
+    @property
+    def message(self) -> Any:
+        """The message."""
+
+
+@dataclass
+class ReplayReport:
+    """What came of a replay.
+
+    ``differs`` lists recorded commands whose result here is not the recorded one, bit for bit.
+    """
+
+    outcomes: list[Outcome] = field(default_factory=list)
+    differs: list[str] = field(default_factory=list)
+    commands: int = 0
+
+
+def topic_kind(topic: str) -> str:
+    """The input that a topic name stands for: its last part."""
+    return topic.rsplit("/", 1)[-1]
+
+
+def read_events(messages: Iterable[Recorded]) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
+    """The last configuration and the commands after it, each with its recorded outcome.
+
+    Raises
+    ------
+    InputError
+        When an event cannot be read.
+    """
+    configured: Command | None = None
+    found: list[tuple[Command, dict[str, Any]]] = []
+    for recorded in messages:
+        event = recorded.message
+        command = read_command(event.command, stamp_ns(event.stamp), event.arguments)
+        if command.name == events.CONFIGURE:
+            configured, found = command, []
+        else:
+            found.append((command, json.loads(event.outcome)))
+    return configured, found
+
+
+def feed(session: ThermalSession, recorded: Recorded) -> None:
+    """Give a recorded sample to the session; one that cannot be used is counted."""
+    kind = topic_kind(recorded.topic)
+    try:
+        if kind == JOINTS:
+            session.add(joint_sample(recorded.message))
+        elif kind == POINT:
+            session.add(point_sample(recorded.message))
+        elif kind == POSE:
+            session.add(pose_sample(recorded.message))
+    except InputError as error:
+        session.desk.ignore(kind, str(error))
+
+
+def replay(
+    session: ThermalSession,
+    messages: Iterable[Recorded],
+    commands: Sequence[tuple[Command, Mapping[str, Any]]],
+) -> ReplayReport:
+    """Play samples through a session and carry out commands where they were carried out.
+
+    ``commands``: each with its recorded outcome (empty: none was recorded). Ids of calibrations
+    differ between histories; a recorded id is translated to the one given here.
+    """
+    report = ReplayReport(commands=len(commands))
+    expected = iter(commands)
+    ids: dict[int, int] = {}
+    awaited = _submit_next(session, expected, ids)
+    for recorded in messages:
+        feed(session, recorded)
+        while awaited is not None and (done := session.advance(wall_ns=0)):
+            awaited = _take(session, report, done, awaited, expected, ids)
+    while awaited is not None:
+        done = session.advance(wall_ns=0, force=True)
+        awaited = _take(session, report, done, awaited, expected, ids)
+    return report
+
+
+def _submit_next(
+    session: ThermalSession,
+    expected: Iterator[tuple[Command, Mapping[str, Any]]],
+    ids: Mapping[int, int],
+) -> Mapping[str, Any] | None:
+    following = next(expected, None)
+    if following is None:
+        return None
+    command, outcome = following
+    arguments = dict(command.arguments)
+    if arguments.get("id"):
+        arguments["id"] = ids.get(int(arguments["id"]), int(arguments["id"]))
+    session.submit(Command(command.name, arguments, command.stamp_ns, command.marks))
+    return outcome
+
+
+def _take(
+    session: ThermalSession,
+    report: ReplayReport,
+    done: list[Outcome],
+    recorded: Mapping[str, Any],
+    expected: Iterator[tuple[Command, Mapping[str, Any]]],
+    ids: dict[int, int],
+) -> Mapping[str, Any] | None:
+    outcome = done[0]
+    report.outcomes.append(outcome)
+    if recorded:
+        if recorded["id"] and outcome.calibration_id:
+            ids.setdefault(int(recorded["id"]), outcome.calibration_id)
+        here = (int(outcome.status), outcome.samples, digest(outcome.document))
+        if here != (recorded["status"], recorded["samples"], recorded["digest"]):
+            report.differs.append(
+                f"{outcome.command.name} at {outcome.command.stamp_ns} ns: recorded "
+                f"'{recorded['message']}', here '{outcome.message}'"
+            )
+    return _submit_next(session, expected, ids)
+
+
+def window_commands(
+    cold: tuple[int, int] | None, warm: Sequence[tuple[int, int]]
+) -> list[tuple[Command, Mapping[str, Any]]]:
+    """Commands for time windows (from, to; ns): the cold reference, then one cycle each."""
+    commands: list[tuple[Command, Mapping[str, Any]]] = []
+    if cold is not None:
+        arguments = {"from_ns": cold[0], "by": "replay"}
+        commands.append((Command(events.CAPTURE_REFERENCE, arguments, cold[1]), {}))
+    for number, (start, end) in enumerate(warm, start=1):
+        arguments = {"from_ns": start, "cycle_id": f"window-{number}"}
+        commands.append((Command(events.IDENTIFY, arguments, end), {}))
+    return commands
+
+
+def automatic_commands(
+    observations: Sequence[Observation],
+) -> list[tuple[Command, Mapping[str, Any]]]:
+    """Find the cycles of a recording without commands.
+
+    Poses that recur from cycle to cycle: the first visit is the cold reference, each later one
+    a warm cycle. Otherwise everything is one calibration.
+
+    Raises
+    ------
+    InputError
+        When nothing was observed.
+    """
+    if not observations:
+        raise InputError("no measurement at standstill in this recording")
+    starts = _cycle_starts(observations)
+    end = observations[-1].stamp_ns
+    if len(starts) < 2:
+        return window_commands(None, [(observations[0].stamp_ns, end)])
+    edges = [observations[i].stamp_ns for i in starts]
+    last = [observations[i - 1].stamp_ns for i in starts[1:]] + [end]
+    windows = list(zip(edges, last, strict=True))
+    return window_commands(windows[0], windows[1:])
+
+
+def _cycle_starts(observations: Sequence[Observation]) -> list[int]:
+    """Index of the first observation of each cycle; one alone when poses do not recur."""
+
+    def same(a: Observation, b: Observation) -> bool:
+        near = np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD
+        return a.target == b.target and bool(near)
+
+    first = observations[0]
+    limit = min(len(observations), LARGEST_CYCLE + 1)
+    length = next((i for i in range(1, limit) if same(first, observations[i])), None)
+    if length is None:
+        return [0]
+    starts = [i for i, o in enumerate(observations) if same(first, o)]
+    known = observations[:length]
+    recurring = sum(any(same(o, k) for k in known) for o in observations[length:])
+    return starts if recurring >= 0.9 * len(observations[length:]) else [0]

@@ -1,0 +1,325 @@
+"""The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from robocal_ros.core.assessment import hold_out, pose_groups
+from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import (
+    arm_of,
+    identification_document,
+    model_document,
+    reference_document,
+    reference_of,
+)
+from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
+from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_judge
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import THERMAL, Head, Proposal
+from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.core.thermal.identification import (
+    ColdReference,
+    capture_reference,
+    identify_drift,
+)
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.observations import (
+    JOINTS,
+    Observation,
+    ObservationDesk,
+    as_measurements,
+)
+
+REFERENCE = "reference"
+METHODS: tuple[Method, ...] = ("map", "lsq")
+
+
+@dataclass(frozen=True)
+class ThermalConfig:
+    """Settings of a thermal session.
+
+    Attributes
+    ----------
+    method : estimator where a command names none.
+    sigma_m : standard deviation of one measured coordinate in one visit of a pose.
+    hold_out, seed : share of the poses kept to judge a calibration without reference.
+    lateness_s : a command waits for joint readings this much newer, so that measurements
+        under way still count.
+    measuring_frame : frame of the measurements; empty: that of the first one.
+    """
+
+    method: Method = "map"
+    sigma_m: float = 3e-5
+    hold_out: float = 0.5
+    seed: int = 0
+    lateness_s: float = 0.2
+    measuring_frame: str = ""
+    standstill: StandstillRule = field(default_factory=StandstillRule)
+
+
+class ThermalSession:
+    """Identifies the model of one arm from measurements at standstill.
+
+    Without a cold reference, ``identify`` calibrates base, targets and model from all poses and
+    judges on held-out ones; with one, it identifies the drift since then.
+
+    Attributes
+    ----------
+    in_force : head of the history as the session last saw it.
+    reference : the cold reference, or None.
+    """
+
+    def __init__(
+        self, nominal: SerialArm, history: History, config: ThermalConfig, software: str
+    ) -> None:
+        self.nominal = nominal
+        self.config = config
+        self.desk = ObservationDesk(nominal.joint_names, config.standstill, config.measuring_frame)
+        self._history = history
+        self._software = software
+        self._queue: list[Command] = []
+        self._used_ns = -1
+        self._version = history.data_version()
+        self.in_force: Head = history.head(THERMAL)
+        self.reference = self._stored_reference()
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the model in force."""
+        model = self.in_force.model
+        return self.nominal if model is None else arm_of(model, self.nominal)
+
+    @property
+    def reference_model(self) -> dict[str, Any] | None:
+        """The cold reference's document, or None."""
+        return None if self.reference is None else reference_document(self.reference)
+
+    def add(self, sample: JointSample | PointSample | PoseSample) -> None:
+        """Take a sample."""
+        if isinstance(sample, JointSample):
+            self.desk.add_joints(sample)
+        else:
+            self.desk.add_measurement(sample)
+
+    def submit(self, command: Command) -> None:
+        """Queue a command; ``advance`` carries it out when its samples are complete."""
+        if command.stamp_ns is None:
+            command = replace(command, stamp_ns=self.desk.newest_ns.get(JOINTS, 0))
+        self._queue.append(command)
+
+    @property
+    def waiting(self) -> int:
+        """Number of commands not yet carried out."""
+        return len(self._queue)
+
+    def advance(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out the commands whose samples are complete.
+
+        ``wall_ns`` enters the history's records only; ``force`` carries out all with what is
+        there (no more samples will come, or a caller's deadline has passed).
+        """
+        outcomes: list[Outcome] = []
+        while self._queue and (force or self._ready(self._queue[0])):
+            command = self._queue.pop(0)
+            if command.marks is None:
+                command = replace(command, marks=dict(self.desk.newest_ns))
+            outcomes.append(self._carry_out(command, wall_ns))
+        return outcomes
+
+    def _ready(self, command: Command) -> bool:
+        newest = self.desk.newest_ns
+        if command.marks is not None:
+            return all(newest.get(topic, -1) >= stamp for topic, stamp in command.marks.items())
+        if command.name not in (events.IDENTIFY, events.CAPTURE_REFERENCE):
+            return True
+        wanted = (command.stamp_ns or 0) + int(self.config.lateness_s * 1e9)
+        return newest.get(JOINTS, -1) >= wanted
+
+    def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
+        handlers: dict[str, Callable[[Command, int], Outcome]] = {
+            events.CAPTURE_REFERENCE: self._capture_reference,
+            events.IDENTIFY: self._identify,
+            events.ACCEPT: self._decide,
+            events.REJECT: self._decide,
+            events.ROLLBACK: self._decide,
+        }
+        try:
+            if command.name not in handlers:
+                raise InputError(f"unknown command '{command.name}'; known: {', '.join(handlers)}")
+            outcome = handlers[command.name](command, wall_ns)
+        except RobocalError as error:
+            outcome = Outcome(command, error.code, str(error))
+        self._refresh()
+        return replace(outcome, revision=self.in_force.revision)
+
+    def _window(self, command: Command) -> list[Observation]:
+        after = int(command.arguments.get("from_ns", self._used_ns + 1)) - 1
+        found = self.desk.window(after, command.stamp_ns or 0, command.marks or {})
+        last = int(command.arguments.get("samples", 0))
+        if not found:
+            lost = {topic: dict(why) for topic, why in self.desk.ignored.items()}
+            raise TooFewSamplesError(
+                "no measurement with the robot at standstill since the last command"
+                + (f"; ignored: {lost}" if lost else "")
+            )
+        return found[-last:] if last else found
+
+    def _used(self, command: Command) -> None:
+        self._used_ns = command.stamp_ns or 0
+        self.desk.forget(self._used_ns)
+
+    def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
+        data = as_measurements(self._window(command))
+        reference = capture_reference(self.arm, data)
+        model = reference_document(reference)
+        proposal = self._proposal(
+            REFERENCE, command, wall_ns, "lsq", Code.ACCEPT, "cold reference captured", {}, model
+        )
+        calibration_id = self._history.propose(proposal)
+        self._history.accept(
+            calibration_id,
+            by=str(command.arguments.get("by", "")),
+            reason="captured",
+            expected_head=proposal.based_on,
+            wall_ns=wall_ns,
+        )
+        self.reference = reference
+        self._used(command)
+        count = len(data)
+        message = f"cold reference of {count} measurements captured"
+        return Outcome(command, Code.ACCEPT, message, calibration_id=calibration_id, samples=count)
+
+    def _identify(self, command: Command, wall_ns: int) -> Outcome:
+        method = str(command.arguments.get("method") or self.config.method)
+        if method not in METHODS:
+            raise InputError(f"method '{method}' is not one of {', '.join(METHODS)}")
+        data = as_measurements(self._window(command))
+        judged = self._solve(data, "lsq" if method == "lsq" else "map")
+        document = identification_document(judged)
+        cycle_id = str(command.arguments.get("cycle_id", ""))
+        document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
+        verdict = judged.verdict
+        model = model_document(judged.identification.cell.arm)
+        calibration_id = self._history.propose(
+            self._proposal(
+                THERMAL,
+                command,
+                wall_ns,
+                method,
+                verdict.code,
+                verdict.reason,
+                document,
+                model,
+                data,
+            )
+        )
+        self._used(command)
+        return Outcome(
+            command, verdict.code, verdict.reason, document, calibration_id, samples=len(data)
+        )
+
+    def _solve(self, data: Measurements, method: Method) -> JudgedIdentification:
+        if self.reference is not None:
+            return identify_drift(
+                self.nominal,
+                self.reference,
+                data,
+                sigma_m=self.config.sigma_m,
+                in_force=self.arm,
+                method=method,
+            )
+        held = hold_out(pose_groups(data.q), self.config.hold_out, self.config.seed)
+        in_force = self.arm if self.in_force.model is not None else None
+        return identify_and_judge(
+            self.nominal, data.take(~held), data.take(held), method=method, in_force=in_force
+        )
+
+    def _proposal(
+        self,
+        kind: str,
+        command: Command,
+        wall_ns: int,
+        method: str,
+        code: Code,
+        reason: str,
+        document: dict[str, Any],
+        model: dict[str, Any],
+        data: Measurements | None = None,
+    ) -> Proposal:
+        held_out = document.get("calibrated", {}).get("held_out", {})
+        inputs = {} if data is None else {"q": data.q, "position": data.position}
+        return Proposal(
+            kind=kind,
+            model_hash=self.nominal.model_hash,
+            based_on=self._history.head(kind).revision,
+            cycle_id=str(command.arguments.get("cycle_id", "")),
+            stamp_ns=command.stamp_ns or 0,
+            created_ns=wall_ns,
+            software=self._software,
+            method=method,
+            code=code,
+            reason=reason,
+            candidate_rms_mm=held_out.get("rms_mm"),
+            document=document,
+            model=model,
+            inputs=inputs,
+        )
+
+    def _decide(self, command: Command, wall_ns: int) -> Outcome:
+        arguments = command.arguments
+        chosen = int(arguments.get("id", 0))
+        by, why = str(arguments.get("by", "")), str(arguments.get("reason", ""))
+        expected = self.in_force.revision
+        if command.name == events.REJECT:
+            self._history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
+            return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
+        if command.name == events.ACCEPT:
+            head = self._history.accept(
+                chosen, by=by, reason=why, expected_head=expected, wall_ns=wall_ns
+            )
+        else:
+            head = self._history.rollback(
+                None if arguments.get("previous", False) else chosen,
+                by=by,
+                reason=why,
+                expected_head=expected,
+                wall_ns=wall_ns,
+            )
+        what = f"calibration {head.calibration_id}" if head.calibration_id else "the nominal model"
+        return Outcome(
+            command, Code.ACCEPT, f"revision {head.revision}: {what} in force", None, chosen
+        )
+
+    def poll(self) -> list[Outcome]:
+        """Take over what another process decided in the history since the last look."""
+        if self._history.data_version() == self._version:
+            return []
+        before = self.in_force.revision
+        self._refresh()
+        if self.in_force.revision == before:
+            return []
+        chosen, name, by, why = self.in_force.calibration_id or 0, events.ROLLBACK, "", ""
+        if chosen:
+            decision = self._history.get(chosen).decisions[-1]
+            name, by, why = decision.action.value, decision.by, decision.reason
+        command = Command(
+            name,
+            {"id": chosen, "by": by, "reason": why},
+            self.desk.newest_ns.get(JOINTS, 0),
+            dict(self.desk.newest_ns),
+        )
+        message = f"revision {self.in_force.revision}: decided outside this node"
+        return [Outcome(command, Code.ACCEPT, message, None, chosen, self.in_force.revision)]
+
+    def _refresh(self) -> None:
+        self._version = self._history.data_version()
+        self.in_force = self._history.head(THERMAL)
+        self.reference = self._stored_reference()
+
+    def _stored_reference(self) -> ColdReference | None:
+        model = self._history.head(REFERENCE).model
+        return None if model is None else reference_of(model, self.nominal)
