@@ -85,9 +85,7 @@ def hold_out(groups: Index, share: float, seed: int) -> NDArray[np.bool_]:
     return np.asarray(chosen[groups])
 
 
-def judge(
-    current: Array, candidate: Array, groups: Index, uninformative: str = ""
-) -> Verdict:
+def judge(current: Array, candidate: Array, groups: Index, uninformative: str = "") -> Verdict:
     """Decide whether a candidate replaces the model in force.
 
     Parameters

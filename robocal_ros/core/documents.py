@@ -65,7 +65,9 @@ def cell_document(cell: CellModel) -> Document:
     }
 
 
-def parameters_document(nominal: SerialArm, identified: SerialArm, sigma: dict[str, float]) -> Document:
+def parameters_document(
+    nominal: SerialArm, identified: SerialArm, sigma: dict[str, float]
+) -> Document:
     """Nominal value, identified value and standard deviation of every free parameter.
 
     ``sigma`` in SI by name; a parameter without one was held at its nominal value (null).

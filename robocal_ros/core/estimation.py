@@ -221,7 +221,9 @@ class _Descent(Generic[S]):
         k = run.jacobian.shape[2]
         state, residual, jacobian = run.state, run.residual, run.jacobian
         damping = 0.0
-        for iteration in range(1, MOST_ITERATIONS + 1):
+        iterations, small = run.iterations, False
+        while not small and iterations < run.iterations + MOST_ITERATIONS:
+            iterations += 1
             scale = self._scale(residual, keep, huber)
             normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
             while True:
@@ -234,12 +236,14 @@ class _Descent(Generic[S]):
                 damping = max(10.0 * damping, 1e-4)
             state, residual, jacobian = trial, new_residual, new_jacobian
             damping /= 10.0
-            if small:
-                break
-        return _Run(state, residual, jacobian, run.iterations + iteration, small)
+        return _Run(state, residual, jacobian, iterations, small)
 
     def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: float) -> float:
-        return self.plain_scale(residual, keep) if huber == np.inf else self.robust_scale(residual, keep)
+        return (
+            self.plain_scale(residual, keep)
+            if huber == np.inf
+            else self.robust_scale(residual, keep)
+        )
 
     def plain_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
         """Standard deviation of the kept residuals, unknowns counted; 1 where it is known."""
@@ -300,7 +304,9 @@ class _Descent(Generic[S]):
         sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
-        inlier = np.sum(run.residual * whitened, axis=1) < chi2_quantile(1.0 - FALSE_REJECTION / m, c)
+        inlier = np.sum(run.residual * whitened, axis=1) < chi2_quantile(
+            1.0 - FALSE_REJECTION / m, c
+        )
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep
 

@@ -160,6 +160,4 @@ def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSampl
     norm = float(np.linalg.norm(quat))
     if abs(norm - 1.0) > 1e-3:
         raise InputError(f"measured orientation has a quaternion of length {norm:.6g}, not 1")
-    return PoseSample(
-        stamp_ns(message.header.stamp), frame, target, transform_from_quat(xyz, quat)
-    )
+    return PoseSample(stamp_ns(message.header.stamp), frame, target, transform_from_quat(xyz, quat))

@@ -38,7 +38,7 @@ class Reading:
     ready_ns: int
 
 
-class NotStill(InputError):
+class NotStillError(InputError):
     """The joints cannot be given at that instant; the message says why."""
 
 
@@ -104,7 +104,7 @@ class JointStream:
 
         Raises
         ------
-        NotStill
+        NotStillError
             When the robot moved, or readings are missing around the instant.
         """
         first_ns = stamp_ns - int(rule.before_s * 1e9)
@@ -115,15 +115,17 @@ class JointStream:
         low = int(np.searchsorted(stamps, first_ns, side="right")) - 1
         high = int(np.searchsorted(stamps, last_ns, side="left"))
         if low < 0:
-            raise NotStill("no joint readings from before the measurement")
+            raise NotStillError("no joint readings from before the measurement")
         gap = float(np.max(np.diff(stamps[low : high + 1]))) * 1e-9
         if gap > rule.gap_s:
-            raise NotStill(f"joint readings pause for {gap:.3f} s (allowed {rule.gap_s:.3f} s)")
+            raise NotStillError(
+                f"joint readings pause for {gap:.3f} s (allowed {rule.gap_s:.3f} s)"
+            )
         window = self._q[low : high + 1]
         spread = np.ptp(window, axis=0)
         worst = int(np.argmax(spread))
         if spread[worst] > rule.tolerance_rad:
-            raise NotStill(
+            raise NotStillError(
                 f"{self._names[worst]} moved by {np.degrees(spread[worst]):.3f} deg "
                 f"(allowed {np.degrees(rule.tolerance_rad):.3f} deg)"
             )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
-from robocal_ros.core.streams import JointStream, NotStill, StandstillRule
+from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class ObservationDesk:
             topic = POINT if isinstance(sample, PointSample) else POSE
             try:
                 reading = self.stream.standstill(sample.stamp_ns, self.rule)
-            except NotStill as error:
+            except NotStillError as error:
                 self.ignore(topic, str(error))
                 continue
             if reading is None:

@@ -49,7 +49,9 @@ def topic_kind(topic: str) -> str:
     return topic.rsplit("/", 1)[-1]
 
 
-def read_events(messages: Iterable[Recorded]) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
+def read_events(
+    messages: Iterable[Recorded],
+) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
     """The last configuration and the commands after it, each with its recorded outcome.
 
     Raises

@@ -16,7 +16,7 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class CellModel:
-    """Model of a measured robot: ``T_frame_target = T_frame_base T_base_flange(q) T_flange_target``.
+    """A measured robot: ``T_frame_target = T_frame_base T_base_flange(q) T_flange_target``.
 
     Attributes
     ----------
@@ -95,9 +95,7 @@ class Layout:
         if self.base >= 0:
             shift, turn = step[self.base : self.base + 3], step[self.base + 3 : self.base + 6]
             root = state.T_frame_root
-            moved = frames.transform(
-                frames.exp_rotation(turn) @ root[:3, :3], root[:3, 3] + shift
-            )
+            moved = frames.transform(frames.exp_rotation(turn) @ root[:3, :3], root[:3, 3] + shift)
             T_frame_base = moved @ frames.invert(arm.T_base_root)
         if self.tool[0] >= 0:
             tools = tools.copy()

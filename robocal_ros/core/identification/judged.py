@@ -133,5 +133,3 @@ def _predicted(
     sigma = check.sigma
     noise = result.noise_m if sigma is None else float(np.sqrt(np.mean(sigma**2)))
     return float(np.sqrt(model)), float(np.sqrt(model + 3.0 * noise**2))
-
-

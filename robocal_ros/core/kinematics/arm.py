@@ -52,7 +52,7 @@ class SerialArm:
         shapes |= {"T_base_root": (4, 4), "T_flange_tool": (4, 4)}
         for name, shape in shapes.items():
             kind = np.bool_ if name == "prismatic" else np.float64
-            value = np.array(getattr(self, name), dtype=kind)
+            value: NDArray[np.float64 | np.bool_] = np.array(getattr(self, name), dtype=kind)
             if value.shape != shape:
                 raise ValueError(f"{name} has shape {value.shape}, expected {shape}")
             value.flags.writeable = False
@@ -82,10 +82,9 @@ class SerialArm:
         The same file gives the same hash on every machine; name, limits and tool do not enter.
         """
         numbers = np.round(np.hstack([self.mdh.ravel(), self.T_base_root[:3].ravel()]), 9) + 0.0
-        text = "|".join(
-            [",".join(self.joint_names), ",".join(f"{x:.9f}" for x in numbers)]
-            + [",".join(f"{s:+.0f}{int(p)}" for s, p in zip(self.sign, self.prismatic, strict=True))]
-        )
+        joints = zip(self.joint_names, self.sign, self.prismatic, strict=True)
+        words = [f"{name}{sign:+.0f}{int(slides)}" for name, sign, slides in joints]
+        text = "|".join([*words, *(f"{x:.9f}" for x in numbers)])
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def with_mdh(self, mdh: ArrayLike) -> "SerialArm":

@@ -80,7 +80,9 @@ class ParameterSet:
             raise ValueError(
                 f"unknown parameter {sorted(unknown)[0]!r}; this model has {', '.join(self.names)}"
             )
-        return ParameterSet(tuple(i for i, n in zip(self.index, self.names, strict=True) if n in names))
+        return ParameterSet(
+            tuple(i for i, n in zip(self.index, self.names, strict=True) if n in names)
+        )
 
 
 def free_parameters(arm: "SerialArm") -> ParameterSet:
@@ -111,8 +113,16 @@ def _without_redundant(arm: "SerialArm", candidates: ParameterSet) -> ParameterS
     T, J = np.empty((poses, 4, 4)), np.zeros((poses, 6, k))
     target, none = np.zeros(poses, dtype=np.int64), np.array([-1], dtype=np.int64)
     kernels.parameter_batch(
-        q, arm.links, arm.T_base_root, np.eye(4)[None], target, candidates.slots(arm.n),
-        -1, none, T, J,
+        q,
+        arm.links,
+        arm.T_base_root,
+        np.eye(4)[None],
+        target,
+        candidates.slots(arm.n),
+        -1,
+        none,
+        T,
+        J,
     )
     columns = J.reshape(-1, k)
     diagonal = np.abs(np.diag(np.linalg.qr(columns, mode="r")))

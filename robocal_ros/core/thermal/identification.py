@@ -158,7 +158,7 @@ def _identify(
         raise ValueError("drift needs the measurements' sigma")
     start = replace(cell, arm=nominal.with_mdh(cell.arm.mdh))
     problem = CellProblem(layout, data, cell.targets, data.sigma, 0.0, cell.arm.mdh)
-    information = None if prior is None else np.linalg.inv(prior)
+    information = None if prior is None else np.asarray(np.linalg.inv(prior), dtype=np.float64)
     estimate = estimation.solve(problem, start, prior_information=information, noise_known=True)
     return Identification(
         nominal=nominal,
