@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from robocal_ros.core.assessment import hold_out, pose_groups
+from robocal_ros.core.assessment import Verdict, hold_out, pose_groups
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import (
     arm_of,
@@ -176,15 +176,13 @@ class ThermalSession:
         data = as_measurements(self._window(command))
         reference = capture_reference(self.arm, data)
         model = reference_document(reference)
-        proposal = self._proposal(
-            REFERENCE, command, wall_ns, "lsq", Code.ACCEPT, "cold reference captured", {}, model
-        )
-        calibration_id = self._history.propose(proposal)
+        verdict = Verdict(Code.ACCEPT, "cold reference captured")
+        calibration_id = self._propose(REFERENCE, command, wall_ns, "lsq", verdict, {}, model, data)
         self._history.accept(
             calibration_id,
             by=str(command.arguments.get("by", "")),
             reason="captured",
-            expected_head=proposal.based_on,
+            expected_head=None,
             wall_ns=wall_ns,
         )
         self.reference = reference
@@ -204,18 +202,8 @@ class ThermalSession:
         document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
         verdict = judged.verdict
         model = model_document(judged.identification.cell.arm)
-        calibration_id = self._history.propose(
-            self._proposal(
-                THERMAL,
-                command,
-                wall_ns,
-                method,
-                verdict.code,
-                verdict.reason,
-                document,
-                model,
-                data,
-            )
+        calibration_id = self._propose(
+            THERMAL, command, wall_ns, method, verdict, document, model, data
         )
         self._used(command)
         return Outcome(
@@ -238,35 +226,35 @@ class ThermalSession:
             self.nominal, data.take(~held), data.take(held), method=method, in_force=in_force
         )
 
-    def _proposal(
+    def _propose(
         self,
         kind: str,
         command: Command,
         wall_ns: int,
         method: str,
-        code: Code,
-        reason: str,
+        verdict: Verdict,
         document: dict[str, Any],
         model: dict[str, Any],
-        data: Measurements | None = None,
-    ) -> Proposal:
+        data: Measurements,
+    ) -> int:
         held_out = document.get("calibrated", {}).get("held_out", {})
-        inputs = {} if data is None else {"q": data.q, "position": data.position}
-        return Proposal(
-            kind=kind,
-            model_hash=self.nominal.model_hash,
-            based_on=self._history.head(kind).revision,
-            cycle_id=str(command.arguments.get("cycle_id", "")),
-            stamp_ns=command.stamp_ns or 0,
-            created_ns=wall_ns,
-            software=self._software,
-            method=method,
-            code=code,
-            reason=reason,
-            candidate_rms_mm=held_out.get("rms_mm"),
-            document=document,
-            model=model,
-            inputs=inputs,
+        return self._history.propose(
+            Proposal(
+                kind=kind,
+                model_hash=self.nominal.model_hash,
+                based_on=self._history.head(kind).revision,
+                cycle_id=str(command.arguments.get("cycle_id", "")),
+                stamp_ns=command.stamp_ns or 0,
+                created_ns=wall_ns,
+                software=self._software,
+                method=method,
+                code=verdict.code,
+                reason=verdict.reason,
+                candidate_rms_mm=held_out.get("rms_mm"),
+                document=document,
+                model=model,
+                inputs={"q": data.q, "position": data.position},
+            )
         )
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:

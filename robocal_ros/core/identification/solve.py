@@ -12,6 +12,7 @@ from robocal_ros.core.errors import RankDeficientError
 from robocal_ros.core.identification.cell import CellModel, CellProblem, Layout, make_layout
 from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.observability import describe, observability
 from robocal_ros.core.samples import Measurements
 
 Array = NDArray[np.float64]
@@ -255,10 +256,8 @@ def _report(
         sigma = np.ones(len(data)) if data.sigma is None else data.sigma
         problem = CellProblem(complete, data, estimate.state.targets, sigma, lever, arm.mdh)
         _, J = problem.linearise(estimate.state)
-        seen = estimation.observability(J[~estimate.rejected].reshape(-1, J.shape[2]))
-    words = tuple(
-        estimation.describe(column, complete.names, complete.to_display) for column in seen.null.T
-    )
+        seen = observability(J[~estimate.rejected].reshape(-1, J.shape[2]))
+    words = tuple(describe(column, complete.names, complete.to_display) for column in seen.null.T)
     known = data.sigma
     return Identification(
         nominal=arm,

@@ -12,6 +12,7 @@ from robocal_ros.core.identification.cell import CellModel, CellProblem, make_la
 from robocal_ros.core.identification.judged import JudgedIdentification, uninformative
 from robocal_ros.core.identification.solve import Identification, Method, identify
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.observability import describe
 from robocal_ros.core.samples import Measurements
 
 Array = NDArray[np.float64]
@@ -169,7 +170,7 @@ def _identify(
         held=(),
         prior_covariance=prior,
         unobservable=tuple(
-            estimation.describe(direction, layout.names, layout.to_display)
+            describe(direction, layout.names, layout.to_display)
             for direction in estimate.observability.null.T
         ),
         rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
