@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import ErrorSummary, Verdict
-from robocal_ros.core.identification import CellModel, JudgedIdentification
+from robocal_ros.core.identification import CellModel, Identification, JudgedIdentification
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.identification import ColdReference
@@ -46,6 +46,19 @@ def model_document(arm: SerialArm) -> Document:
         "prismatic": arm.prismatic.tolist(),
         "mdh": arm.mdh.tolist(),
         "T_base_root": arm.T_base_root.tolist(),
+    }
+
+
+def identified_model_document(result: Identification) -> Document:
+    """``model_document`` of an identified arm, with its parameters' covariance (SI).
+
+    ``parameters`` are those that were unknown, in the order of ``covariance``.
+    """
+    _, _, place = result.layout.geometry
+    covariance = result.estimate.covariance[np.ix_(place, place)]
+    return model_document(result.cell.arm) | {
+        "parameters": [result.layout.names[i] for i in place],
+        "covariance": covariance.tolist(),
     }
 
 

@@ -85,6 +85,17 @@ class Measurements:
             raise InputError(f"target '{unknown}' is not one of {', '.join(targets)}")
         return np.array([lookup[name] for name in self.target], dtype=np.int64)
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything measured as named arrays, for keeping."""
+        optional = {"rotation": self.rotation, "sigma": self.sigma, "stamp_ns": self.stamp_ns}
+        return {
+            "q": self.q,
+            "position": self.position,
+            "target": np.array(self.target),
+            "sample": np.array(self.sample),
+            **{name: value for name, value in optional.items() if value is not None},
+        }
+
     def take(self, rows: NDArray[Any]) -> "Measurements":
         """Return the samples at ``rows`` (index or boolean mask)."""
         index = np.arange(len(self))[rows]

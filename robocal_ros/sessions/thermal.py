@@ -9,7 +9,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import (
     arm_of,
     identification_document,
-    model_document,
+    identified_model_document,
     reference_document,
     reference_of,
 )
@@ -201,7 +201,7 @@ class ThermalSession:
         cycle_id = str(command.arguments.get("cycle_id", ""))
         document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
         verdict = judged.verdict
-        model = model_document(judged.identification.cell.arm)
+        model = identified_model_document(judged.identification)
         calibration_id = self._propose(
             THERMAL, command, wall_ns, method, verdict, document, model, data
         )
@@ -253,7 +253,7 @@ class ThermalSession:
                 candidate_rms_mm=held_out.get("rms_mm"),
                 document=document,
                 model=model,
-                inputs={"q": data.q, "position": data.position},
+                inputs=data.arrays(),
             )
         )
 
