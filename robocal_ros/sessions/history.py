@@ -43,5 +43,11 @@ class History(Protocol):
     def get(self, calibration_id: int) -> Entry:
         """One calibration with its decisions."""
 
+    def list(self, limit: int = ...) -> Sequence[Entry]:
+        """The latest calibrations, newest first."""
+
+    def model(self, calibration_id: int) -> dict[str, Any]:
+        """A calibration's model in full precision."""
+
     def data_version(self) -> Any:
         """A value that changes when the history does."""

@@ -9,7 +9,8 @@ from typing import Any
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions.events import CONFIGURE, Command, Outcome
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
+from robocal_ros.sessions.thermal import ThermalSession
+from robocal_ros.sessions.thermal_config import ThermalConfig
 
 
 def _text(document: Mapping[str, Any]) -> str:
@@ -69,6 +70,7 @@ def configuration(session: ThermalSession) -> Command:
             "config": asdict(session.config),
             "model": session.in_force.model,
             "reference": reference,
+            "prior": session.prior.tolist(),
         },
         0,
         {},

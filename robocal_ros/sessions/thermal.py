@@ -1,8 +1,11 @@
 """The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import Verdict, hold_out, pose_groups
 from robocal_ros.core.codes import Code
@@ -18,7 +21,6 @@ from robocal_ros.core.identification import JudgedIdentification, Method, identi
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Head, Proposal
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
-from robocal_ros.core.streams import StandstillRule
 from robocal_ros.core.thermal.identification import (
     ColdReference,
     capture_reference,
@@ -33,32 +35,11 @@ from robocal_ros.sessions.observations import (
     ObservationDesk,
     as_measurements,
 )
+from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig, expected_drift
+
+__all__ = ["ThermalConfig", "ThermalSession"]
 
 REFERENCE = "reference"
-METHODS: tuple[Method, ...] = ("map", "lsq")
-
-
-@dataclass(frozen=True)
-class ThermalConfig:
-    """Settings of a thermal session.
-
-    Attributes
-    ----------
-    method : estimator where a command names none.
-    sigma_m : standard deviation of one measured coordinate in one visit of a pose.
-    hold_out, seed : share of the poses kept to judge a calibration without reference.
-    lateness_s : a command waits for joint readings this much newer, so that measurements
-        under way still count.
-    measuring_frame : frame of the measurements; empty: that of the first one.
-    """
-
-    method: Method = "map"
-    sigma_m: float = 3e-5
-    hold_out: float = 0.5
-    seed: int = 0
-    lateness_s: float = 0.2
-    measuring_frame: str = ""
-    standstill: StandstillRule = field(default_factory=StandstillRule)
 
 
 class ThermalSession:
@@ -69,12 +50,18 @@ class ThermalSession:
 
     Attributes
     ----------
+    prior : (k, k) covariance of the expected drift, fixed for the life of the session.
     in_force : head of the history as the session last saw it.
     reference : the cold reference, or None.
     """
 
     def __init__(
-        self, nominal: SerialArm, history: History, config: ThermalConfig, software: str
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: ThermalConfig,
+        software: str,
+        prior: NDArray[np.float64] | None = None,
     ) -> None:
         self.nominal = nominal
         self.config = config
@@ -86,6 +73,7 @@ class ThermalSession:
         self._version = history.data_version()
         self.in_force: Head = history.head(THERMAL)
         self.reference = self._stored_reference()
+        self.prior = expected_drift(nominal, history, config) if prior is None else prior
 
     @property
     def arm(self) -> SerialArm:
@@ -202,6 +190,8 @@ class ThermalSession:
         document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
         verdict = judged.verdict
         model = identified_model_document(judged.identification)
+        if self.reference is not None:
+            model["reference_mdh"] = self.reference.cell.arm.mdh.tolist()
         calibration_id = self._propose(
             THERMAL, command, wall_ns, method, verdict, document, model, data
         )
@@ -218,6 +208,7 @@ class ThermalSession:
                 data,
                 sigma_m=self.config.sigma_m,
                 in_force=self.arm,
+                prior_covariance=self.prior,
                 method=method,
             )
         held = hold_out(pose_groups(data.q), self.config.hold_out, self.config.seed)

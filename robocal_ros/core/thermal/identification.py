@@ -17,10 +17,6 @@ from robocal_ros.core.samples import Measurements
 
 Array = NDArray[np.float64]
 
-EXPANSION_PER_K = 12e-6  # steel and cast iron; aluminium links drift up to twice as much
-PLAUSIBLE_WARMING_K = 20.0
-SMALLEST_LENGTH_M = 0.2  # a joint whose nominal length is zero still has a housing that grows
-DRIFT_ANGLE_RAD = float(np.radians(0.005))
 SAME_VISIT_RAD = float(np.radians(0.5))
 
 
@@ -47,17 +43,6 @@ def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
         When the visit cannot place them.
     """
     return ColdReference(identify(arm, data, fit=("base", "tool"), method="lsq").cell, data)
-
-
-def drift_prior(arm: SerialArm) -> Array:
-    """Covariance (k, k), SI, of the free parameters' thermal drift before it is learned.
-
-    Lengths: link length times expansion coefficient times plausible warming; angles: a fixed
-    small value.
-    """
-    length = np.maximum(np.abs(arm.parameters.read(arm.mdh)), SMALLEST_LENGTH_M)
-    grown = length * EXPANSION_PER_K * PLAUSIBLE_WARMING_K
-    return np.diag(np.where(arm.parameters.is_length, grown, DRIFT_ANGLE_RAD) ** 2)
 
 
 def against_reference(reference: ColdReference, warm: Measurements) -> Measurements:
@@ -92,6 +77,7 @@ def identify_drift(
     *,
     sigma_m: float,
     in_force: SerialArm,
+    prior_covariance: Array,
     method: Method = "map",
 ) -> JudgedIdentification:
     """Identify the drifted model and judge it by leaving out one pose at a time.
@@ -101,6 +87,7 @@ def identify_drift(
     sigma_m : standard deviation of one coordinate of one visit (sensor and repeatability);
         the difference of two visits has sqrt(2) of it.
     in_force : the model that the candidate must beat at the left-out poses.
+    prior_covariance : (k, k), SI, of the drift of the free parameters, for ``map``.
 
     Raises
     ------
@@ -113,7 +100,7 @@ def identify_drift(
     groups = pose_groups(data.q)
     if groups.max() < 1:
         raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
-    prior = drift_prior(nominal) if method == "map" else None
+    prior = prior_covariance if method == "map" else None
     result = _identify(nominal, reference, data, method, prior)
     after, model = np.empty(len(data)), np.empty(len(data))
     for group in range(int(groups.max()) + 1):

@@ -1,0 +1,61 @@
+"""Settings of the thermal session, and the drift that it expects."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.identification import Method
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.core.thermal.priors import drift_prior, learned_prior
+from robocal_ros.sessions.history import History
+
+METHODS: tuple[Method, ...] = ("map", "lsq")
+LEARN_FROM = 500
+
+
+@dataclass(frozen=True)
+class ThermalConfig:
+    """Settings of a thermal session.
+
+    Attributes
+    ----------
+    method : estimator where a command names none.
+    prior : ``default``, or ``learned`` from the drifts accepted so far.
+    sigma_m : standard deviation of one measured coordinate in one visit of a pose.
+    hold_out, seed : share of the poses kept to judge a calibration without reference.
+    lateness_s : a command waits for joint readings this much newer, so that measurements
+        under way still count.
+    measuring_frame : frame of the measurements; empty: that of the first one.
+    """
+
+    method: Method = "map"
+    prior: Literal["default", "learned"] = "default"
+    sigma_m: float = 3e-5
+    hold_out: float = 0.5
+    seed: int = 0
+    lateness_s: float = 0.2
+    measuring_frame: str = ""
+    standstill: StandstillRule = field(default_factory=StandstillRule)
+
+
+def expected_drift(
+    nominal: SerialArm, history: History, config: ThermalConfig
+) -> NDArray[np.float64]:
+    """Covariance (k, k), SI, of the drift: the default, or learned from what was accepted."""
+    default = drift_prior(nominal)
+    if config.prior == "default":
+        return default
+    accepted = [entry.id for entry in history.list(LEARN_FROM) if entry.revision]
+    models = [history.model(calibration_id) for calibration_id in accepted]
+    drifts = [m for m in models if "reference_mdh" in m]
+    if not drifts:
+        return default
+    changes = [np.array(m["mdh"]) - np.array(m["reference_mdh"]) for m in drifts]
+    return learned_prior(
+        default,
+        np.array([nominal.parameters.read(change) for change in changes]),
+        np.array([m["covariance"] for m in drifts]),
+    )
