@@ -1,0 +1,205 @@
+"""Drift identification against a simulated truth: recovery, honesty, and what it cannot see."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.identification import capture_reference, identify_drift
+from robocal_ros.core.thermal.priors import drift_prior, learned_prior
+from robocal_ros.storage.robots import load_robot
+
+SIGMA_M = 2e-5
+BALL = np.array([0.10, 0.05, 0.20, 1.0])
+T_SENSOR_BASE = frames.transform(frames.exp_rotation([0.3, -0.2, 1.0]), [2.0, 1.0, -0.5])
+
+
+@pytest.fixture(scope="module")
+def nominal() -> SerialArm:
+    return load_robot("kr150_r3100")
+
+
+@pytest.fixture(scope="module")
+def cold(nominal: SerialArm) -> SerialArm:
+    """The robot as built: off its nominal model by tenths of a millimetre and hundredths of a deg."""
+    rng = np.random.default_rng(5)
+    size = np.where(nominal.parameters.is_length, 3e-4, np.radians(0.01))
+    return nominal.with_mdh(
+        nominal.parameters.add(nominal.mdh, size * rng.normal(size=len(size)))
+    )
+
+
+def drifted(cold: SerialArm, covariance: np.ndarray, rng: np.random.Generator) -> SerialArm:
+    change = np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
+    return cold.with_mdh(cold.parameters.add(cold.mdh, change))
+
+
+def postures(arm: SerialArm, count: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(np.maximum(arm.lower, -1.6), np.minimum(arm.upper, 1.6), (count, arm.n))
+
+
+def visit(arm: SerialArm, q: np.ndarray, rng: np.random.Generator, noise: float = SIGMA_M):
+    position = (T_SENSOR_BASE @ arm.fk(q) @ BALL)[:, :3]
+    return Measurements(
+        q=q,
+        position=position + noise * rng.normal(size=position.shape),
+        target=("ball",) * len(q),
+        sample=tuple(str(i) for i in range(len(q))),
+    )
+
+
+def drift_error(found: SerialArm, reference: SerialArm, warm: SerialArm, cold: SerialArm, q):
+    """Error (m, 3) of the ball's identified displacement, base axes."""
+    moved = (warm.fk(q) - cold.fk(q)) @ BALL
+    return ((found.fk(q) - reference.fk(q)) @ BALL - moved)[:, :3]
+
+
+def test_expected_error_is_the_achieved_one(nominal, cold):
+    """Truth drawn from the prior: squared errors match the predicted variance.
+
+    The cold model of the session is the true one, so that the statement is about the drift
+    alone. Each run gives about 3 effective numbers per check pose, strongly correlated; with 150
+    runs the mean ratio has a standard error below 0.08.
+    """
+    rng = np.random.default_rng(11)
+    prior = drift_prior(nominal)
+    q, check = postures(nominal, 8, rng), postures(nominal, 40, rng)
+    ratio = []
+    for _ in range(150):
+        warm = drifted(cold, prior, rng)
+        reference = capture_reference(cold, visit(cold, q, rng))
+        judged = identify_drift(
+            nominal,
+            reference,
+            visit(warm, q, rng),
+            sigma_m=SIGMA_M,
+            in_force=cold,
+            prior_covariance=prior,
+        )
+        result = judged.identification
+        error = drift_error(result.cell.arm, cold, warm, cold, check)
+        predicted = result.predicted_variance(check, np.zeros(len(check), dtype=np.int64))
+        ratio.append(np.sum(error**2) / np.trace(predicted.sum(axis=0)))
+    spread = np.std(ratio) / np.sqrt(len(ratio))
+    assert spread < 0.08
+    assert abs(np.mean(ratio) - 1.0) < 4.0 * spread
+
+
+def test_drift_is_recovered_and_accepted(nominal, cold):
+    rng = np.random.default_rng(2)
+    warm = drifted(cold, drift_prior(nominal), rng)
+    q = postures(nominal, 12, rng)
+    reference = capture_reference(nominal, visit(cold, q, rng))
+    judged = identify_drift(
+        nominal,
+        reference,
+        visit(warm, q, rng),
+        sigma_m=SIGMA_M,
+        in_force=nominal,
+        prior_covariance=drift_prior(nominal),
+    )
+    check = postures(nominal, 200, rng)
+    error = drift_error(judged.identification.cell.arm, nominal, warm, cold, check)
+    before = drift_error(nominal, nominal, warm, cold, check)
+    assert judged.verdict.code is Code.ACCEPT
+    assert np.sqrt(np.mean(error**2)) < 0.4 * np.sqrt(np.mean(before**2))
+
+
+def test_one_ball_cannot_tell_the_last_joints_parameters_apart(nominal, cold):
+    rng = np.random.default_rng(3)
+    q = postures(nominal, 20, rng)
+    reference = capture_reference(nominal, visit(cold, q, rng))
+    judged = identify_drift(
+        nominal,
+        reference,
+        visit(cold, q, rng),
+        sigma_m=SIGMA_M,
+        in_force=nominal,
+        prior_covariance=drift_prior(nominal),
+    )
+    assert judged.identification.estimate.observability.rank == 23
+    (words,) = judged.identification.unobservable
+    named = {name for name in nominal.parameters.names if f" {name}" in f" {words}"}
+    assert named <= {"d6_mm", "theta6_deg", "a6_mm", "alpha6_deg"}
+    assert len(named) >= 2
+
+
+def test_no_drift_is_no_gain(nominal, cold):
+    """Without any drift, chance must not bring a model into force more often than 1 in 20."""
+    rng = np.random.default_rng(4)
+    q = postures(nominal, 8, rng)
+    accepted = 0
+    for _ in range(60):
+        reference = capture_reference(nominal, visit(cold, q, rng))
+        judged = identify_drift(
+            nominal,
+            reference,
+            visit(cold, q, rng),
+            sigma_m=SIGMA_M,
+            in_force=nominal,
+            prior_covariance=drift_prior(nominal),
+        )
+        accepted += judged.verdict.accept
+    assert accepted <= 8  # 99.7 % bound of a binomial with 60 trials at 5 %
+
+
+def test_static_errors_cancel(nominal, cold):
+    """Whatever the robot's static error, the same drift is found (noise-free, linear regime)."""
+    rng = np.random.default_rng(6)
+    q = postures(nominal, 12, rng)
+    prior = drift_prior(nominal)
+    change = 0.1 * np.linalg.cholesky(prior) @ rng.normal(size=len(prior))
+    found = []
+    for built in (nominal, cold):
+        warm = built.with_mdh(built.parameters.add(built.mdh, change))
+        reference = capture_reference(nominal, visit(built, q, rng, noise=0.0))
+        judged = identify_drift(
+            nominal,
+            reference,
+            visit(warm, q, rng, noise=0.0),
+            sigma_m=SIGMA_M,
+            in_force=nominal,
+            prior_covariance=prior,
+        )
+        check = postures(nominal, 50, np.random.default_rng(0))
+        found.append((judged.identification.cell.arm.fk(check) - nominal.fk(check)) @ BALL)
+    # static errors turn the drift by about 1e-3 rad: a thousandth of 0.05 mm
+    assert np.abs(found[0] - found[1]).max() < 2e-6
+
+
+def test_a_pose_without_cold_visit_is_refused(nominal, cold):
+    rng = np.random.default_rng(7)
+    q = postures(nominal, 8, rng)
+    reference = capture_reference(nominal, visit(cold, q, rng))
+    elsewhere = replace(visit(cold, q, rng), q=q + np.radians(2.0))
+    with pytest.raises(InputError, match="not measured in the cold reference"):
+        identify_drift(
+            nominal,
+            reference,
+            elsewhere,
+            sigma_m=SIGMA_M,
+            in_force=nominal,
+            prior_covariance=drift_prior(nominal),
+        )
+
+
+def test_learned_prior_tends_to_the_true_covariance():
+    rng = np.random.default_rng(8)
+    truth, default = np.diag([4.0, 1.0, 0.25]), np.eye(3)
+    drifts = rng.normal(size=(4000, 3)) * np.sqrt(np.diag(truth))
+    learned = learned_prior(default, drifts, np.zeros((4000, 3, 3)))
+    # a variance from 4000 draws has a relative standard error of sqrt(2/4000) = 2.2 %
+    np.testing.assert_allclose(np.diag(learned), np.diag(truth), rtol=0.1)
+
+
+def test_learned_prior_keeps_the_default_where_nothing_was_seen():
+    unseen = np.tile(np.diag([1e-6, 1.0]), (50, 1, 1))
+    drifts = np.zeros((50, 2))
+    learned = learned_prior(np.eye(2), drifts, unseen)
+    assert learned[1, 1] == pytest.approx(1.0)
+    assert learned[0, 0] < 0.2
