@@ -1,0 +1,137 @@
+"""Inputs, outputs, services and timers of a lifecycle node, with the manners of this house."""
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from lifecycle_msgs.msg import State
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.nodes import qos
+
+LOG_EVERY_S = 5.0
+
+
+class NotActiveError(RobocalError):
+    """A service was called while its node is not active."""
+
+    code = Code.CONFLICT
+
+
+@dataclass
+class InputCount:
+    """Messages of one input: all, ignored while inactive, refused as invalid."""
+
+    received: int = 0
+    ignored: int = 0
+    invalid: int = 0
+
+
+class EndpointNode(LifecycleNode):
+    """A lifecycle node whose endpoints act only while it is active and go at its cleanup."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self.inputs: dict[str, InputCount] = {}
+        self._async_group = ReentrantCallbackGroup()
+        self._release: list[Callable[[], object]] = []
+
+    @property
+    def state(self) -> str:
+        """Label of the lifecycle state."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_active(self) -> bool:
+        """True while the node acts."""
+        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+
+    def now_ns(self) -> int:
+        """ROS time, ns (simulated when ``use_sim_time``)."""
+        return int(self.get_clock().now().nanoseconds)
+
+    def add_input(
+        self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile
+    ) -> None:
+        """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid."""
+        count = self.inputs.setdefault(topic, InputCount())
+
+        def receive(message: Any) -> None:
+            count.received += 1
+            if not self.is_active:
+                count.ignored += 1
+                return
+            try:
+                callback(message)
+            except RobocalError as error:
+                count.invalid += 1
+                self.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=LOG_EVERY_S)
+
+        subscription = self.create_subscription(
+            kind, topic, receive, qos.own(profile), qos_overriding_options=qos.overridable()
+        )
+        self._release.append(lambda: self.destroy_subscription(subscription))
+
+    def add_output(self, kind: type, topic: str, profile: QoSProfile) -> Any:
+        """Return a publisher that is silent while the node is inactive, until cleanup."""
+        publisher = self.create_lifecycle_publisher(
+            kind, topic, qos.own(profile), qos_overriding_options=qos.overridable()
+        )
+        self._release.append(lambda: self.destroy_lifecycle_publisher(publisher))
+        return publisher
+
+    def add_service(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
+        """Serve until cleanup; ``callback(request, response)`` may be ``async``.
+
+        While inactive, and when the callback raises a `RobocalError`, the answer is
+        ``success = False`` with the reason in ``message`` and its code in ``status``. An async
+        callback may await other services; the node must then run in the plain executor.
+        """
+        if inspect.iscoroutinefunction(callback):
+
+            async def serve(request: Any, response: Any) -> Any:
+                try:
+                    self._require_active(name)
+                    return await callback(request, response)
+                except RobocalError as error:
+                    return self._refuse(name, response, error)
+
+            service = self.create_service(kind, name, serve, callback_group=self._async_group)
+        else:
+
+            def answer(request: Any, response: Any) -> Any:
+                try:
+                    self._require_active(name)
+                    return callback(request, response)
+                except RobocalError as error:
+                    return self._refuse(name, response, error)
+
+            service = self.create_service(kind, name, answer)
+        self._release.append(lambda: self.destroy_service(service))
+
+    def add_timer(self, period_s: float, callback: Callable[[], None]) -> None:
+        """Call back every ``period_s`` of ROS time while active, until cleanup."""
+        timer = self.create_timer(period_s, lambda: callback() if self.is_active else None)
+        self._release.append(lambda: self.destroy_timer(timer))
+
+    def release_endpoints(self) -> None:
+        """Take down all of them, the last one first."""
+        while self._release:
+            self._release.pop()()
+
+    def _require_active(self, name: str) -> None:
+        if not self.is_active:
+            raise NotActiveError(f"{self.get_name()} is {self.state}: activate it to use {name}")
+
+    def _refuse(self, name: str, response: Any, error: RobocalError) -> Any:
+        self.get_logger().warning(f"{name}: {error}")
+        response.success = False
+        response.message = str(error)
+        if hasattr(response, "status"):
+            response.status = int(error.code)
+        return response
