@@ -1,0 +1,33 @@
+"""What all tests share: the place of the real measurements, and which tests can run here."""
+
+import importlib.util
+import os
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+# Without rclpy (make test-floor) the node tests cannot even be imported.
+collect_ignore = [] if importlib.util.find_spec("rclpy") else ["nodes"]
+
+
+def find_data() -> Path:
+    """Folder of the real measurements, whether it is there or not."""
+    return Path(os.environ.get("ROBOCAL_DATA", ROOT.parent / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    folder = find_data()
+    if folder.is_dir():
+        return
+    absent = pytest.mark.skip(reason=f"no real measurements at {folder} (set ROBOCAL_DATA)")
+    for item in items:
+        if item.get_closest_marker("data"):
+            item.add_marker(absent)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of the real measurements; the test must be marked ``data``."""
+    return find_data()

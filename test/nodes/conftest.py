@@ -1,0 +1,221 @@
+"""Harness of the node tests: a graph of its own for each test, spun in the test's own thread."""
+
+import contextlib
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+
+from robocal_ros.nodes import qos
+
+ROOT = Path(__file__).parent.parent.parent
+EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
+# Domains whose ports lie below those that Linux hands out to any program.
+DOMAINS = range(1, 102)
+DEADLINE_S = 10.0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    for item in items:
+        if here in item.path.parents:
+            item.add_marker(pytest.mark.ros)
+
+
+class Executable:
+    """A node that runs as its own process."""
+
+    def __init__(self, name: str, command: list[str], environment: dict[str, str]) -> None:
+        self.name = name
+        self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by stop)
+        self.process = subprocess.Popen(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=self._log,
+            stderr=subprocess.STDOUT,
+        )
+
+    @property
+    def output(self) -> str:
+        """What the process wrote so far."""
+        self._log.seek(0)
+        return self._log.read()
+
+    def kill(self) -> None:
+        """End it as a power cut would."""
+        self.process.kill()
+        self.process.wait()
+
+    def stop(self, by: signal.Signals = signal.SIGINT) -> int:
+        """Ask it to end, and return its exit status; one that stays is a failure."""
+        if self.process.poll() is None:
+            self.process.send_signal(by)
+        try:
+            return self.process.wait(DEADLINE_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            pytest.fail(f"{self.name} did not end at {by.name}:\n{self.output}")
+
+    def close(self) -> None:
+        """Make sure that it is gone."""
+        if self.process.poll() is None:
+            self.kill()
+        self._log.close()
+
+
+class Graph:
+    """One ROS graph: nodes in this process, executables beside it, and a probe that talks to them.
+
+    Nothing runs by itself: nodes of this process work only inside ``spin_until``, ``spin_for``
+    and ``call``.
+    """
+
+    def __init__(self, domain: int, state: Path) -> None:
+        self.domain = domain
+        self.context = Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.probe = Node("probe", context=self.context, start_parameter_services=False)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.probe)
+        self._environment = os.environ | {
+            "ROS_DOMAIN_ID": str(domain),
+            "ROBOCAL_STATE": str(state),
+            "PYTHONUNBUFFERED": "1",
+        }
+        self._nodes: list[Any] = []
+        self._executables: list[Executable] = []
+
+    def add(
+        self, node_class: type, parameters: dict[str, Any] | None = None, **options: Any
+    ) -> Any:
+        """Start a house node in this process, as ``run`` would."""
+        overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
+        node = node_class(
+            context=self.context,
+            parameter_overrides=overrides,
+            use_global_arguments=False,
+            **options,
+        )
+        self._nodes.append(node)
+        self.executor.add_node(node)
+        node.autostart()
+        return node
+
+    def start(
+        self,
+        executable: str | Path,
+        parameters: dict[str, Any] | None = None,
+        remap: dict[str, str] | None = None,
+        *arguments: str,
+    ) -> Executable:
+        """Start an executable of the install tree (or a script); it is ended with the test."""
+        ros = [f"-p{name}:={value}" for name, value in (parameters or {}).items()]
+        ros += [f"-r{old}:={new}" for old, new in (remap or {}).items()]
+        ros_arguments = [item for pair in ros for item in (pair[:2], pair[2:])]
+        program = (
+            [sys.executable, str(executable)]
+            if isinstance(executable, Path)
+            else [str(EXECUTABLES / executable)]
+        )
+        command = [*program, *arguments, "--ros-args", *ros_arguments]
+        process = Executable(str(executable), command, self._environment)
+        self._executables.append(process)
+        return process
+
+    def spin_until(
+        self, condition: Callable[[], object], what: str = "", within_s: float = DEADLINE_S
+    ) -> None:
+        """Let the graph work until the condition holds; fail at the deadline."""
+        deadline = time.monotonic() + within_s
+        while not condition():
+            left = deadline - time.monotonic()
+            if left <= 0:
+                logs = "".join(f"\n--- {e.name}:\n{e.output}" for e in self._executables)
+                pytest.fail(f"not within {within_s} s: {what or condition}{logs}")
+            self.executor.spin_once(timeout_sec=min(left, 0.05))
+
+    def spin_for(self, seconds: float) -> None:
+        """Let the graph work for a time, to show that something does not happen."""
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0:
+            self.executor.spin_once(timeout_sec=left)
+
+    def call(self, kind: type, name: str, within_s: float = DEADLINE_S, **fields: Any) -> Any:
+        """Call a service, waiting for it to appear, and return its response."""
+        client = self.probe.create_client(kind, name)
+        try:
+            self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
+            future = client.call_async(kind.Request(**fields))
+            self.spin_until(future.done, f"service {name} answers", within_s)
+            return future.result()
+        finally:
+            self.probe.destroy_client(client)
+
+    def collect(self, kind: type, topic: str, profile: QoSProfile = qos.RELIABLE) -> list[Any]:
+        """Subscribe; return the list that gathers what arrives."""
+        inbox: list[Any] = []
+        self.probe.create_subscription(kind, topic, inbox.append, qos.own(profile))
+        return inbox
+
+    def publisher(
+        self, kind: type, topic: str, profile: QoSProfile = qos.RELIABLE, subscribers: int = 1
+    ) -> Publisher:
+        """Publish as the probe, once so many subscribers are there."""
+        publisher = self.probe.create_publisher(kind, topic, qos.own(profile))
+        self.spin_until(
+            lambda: publisher.get_subscription_count() >= subscribers,
+            f"{subscribers} subscribers of {topic}",
+        )
+        return publisher
+
+    def close(self) -> None:
+        """End everything."""
+        for executable in self._executables:
+            executable.close()
+        for node in self._nodes:
+            self.executor.remove_node(node)
+            node.close()
+        self.executor.shutdown()
+        self.probe.destroy_node()
+        self.context.try_shutdown()
+
+
+@contextlib.contextmanager
+def free_domain() -> Iterator[int]:
+    """Reserve a ROS domain that no other test on this machine uses."""
+    for domain in DOMAINS:
+        path = Path(tempfile.gettempdir(), f"robocal_test_domain_{domain}.lock")
+        with contextlib.suppress(BlockingIOError), path.open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield domain
+            return
+    pytest.fail("all ROS domains are in use by other tests")
+
+
+@pytest.fixture
+def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
+    """A private graph, with its own domain and its own state folder (``ROBOCAL_STATE``)."""
+    state = tmp_path / "state"
+    monkeypatch.setenv("ROBOCAL_STATE", str(state))
+    with free_domain() as domain:
+        graph = Graph(domain, state)
+        try:
+            yield graph
+        finally:
+            graph.close()

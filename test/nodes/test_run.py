@@ -1,0 +1,72 @@
+"""A node as a process of its own: how it starts and how it ends."""
+
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from std_srvs.srv import Trigger
+
+SCRIPT = """
+import sys
+from std_srvs.srv import Trigger
+from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.run import run
+
+class Sleeper(HouseNode):
+    NAME = "sleeper"
+    def configure(self):
+        self.add_service(Trigger, "~/ping", self.on_ping)
+        self.add_service(Trigger, "~/break", lambda request, response: 1 / 0)
+    def on_ping(self, request, response):
+        response.success = True
+        return response
+    def cleanup(self):
+        print("released", flush=True)
+
+run(Sleeper, events=EVENTS)
+"""
+
+
+@pytest.fixture(params=[False, True], ids=["plain executor", "events executor"])
+def script(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / "sleeper.py"
+    path.write_text(SCRIPT.replace("EVENTS", str(request.param)))
+    return path
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) -> None:
+    sleeper = graph.start(script)
+    assert graph.call(Trigger, "/sleeper/ping").success
+    began = time.monotonic()
+    assert sleeper.stop(by) == 0
+    assert time.monotonic() - began < 1.0
+    assert sleeper.output.count("released") == 1
+    assert "Traceback" not in sleeper.output
+
+
+def test_answers_within_the_time_of_a_bare_start(graph: Any, script: Path) -> None:
+    began = time.monotonic()
+    sleeper = graph.start(script)
+    assert graph.call(Trigger, "/sleeper/ping").success
+    assert time.monotonic() - began < 1.5
+    sleeper.stop()
+
+
+def test_a_bug_ends_the_process_and_says_where(graph: Any, script: Path) -> None:
+    sleeper = graph.start(script)
+    client = graph.probe.create_client(Trigger, "/sleeper/break")
+    graph.spin_until(client.service_is_ready, "the service appears")
+    client.call_async(Trigger.Request())
+    graph.spin_until(lambda: sleeper.process.poll() is not None, "the process ends")
+    assert sleeper.process.returncode == 1
+    assert "ZeroDivisionError" in sleeper.output
+    assert "released" in sleeper.output
+
+
+def test_waits_for_a_better_parameter_when_one_is_bad(graph: Any, script: Path) -> None:
+    sleeper = graph.start(script, {"serial": 5})
+    graph.spin_until(lambda: "is not text" in sleeper.output, "the fault is logged")
+    assert sleeper.stop() == 0
