@@ -1,0 +1,62 @@
+"""Small helpers that the readers and writers of files share."""
+
+import difflib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from robocal_ros.core.errors import InputError
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Words that suggest the known name nearest to ``name``: `` (did you mean 'x_mm'?)``, or none.
+
+    Upper and lower case count as equal.
+    """
+    folded = {word.casefold(): word for word in known}
+    found = difflib.get_close_matches(name.casefold(), folded, n=1, cutoff=0.5)
+    return f" (did you mean '{folded[found[0]]}'?)" if found else ""
+
+
+def read_text(path: Path, what: str) -> str:
+    """Text of a UTF-8 file, without a byte order mark.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, unreadable, empty or not UTF-8.
+    """
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"no such {what}", file=str(path)) from error
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"this {what} cannot be read: {reason}", file=str(path)) from error
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        message = f"byte {error.start} is not UTF-8 text; save the {what} as UTF-8"
+        raise InputError(message, file=str(path)) from error
+    if not text.strip():
+        raise InputError(f"this {what} is empty", file=str(path))
+    return text
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole file or nothing: a reader never sees one that is half-written.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be written.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with draft.open("w", encoding="utf-8", newline="") as stream:
+            stream.write(text)
+        draft.replace(path)
+    except OSError as error:
+        draft.unlink(missing_ok=True)
+        reason = error.strerror or error
+        raise InputError(f"cannot be written: {reason}", file=str(path)) from error
