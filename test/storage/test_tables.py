@@ -8,11 +8,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.storage.tables import beyond_limits, read_measurements, write_measurements
-from scipy.spatial.transform import Rotation
 
 
 def make_arm(prismatic: tuple[bool, ...]) -> SerialArm:
@@ -119,7 +120,7 @@ def test_what_spreadsheets_write_is_read(tmp_path: Path, text: str) -> None:
         (" \n\n", None, None, "empty"),
         ("q1_deg,q2_deg,x_mm,y_mm,z_mm\n", None, None, "no measurements"),
         (GOOD.replace("q2_deg", "q2_dge"), 1, "q2_dge", "its column is q2_deg or q2_rad"),
-        (GOOD.replace("y_mm", "y_mn"), 1, "y_mn", "'y_mm'"),
+        (GOOD.replace("y_mm", "ymm"), 1, "ymm", "'y_mm'"),
         (GOOD.replace("x_mm", "X_mm"), 1, "X_mm", "'x_mm'"),
         (GOOD.replace("x_mm", "temperature"), 1, "temperature", "unknown column"),
         (GOOD.replace("q2_deg", "q3_deg"), 1, "q3_deg", "has 2 joints"),
