@@ -43,6 +43,7 @@ class Outcome:
     status : ACCEPT when done, else why not.
     document : the identification, where one was made.
     calibration_id, revision : what was proposed or decided, and the revision now in force.
+    outside : decided in the history by another process; nobody asked this session.
     """
 
     command: Command
@@ -52,6 +53,7 @@ class Outcome:
     calibration_id: int = 0
     revision: int = 0
     samples: int = 0
+    outside: bool = False
 
     @property
     def done(self) -> bool:

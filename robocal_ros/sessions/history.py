@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, Protocol
 
-from robocal_ros.core.proposals import Entry, Head, Proposal
+from robocal_ros.core.proposals import Decision, Entry, Head, Proposal
 
 
 class History(Protocol):
@@ -40,8 +40,8 @@ class History(Protocol):
     def pending(self, kind: str = ...) -> Sequence[Entry]:
         """Candidates that wait for a decision."""
 
-    def get(self, calibration_id: int) -> Entry:
-        """One calibration with its decisions."""
+    def decisions(self, after_seq: int = ...) -> Sequence[Decision]:
+        """Decisions after a sequence number, oldest first."""
 
     def list(self, limit: int = ...) -> Sequence[Entry]:
         """The latest calibrations, newest first."""

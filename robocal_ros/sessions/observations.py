@@ -1,5 +1,6 @@
 """Measurements paired with the joints of the same instant, whatever order they arrive in."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,11 @@ JOINTS = "joint_states"
 POINT = "measured_point"
 POSE = "measured_pose"
 
+MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
+MOST_KEPT = 20000  # observations that no command has used
+MOST_REASONS = 30
+_NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
+
 
 @dataclass(frozen=True, eq=False)
 class Observation:
@@ -28,6 +34,7 @@ class Observation:
     stamp_ns: int
     ready_ns: int
     topic: str
+    frame: str
     target: str
     q: Array
     position: Array
@@ -40,48 +47,88 @@ class ObservationDesk:
 
     Everything is decided by stamps: the same samples give the same observations however the
     topics interleave. ``ignored`` counts what was left out, by topic and reason.
+
+    Attributes
+    ----------
+    frame : the measuring frame; None until the first observation that is used gives it.
+    newest_ns : newest stamp of each topic.
+    used_ns : observations up to this stamp were used.
     """
 
     joint_names: tuple[str, ...]
     rule: StandstillRule
-    frame: str = ""
+    frame: str | None = None
     stream: JointStream = field(init=False)
     newest_ns: dict[str, int] = field(default_factory=dict)
+    used_ns: int = -1
     received: Counter[str] = field(default_factory=Counter)
     ignored: dict[str, Counter[str]] = field(default_factory=dict)
+    _complete_ns: int | None = None
     _pending: list[PointSample | PoseSample] = field(default_factory=list)
     _observed: list[Observation] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.stream = JointStream(self.joint_names)
 
-    def ignore(self, topic: str, reason: str) -> None:
-        """Count a sample that is not used."""
-        self.ignored.setdefault(topic, Counter())[reason] += 1
+    @property
+    def from_ns(self) -> int:
+        """Stamp from which observations are complete and not yet used."""
+        return max(self.used_ns + 1, self._complete_ns or 0)
+
+    def ignore(self, topic: str, reason: str, count: int = 1) -> None:
+        """Count samples that are not used; numbers in the reason do not tell reasons apart."""
+        counter = self.ignored.setdefault(topic, Counter())
+        reason = _NUMBER.sub("#", reason)
+        counter[reason if reason in counter or len(counter) < MOST_REASONS else "other"] += count
 
     def add_joints(self, sample: JointSample) -> None:
-        """Take a joint reading."""
+        """Take a joint reading; a clock that jumps back begins everything anew."""
         self.received[JOINTS] += 1
+        if sample.stamp_ns <= 0:
+            self.ignore(JOINTS, "no time stamp")
+            return
+        newest = self.stream.newest_ns
         try:
             self.stream.add(sample, int(self.rule.gap_s * 1e9))
         except InputError as error:
-            self.ignore(JOINTS, _reason(error))
+            self.ignore(JOINTS, str(error))
             return
+        if newest is None or sample.stamp_ns < newest:
+            self._begin(sample.stamp_ns)
         self.newest_ns[JOINTS] = sample.stamp_ns
         if self._pending:
             self._pair()
+
+    def _begin(self, first_ns: int) -> None:
+        """Start at the first joint reading; what an earlier clock stamped means nothing now."""
+        if self._complete_ns is not None:
+            for topic, count in Counter(o.topic for o in self._observed).items():
+                self.ignore(topic, "the clock jumped back", count)
+            self._observed.clear()
+            self._pending.clear()
+            self.newest_ns.clear()
+            self.used_ns = -1
+        self._complete_ns = first_ns + int(self.rule.before_s * 1e9)
 
     def add_measurement(self, sample: PointSample | PoseSample) -> None:
         """Take a measured point or pose; its joints may come before or after it."""
         topic = POINT if isinstance(sample, PointSample) else POSE
         self.received[topic] += 1
-        self.frame = self.frame or sample.frame
-        if sample.frame != self.frame:
-            self.ignore(topic, f"frame '{sample.frame}' is not the measuring frame '{self.frame}'")
+        if sample.stamp_ns <= 0:
+            self.ignore(topic, "no time stamp")
+            return
+        if self.frame is not None and sample.frame != self.frame:
+            self._ignore_frame(topic, sample.frame)
             return
         self.newest_ns[topic] = max(sample.stamp_ns, self.newest_ns.get(topic, sample.stamp_ns))
         self._pending.append(sample)
+        if len(self._pending) > MOST_WAITING:
+            del self._pending[0]
+            self.ignore(topic, "no joint readings came")
         self._pair()
+
+    def _ignore_frame(self, topic: str, frame: str) -> None:
+        self.ignore(topic, f"frame '{frame}' is not the measuring frame '{self.frame}'")
 
     def _pair(self) -> None:
         waiting: list[PointSample | PoseSample] = []
@@ -102,14 +149,20 @@ class ObservationDesk:
                 position, rotation = T[:3, 3], T[:3, :3]
             self._observed.append(
                 Observation(
-                    sample.stamp_ns, reading.ready_ns, topic, sample.target,
+                    sample.stamp_ns, reading.ready_ns, topic, sample.frame, sample.target,
                     reading.q, position, rotation,
                 )
             )  # fmt: skip
         self._pending = waiting
+        if len(self._observed) > MOST_KEPT:
+            self.ignore(self._observed.pop(0).topic, "no command used it")
 
     def window(self, after_ns: int, until_ns: int, marks: Mapping[str, int]) -> list[Observation]:
-        """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``."""
+        """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``.
+
+        Ordered by stamp and target. Of a target measured twice at one stamp the pose counts,
+        else the first; the first observation gives the measuring frame where none is set.
+        """
         joints = marks.get(JOINTS, -1)
         found = [
             o
@@ -118,27 +171,36 @@ class ObservationDesk:
             and o.ready_ns <= joints
             and o.stamp_ns <= marks.get(o.topic, -1)
         ]
-        return sorted(found, key=lambda o: (o.stamp_ns, o.topic, o.target))
+        found.sort(key=lambda o: (o.stamp_ns, o.target, o.topic != POSE))
+        if found and self.frame is None:
+            self.frame = found[0].frame
+            for other in [o for o in self._observed if o.frame != self.frame]:
+                self._ignore_frame(other.topic, other.frame)
+            self._observed = [o for o in self._observed if o.frame == self.frame]
+        once: dict[tuple[int, str], Observation] = {}
+        for observation in found:
+            if observation.frame == self.frame:
+                once.setdefault((observation.stamp_ns, observation.target), observation)
+        return list(once.values())
 
-    def forget(self, until_ns: int) -> None:
+    def use(self, until_ns: int) -> None:
         """Drop observations up to a stamp: they were used."""
+        self.used_ns = max(self.used_ns, until_ns)
         self._observed = [o for o in self._observed if o.stamp_ns > until_ns]
-
-
-def _reason(error: InputError) -> str:
-    """The message without its stamps, so that repeated ones count together."""
-    return "stamp not after the newest one" if "is not after" in str(error) else str(error)
 
 
 def as_measurements(observations: Sequence[Observation]) -> Measurements:
     """Arrays of observations; orientations only where all have one."""
     rotations = [o.rotation for o in observations if o.rotation is not None]
     complete = bool(observations) and len(rotations) == len(observations)
+    several = len({o.target for o in observations}) > 1
     return Measurements(
         q=np.array([o.q for o in observations]),
         position=np.array([o.position for o in observations]),
         target=tuple(o.target for o in observations),
-        sample=tuple(str(o.stamp_ns) for o in observations),
+        sample=tuple(
+            f"{o.stamp_ns}/{o.target}" if several else str(o.stamp_ns) for o in observations
+        ),
         rotation=np.array(rotations) if complete else None,
         stamp_ns=np.array([o.stamp_ns for o in observations], dtype=np.int64),
     )

@@ -9,8 +9,11 @@ from typing import Any
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions.events import CONFIGURE, Command, Outcome
+from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
+
+VERSION = 1
 
 
 def _text(document: Mapping[str, Any]) -> str:
@@ -25,8 +28,9 @@ def digest(document: Mapping[str, Any] | None) -> str:
 
 
 def arguments_text(command: Command) -> str:
-    """Arguments and marks of a command as JSON."""
-    return _text({"arguments": dict(command.arguments), "marks": dict(command.marks or {})})
+    """Arguments and marks of a command as JSON, with the version of this form."""
+    marks = dict(command.marks or {})
+    return _text({"version": VERSION, "arguments": dict(command.arguments), "marks": marks})
 
 
 def outcome_text(outcome: Outcome) -> str:
@@ -49,30 +53,39 @@ def read_command(name: str, stamp_ns: int, arguments: str) -> Command:
     Raises
     ------
     InputError
-        When the text is no such record.
+        When the text is no such record, or of a newer version.
     """
     try:
         record = json.loads(arguments)
+        if record["version"] != VERSION:
+            raise InputError(
+                f"session event '{name}' has version {record['version']}; this software knows "
+                f"version {VERSION}: replay it with the software that recorded it"
+            )
         marks = {str(topic): int(mark) for topic, mark in record["marks"].items()}
         return Command(name, dict(record["arguments"]), stamp_ns, marks)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"session event '{name}' cannot be read: {error}") from error
 
 
-def configuration(session: ThermalSession) -> Command:
-    """The session's settings and what it started from, so that replay starts from the same."""
-    reference = session.reference_model
+def configuration(session: ThermalSession, topics: Mapping[str, str] | None = None) -> Command:
+    """The session's settings and what is in force, so that replay can start from the same.
+
+    Recorded at the start and after each change of what is in force: a recording that begins
+    later has it too. ``topics``: name of each input's topic.
+    """
     return Command(
         CONFIGURE,
         {
             "robot": session.nominal.name,
             "model_hash": session.nominal.model_hash,
+            "topics": dict(topics or {}),
             "config": asdict(session.config),
             "model": session.in_force.model,
-            "reference": reference,
+            "reference": session.reference_model,
             "prior": session.prior.tolist(),
         },
-        0,
+        session.desk.newest_ns.get(JOINTS, 0),
         {},
     )
 

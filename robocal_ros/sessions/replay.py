@@ -8,15 +8,17 @@ from typing import Any, Protocol
 import numpy as np
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import joint_sample, point_sample, pose_sample, stamp_ns
+from robocal_ros.core.samples import stamp_ns
 from robocal_ros.core.thermal.identification import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observations import JOINTS, POINT, POSE, Observation
 from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.thermal import ThermalSession
 
 EVENTS = "session_events"
+UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
 LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
 
 
@@ -50,9 +52,13 @@ def topic_kind(topic: str) -> str:
 
 
 def read_events(
-    messages: Iterable[Recorded],
+    messages: Iterable[Recorded], from_ns: int = 0
 ) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
-    """The last configuration and the commands after it, each with its recorded outcome.
+    """Read the recorded commands, each with its outcome, and the configuration before them.
+
+    ``from_ns`` is the stamp of the first recorded joint reading. What was commanded before it is
+    in the bag only because the topic is latched; its samples are not. It is left out, and the
+    configuration is the one that it led to.
 
     Raises
     ------
@@ -65,46 +71,72 @@ def read_events(
         event = recorded.message
         command = read_command(event.command, stamp_ns(event.stamp), event.arguments)
         if command.name == events.CONFIGURE:
-            configured, found = command, []
-        else:
+            configured = configured if found else command
+        elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
     return configured, found
 
 
-def feed(session: ThermalSession, recorded: Recorded) -> None:
-    """Give a recorded sample to the session; one that cannot be used is counted."""
-    kind = topic_kind(recorded.topic)
-    try:
-        if kind == JOINTS:
-            session.add(joint_sample(recorded.message))
-        elif kind == POINT:
-            session.add(point_sample(recorded.message))
-        elif kind == POSE:
-            session.add(pose_sample(recorded.message))
-    except InputError as error:
-        session.desk.ignore(kind, str(error))
+def input_topics(topics: Iterable[str], configured: Command | None = None) -> dict[str, str]:
+    """Tell which recorded topic is which input of the session: topic name to input.
+
+    The configuration names them; without it the last part of a name decides. Joint states that
+    a correction node has un-corrected are never an input.
+
+    Raises
+    ------
+    InputError
+        When two topics could be the same input.
+    """
+    recorded = {} if configured is None else dict(configured.arguments.get("topics", {}))
+    if recorded:
+        return {str(topic): str(kind) for kind, topic in recorded.items()}
+    found: dict[str, str] = {}
+    for topic in sorted(topics):
+        kind = topic_kind(topic)
+        if kind not in (JOINTS, POINT, POSE) or UNCORRECTED in topic:
+            continue
+        if kind in found.values():
+            other = next(name for name, its in found.items() if its == kind)
+            raise InputError(f"both {other} and {topic} could be {kind}: record one of them")
+        found[topic] = kind
+    return found
+
+
+def feed(
+    session: ThermalSession, recorded: Recorded, topics: Mapping[str, str] | None = None
+) -> None:
+    """Give a recorded sample to the session; one that cannot be used is counted.
+
+    ``topics``: see `input_topics`; without it the last part of the name decides.
+    """
+    topic = recorded.topic
+    kind = topic_kind(topic) if topics is None else topics.get(topic, "")
+    take_message(session, kind, recorded.message)
 
 
 def replay(
     session: ThermalSession,
     messages: Iterable[Recorded],
     commands: Sequence[tuple[Command, Mapping[str, Any]]],
+    topics: Mapping[str, str] | None = None,
 ) -> ReplayReport:
     """Play samples through a session and carry out commands where they were carried out.
 
     ``commands``: each with its recorded outcome (empty: none was recorded). Ids of calibrations
     differ between histories; a recorded id is translated to the one given here.
+    ``topics``: see `input_topics`.
     """
     report = ReplayReport(commands=len(commands))
     expected = iter(commands)
     ids: dict[int, int] = {}
     awaited = _submit_next(session, expected, ids)
     for recorded in messages:
-        feed(session, recorded)
-        while awaited is not None and (done := session.advance(wall_ns=0)):
+        feed(session, recorded, topics)
+        while awaited is not None and (done := session.step(wall_ns=0)):
             awaited = _take(session, report, done, awaited, expected, ids)
     while awaited is not None:
-        done = session.advance(wall_ns=0, force=True)
+        done = session.step(wall_ns=0, force=True)
         awaited = _take(session, report, done, awaited, expected, ids)
     return report
 
@@ -133,7 +165,7 @@ def _take(
     expected: Iterator[tuple[Command, Mapping[str, Any]]],
     ids: dict[int, int],
 ) -> Mapping[str, Any] | None:
-    outcome = done[0]
+    outcome = done[-1]
     report.outcomes.append(outcome)
     if recorded:
         if recorded["id"] and outcome.calibration_id:

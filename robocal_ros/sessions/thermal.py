@@ -14,12 +14,11 @@ from robocal_ros.core.documents import (
     identification_document,
     identified_model_document,
     reference_document,
-    reference_of,
 )
 from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_judge
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, Head, Proposal
+from robocal_ros.core.proposals import THERMAL, Decision, Head, Proposal
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
 from robocal_ros.core.thermal.identification import (
     ColdReference,
@@ -29,6 +28,7 @@ from robocal_ros.core.thermal.identification import (
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
+from robocal_ros.sessions.in_force import REFERENCE, InForce
 from robocal_ros.sessions.observations import (
     JOINTS,
     Observation,
@@ -39,7 +39,7 @@ from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig, expected
 
 __all__ = ["ThermalConfig", "ThermalSession"]
 
-REFERENCE = "reference"
+SAME_CLOCK_NS = 1_000_000_000
 
 
 class ThermalSession:
@@ -51,8 +51,6 @@ class ThermalSession:
     Attributes
     ----------
     prior : (k, k) covariance of the expected drift, fixed for the life of the session.
-    in_force : head of the history as the session last saw it.
-    reference : the cold reference, or None.
     """
 
     def __init__(
@@ -65,15 +63,29 @@ class ThermalSession:
     ) -> None:
         self.nominal = nominal
         self.config = config
-        self.desk = ObservationDesk(nominal.joint_names, config.standstill, config.measuring_frame)
+        self.desk = ObservationDesk(
+            nominal.joint_names, config.standstill, config.measuring_frame or None
+        )
         self._history = history
         self._software = software
         self._queue: list[Command] = []
-        self._used_ns = -1
-        self._version = history.data_version()
-        self.in_force: Head = history.head(THERMAL)
-        self.reference = self._stored_reference()
+        self._current = InForce(history, nominal)
         self.prior = expected_drift(nominal, history, config) if prior is None else prior
+
+    @property
+    def in_force(self) -> Head:
+        """Head of the history as the session last saw it."""
+        return self._current.head
+
+    @property
+    def reference(self) -> ColdReference | None:
+        """The cold reference, or None."""
+        return self._current.reference
+
+    @property
+    def fault(self) -> str:
+        """Why the history could not be read at the last look; empty when it could."""
+        return self._current.fault
 
     @property
     def arm(self) -> SerialArm:
@@ -93,10 +105,16 @@ class ThermalSession:
         else:
             self.desk.add_measurement(sample)
 
-    def submit(self, command: Command) -> None:
-        """Queue a command; ``advance`` carries it out when its samples are complete."""
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command; ``advance`` carries it out when its samples are complete.
+
+        A command without a stamp gets ``clock_ns`` where that is on the samples' clock (within
+        a second after the newest of them), else the newest stamp known.
+        """
         if command.stamp_ns is None:
-            command = replace(command, stamp_ns=self.desk.newest_ns.get(JOINTS, 0))
+            newest = max(self.desk.newest_ns.values(), default=0)
+            near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
+            command = replace(command, stamp_ns=clock_ns if near else newest)
         self._queue.append(command)
 
     @property
@@ -111,12 +129,28 @@ class ThermalSession:
         there (no more samples will come, or a caller's deadline has passed).
         """
         outcomes: list[Outcome] = []
-        while self._queue and (force or self._ready(self._queue[0])):
-            command = self._queue.pop(0)
-            if command.marks is None:
-                command = replace(command, marks=dict(self.desk.newest_ns))
-            outcomes.append(self._carry_out(command, wall_ns))
+        while done := self.step(wall_ns=wall_ns, force=force):
+            outcomes += done
         return outcomes
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command, as ``advance``: what was decided outside before it, and it."""
+        if not self._queue or not (force or self._ready(self._queue[0])):
+            return []
+        command = self._queue.pop(0)
+        outside = self.poll()
+        if command.marks is None:
+            command = self._marked(command)
+        outcome = self._carry_out(command, wall_ns)
+        outside += [self._outside(decision) for decision in self._current.look(wall_ns)]
+        return [*outside, replace(outcome, revision=self.in_force.revision)]
+
+    def _marked(self, command: Command) -> Command:
+        """Return the command with the bounds of its samples, for the record."""
+        marks, arguments = dict(self.desk.newest_ns), dict(command.arguments)
+        if command.name in (events.IDENTIFY, events.CAPTURE_REFERENCE):
+            arguments.setdefault("from_ns", self.desk.from_ns)
+        return replace(command, marks=marks, arguments=arguments)
 
     def _ready(self, command: Command) -> bool:
         newest = self.desk.newest_ns
@@ -138,14 +172,12 @@ class ThermalSession:
         try:
             if command.name not in handlers:
                 raise InputError(f"unknown command '{command.name}'; known: {', '.join(handlers)}")
-            outcome = handlers[command.name](command, wall_ns)
+            return handlers[command.name](command, wall_ns)
         except RobocalError as error:
-            outcome = Outcome(command, error.code, str(error))
-        self._refresh()
-        return replace(outcome, revision=self.in_force.revision)
+            return Outcome(command, error.code, str(error))
 
     def _window(self, command: Command) -> list[Observation]:
-        after = int(command.arguments.get("from_ns", self._used_ns + 1)) - 1
+        after = int(command.arguments.get("from_ns", self.desk.from_ns)) - 1
         found = self.desk.window(after, command.stamp_ns or 0, command.marks or {})
         last = int(command.arguments.get("samples", 0))
         if not found:
@@ -155,10 +187,6 @@ class ThermalSession:
                 + (f"; ignored: {lost}" if lost else "")
             )
         return found[-last:] if last else found
-
-    def _used(self, command: Command) -> None:
-        self._used_ns = command.stamp_ns or 0
-        self.desk.forget(self._used_ns)
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         data = as_measurements(self._window(command))
@@ -173,8 +201,7 @@ class ThermalSession:
             expected_head=None,
             wall_ns=wall_ns,
         )
-        self.reference = reference
-        self._used(command)
+        self.desk.use(command.stamp_ns or 0)
         count = len(data)
         message = f"cold reference of {count} measurements captured"
         return Outcome(command, Code.ACCEPT, message, calibration_id=calibration_id, samples=count)
@@ -195,7 +222,7 @@ class ThermalSession:
         calibration_id = self._propose(
             THERMAL, command, wall_ns, method, verdict, document, model, data
         )
-        self._used(command)
+        self.desk.use(command.stamp_ns or 0)
         return Outcome(
             command, verdict.code, verdict.reason, document, calibration_id, samples=len(data)
         )
@@ -228,12 +255,15 @@ class ThermalSession:
         model: dict[str, Any],
         data: Measurements,
     ) -> int:
+        # What it was solved against, though another process may have decided meanwhile.
+        thermal = kind == THERMAL
+        based_on = self.in_force.revision if thermal else self._history.head(kind).revision
         held_out = document.get("calibrated", {}).get("held_out", {})
         return self._history.propose(
             Proposal(
                 kind=kind,
                 model_hash=self.nominal.model_hash,
-                based_on=self._history.head(kind).revision,
+                based_on=based_on,
                 cycle_id=str(command.arguments.get("cycle_id", "")),
                 stamp_ns=command.stamp_ns or 0,
                 created_ns=wall_ns,
@@ -275,30 +305,13 @@ class ThermalSession:
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""
-        if self._history.data_version() == self._version:
-            return []
-        before = self.in_force.revision
-        self._refresh()
-        if self.in_force.revision == before:
-            return []
-        chosen, name, by, why = self.in_force.calibration_id or 0, events.ROLLBACK, "", ""
-        if chosen:
-            decision = self._history.get(chosen).decisions[-1]
-            name, by, why = decision.action.value, decision.by, decision.reason
-        command = Command(
-            name,
-            {"id": chosen, "by": by, "reason": why},
-            self.desk.newest_ns.get(JOINTS, 0),
-            dict(self.desk.newest_ns),
+        return [self._outside(decision) for decision in self._current.look()]
+
+    def _outside(self, decision: Decision) -> Outcome:
+        chosen, marks = decision.calibration_id or 0, dict(self.desk.newest_ns)
+        arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
+        command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
+        message = f"revision {decision.head_after}: decided outside this node"
+        return Outcome(
+            command, Code.ACCEPT, message, None, chosen, decision.head_after, outside=True
         )
-        message = f"revision {self.in_force.revision}: decided outside this node"
-        return [Outcome(command, Code.ACCEPT, message, None, chosen, self.in_force.revision)]
-
-    def _refresh(self) -> None:
-        self._version = self._history.data_version()
-        self.in_force = self._history.head(THERMAL)
-        self.reference = self._stored_reference()
-
-    def _stored_reference(self) -> ColdReference | None:
-        model = self._history.head(REFERENCE).model
-        return None if model is None else reference_of(model, self.nominal)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.identification import Method
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import DEFAULT_TARGET
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.core.thermal.priors import drift_prior, learned_prior
 from robocal_ros.sessions.history import History
@@ -28,7 +29,8 @@ class ThermalConfig:
     hold_out, seed : share of the poses kept to judge a calibration without reference.
     lateness_s : a command waits for joint readings this much newer, so that measurements
         under way still count.
-    measuring_frame : frame of the measurements; empty: that of the first one.
+    measuring_frame : frame of the measurements; empty: that of the first one used.
+    target : name of the target where the measurement's frame_id gives none.
     """
 
     method: Method = "map"
@@ -38,6 +40,7 @@ class ThermalConfig:
     seed: int = 0
     lateness_s: float = 0.2
     measuring_frame: str = ""
+    target: str = DEFAULT_TARGET
     standstill: StandstillRule = field(default_factory=StandstillRule)
 
 

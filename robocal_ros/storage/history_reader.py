@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from robocal_ros.core.errors import InputError, WrongRobotError
-from robocal_ros.core.proposals import THERMAL, Candidate, Entry, Head, State
+from robocal_ros.core.proposals import THERMAL, Candidate, Decision, Entry, Head, State
 from robocal_ros.storage.history_file import (
     HistoryFile,
     open_file,
@@ -174,6 +174,11 @@ class HistoryReader:
             where = "WHERE kind = ? AND based_on = ? ORDER BY id DESC"
             entries = [self._entry(*r) for r in read_candidates(connection, where, kind, revision)]
         return tuple(entry for entry in entries if entry.state is State.PENDING)
+
+    def decisions(self, after_seq: int = 0) -> tuple[Decision, ...]:
+        """Decisions of every kind after a sequence number, oldest first."""
+        with self._reading() as connection:
+            return tuple(read_decisions(connection, after_seq))
 
     def document(self, calibration_id: int) -> dict[str, Any]:
         """JSON document of the identification. Raises `InputError` for an unknown id."""

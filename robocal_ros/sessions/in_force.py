@@ -1,0 +1,56 @@
+"""What the history has in force, followed while other processes decide in it too."""
+
+from robocal_ros.core.documents import reference_of
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import THERMAL, Decision, Head
+from robocal_ros.core.thermal.identification import ColdReference
+from robocal_ros.sessions.history import History
+
+REFERENCE = "reference"
+
+
+class InForce:
+    """The thermal model and the cold reference in force, as of the last look.
+
+    Attributes
+    ----------
+    head : head of the thermal models.
+    reference : the cold reference, or None.
+    fault : why the history could not be read at the last look; empty when it could.
+    """
+
+    def __init__(self, history: History, nominal: SerialArm) -> None:
+        self._history = history
+        self._nominal = nominal
+        self._version = history.data_version()
+        decided = history.decisions()
+        self._seen = decided[-1].seq if decided else 0
+        self.head: Head = history.head(THERMAL)
+        self.reference = self._stored_reference()
+        self.fault = ""
+
+    def look(self, own_wall_ns: int | None = None) -> list[Decision]:
+        """Take over what was decided since the last look.
+
+        Returns others' decisions about the thermal model, oldest first; those stamped
+        ``own_wall_ns`` are the caller's own. Never raises for the history's sake: see ``fault``.
+        """
+        try:
+            version = self._history.data_version()
+            if version == self._version:
+                self.fault = ""
+                return []
+            decided = self._history.decisions(self._seen)
+            self.head = self._history.head(THERMAL)
+            self.reference = self._stored_reference()
+        except RobocalError as error:
+            self.fault = str(error)
+            return []
+        self._version, self.fault = version, ""
+        self._seen = decided[-1].seq if decided else self._seen
+        return [d for d in decided if d.kind == THERMAL and d.wall_ns != own_wall_ns]
+
+    def _stored_reference(self) -> ColdReference | None:
+        model = self._history.head(REFERENCE).model
+        return None if model is None else reference_of(model, self._nominal)
