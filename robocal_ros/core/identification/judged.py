@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import ErrorSummary, Verdict, judge, pose_groups, summarise
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.identification.solve import Identification, Method, Part, identify
@@ -71,6 +72,9 @@ def identify_and_judge(
     predicted, total = _predicted(result, check, check_refit)
     doubt = uninformative(result, summarise(before).rms_m)
     verdict = judge(before, after, pose_groups(check.q), doubt)
+    if "geometry" not in fit and verdict.code is Code.WORSE_THAN_CURRENT:
+        why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
+        verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
     return JudgedIdentification(
         identification=result,
         nominal=summarise(plain),
