@@ -24,7 +24,7 @@ from robocal_ros.storage.history_schema import (
 
 COMPANIONS = ("", "-wal", "-shm")
 _FULL_CHECK_BYTES = 2_000_000
-_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_ERROR)  # last: no table
+_NOT_READABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 @contextmanager
@@ -54,6 +54,21 @@ def _advice(error: sqlite3.Error | OSError) -> str:
     return f"{error}: {advice}" if advice else str(error)
 
 
+@contextmanager
+def _damage(*codes: int) -> Iterator[None]:
+    """Turn SQLite's errors of these kinds into `DamagedError`."""
+    try:
+        yield
+    except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in codes:
+            raise DamagedError(str(error)) from error
+        raise
+
+
+Verify = Callable[[sqlite3.Connection], None]
+"""Raises `DamagedError` when the contents make no sense."""
+
+
 class HistoryFile:
     """One open history file. Use `open_file`.
 
@@ -74,21 +89,19 @@ class HistoryFile:
         self._lock = os.open(f"{path}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         self.connection: sqlite3.Connection
 
-    def open(self, verify: Callable[[sqlite3.Connection], None]) -> None:
+    def open(self, verify: Verify) -> None:
         """Open, migrate and check the file; set it aside and begin anew when it is damaged."""
-        try:
-            if not self.path.exists():
-                raise FileNotFoundError
-            self._take_lock(fcntl.LOCK_SH)
-            self._connect(verify)
-        except (FileNotFoundError, DamagedError):
-            self._take_lock(fcntl.LOCK_EX)
-            try:  # another process may have made it or set it aside meanwhile
-                self._connect(verify)
-            except DamagedError:
-                self._set_aside()
-                self._connect(verify)
-            self._take_lock(fcntl.LOCK_SH)
+        deadline = time.monotonic() + self._timeout_s
+        while not self._open_shared(verify):
+            if self._lock_now(fcntl.LOCK_EX):
+                self._renew(verify)
+            elif time.monotonic() > deadline:
+                raise StorageError(
+                    f"{self.path}: is missing or damaged while another process has it open; "
+                    "stop the nodes that use it, then start again"
+                )
+            else:
+                time.sleep(0.005)
         state = self.path.stat()
         self._identity = (state.st_dev, state.st_ino)
 
@@ -118,42 +131,50 @@ class HistoryFile:
                 "restart this program to go on with the file that is there now"
             )
 
-    def _take_lock(self, mode: int) -> None:
-        deadline = time.monotonic() + self._timeout_s
+    def _lock_now(self, mode: int) -> bool:
         fcntl.flock(self._lock, fcntl.LOCK_UN)
-        while True:
-            try:
-                fcntl.flock(self._lock, mode | fcntl.LOCK_NB)
-                return
-            except BlockingIOError as error:
-                if time.monotonic() > deadline:
-                    raise StorageError(
-                        f"{self.path}: is missing or damaged while another process has it open; "
-                        "stop the nodes that use it, then start again"
-                    ) from error
-                time.sleep(0.005)
+        try:
+            fcntl.flock(self._lock, mode | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
 
-    def _connect(self, verify: Callable[[sqlite3.Connection], None]) -> None:
+    def _open_shared(self, verify: Verify) -> bool:
+        """Open a file that is there and sound; stays locked against being set aside."""
+        if not self.path.exists() or not self._lock_now(fcntl.LOCK_SH):
+            return False
+        try:
+            self._connect(verify)
+        except DamagedError:
+            return False
+        return True
+
+    def _renew(self, verify: Verify) -> None:
+        """Make the file, alone; what is there and damaged is set aside."""
+        try:  # another process may have made it or set it aside meanwhile
+            self._connect(verify)
+        except DamagedError:
+            self._set_aside()
+            self._connect(verify)
+        self.connection.close()
+
+    def _connect(self, verify: Verify) -> None:
         existed = self.path.exists()
         if not existed and Path(f"{self.path}-wal").exists():
             raise DamagedError("a write-ahead log without its file")
         try:
-            if existed:
-                self._refuse_foreign()
-            self.connection = sqlite3.connect(
-                self.path, timeout=self._timeout_s, isolation_level=None
-            )
-            for setting in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
-                self.connection.execute(f"PRAGMA {setting}")
-            self._migrate()
-            self._check()
-            verify(self.connection)
-        except sqlite3.DatabaseError as error:
-            self._disconnect()
-            base = getattr(error, "sqlite_errorcode", 0) & 0xFF
-            if base in _DAMAGE:
-                raise DamagedError(str(error)) from error
-            raise
+            with _damage(*_NOT_READABLE):
+                if existed:
+                    self._refuse_foreign()
+                self.connection = sqlite3.connect(
+                    self.path, timeout=self._timeout_s, isolation_level=None
+                )
+                for setting in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON"):
+                    self.connection.execute(f"PRAGMA {setting}")
+                self._migrate()
+            with _damage(*_NOT_READABLE, sqlite3.SQLITE_ERROR):  # the last: a table is missing
+                self._check()
+                verify(self.connection)
         except BaseException:
             self._disconnect()
             raise
@@ -197,7 +218,7 @@ class HistoryFile:
         finally:
             if self.connection.in_transaction:
                 self.connection.execute("ROLLBACK")
-        self.created = start == 0
+        self.created = self.created or start == 0
 
     def _version(self) -> int:
         return int(self.connection.execute("PRAGMA user_version").fetchone()[0])
@@ -242,9 +263,7 @@ class HistoryFile:
         self.damaged = aside
 
 
-def open_file(
-    path: Path, serial: str, *, timeout_s: float, verify: Callable[[sqlite3.Connection], None]
-) -> HistoryFile:
+def open_file(path: Path, serial: str, *, timeout_s: float, verify: Verify) -> HistoryFile:
     """Open a history file; ``verify`` raises `DamagedError` when its contents make no sense.
 
     Raises
