@@ -97,9 +97,13 @@ def solve(
         Without a prior, fewer equations than unknowns.
     RankDeficientError
         Without a prior, when the data leave a direction undetermined.
+    ValueError
+        When the residuals at the start are not finite.
     """
     residual, jacobian = problem.linearise(start)
     m, c, k = jacobian.shape
+    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
+        raise ValueError("the residuals at the start are not finite")
     flat = prior_information is None
     if flat:
         if m * c < k:
@@ -113,6 +117,8 @@ def solve(
         run = descent.run(run, keep, huber=float(np.sqrt(chi2_quantile(0.95, c))))
         keep = descent.inliers(run, keep)
     for _ in range(10):
+        if flat and not np.all(keep):
+            _require_full_rank(observability(run.jacobian[keep].reshape(-1, k)), problem.names)
         run = descent.run(run, keep)
         update = descent.inliers(run, keep) if robust else keep
         if np.array_equal(update, keep):

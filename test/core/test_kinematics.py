@@ -115,7 +115,7 @@ def test_real_bx200l_is_millimetres_off_its_nominal_model():
     assert 1e-3 < np.linalg.norm(flange - reported) < 3e-3
 
 
-# ---- Definition and derivatives -------------------------------------------------------------------
+# ---- Definition and derivatives ------------------------------------------------------------------
 
 
 @given(arms())
@@ -150,7 +150,7 @@ def test_parameter_jacobian_is_the_derivative(case):
         np.testing.assert_allclose(J[:, k], twist(before, after) / (2.0 * h), rtol=0.0, atol=2e-9)
 
 
-# ---- Shapes and frames ----------------------------------------------------------------------------
+# ---- Shapes and frames ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("robot", SHIPPED)
@@ -208,11 +208,11 @@ def test_a_model_cannot_be_changed_in_place():
     ids=["shape", "nan", "sign", "root"],
 )
 def test_wrong_models_are_refused(wrong):
-    with pytest.raises(ValueError, match="ur10|shape"):
+    with pytest.raises(ValueError, match=r"ur10|shape"):
         replace(load_robot("ur10"), **wrong)
 
 
-# ---- Identity of a model --------------------------------------------------------------------------
+# ---- Identity of a model -------------------------------------------------------------------------
 
 
 def test_hash_tells_models_apart_and_nothing_else():
@@ -246,7 +246,7 @@ def test_hash_never_changes():
     assert arm.model_hash == "013c4bb4b3077738"
 
 
-# ---- Free parameters ------------------------------------------------------------------------------
+# ---- Free parameters -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -277,7 +277,8 @@ def test_free_parameters_are_independent_and_complete(robot):
         T, J = np.empty((50, 4, 4)), np.zeros((50, 6, len(chosen)))
         zero, none = np.zeros(50, dtype=np.int64), np.array([-1], dtype=np.int64)
         kernels.parameter_batch(
-            q, arm.links, arm.T_base_root, np.eye(4)[None], zero, chosen.slots(arm.n), -1, none, T, J
+            q, arm.links, arm.T_base_root, np.eye(4)[None], zero, chosen.slots(arm.n),
+            -1, none, T, J,
         )  # fmt: skip
         return J.reshape(300, -1)
 
@@ -308,7 +309,7 @@ def test_parameter_choice():
         chosen.subset(("d2_mm",))
 
 
-# ---- Universal Robots factory calibration ---------------------------------------------------------
+# ---- Universal Robots factory calibration --------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
