@@ -1,6 +1,7 @@
 """Package robocal_ros for ament and pip."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 
@@ -19,7 +20,7 @@ def config_files() -> list[tuple[str, list[str]]]:
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=ElementTree.parse("package.xml").findtext("version"),
     description="On-line accuracy maintenance for industrial robots",
     license="Apache-2.0",
     maintainer="robocal_ros maintainers",

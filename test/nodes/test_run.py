@@ -18,9 +18,12 @@ class Sleeper(HouseNode):
     NAME = "sleeper"
     def configure(self):
         self.add_service(Trigger, "~/ping", self.on_ping)
-        self.add_service(Trigger, "~/break", lambda request, response: 1 / 0)
+        self.add_service(Trigger, "~/break", self.on_break)
     def on_ping(self, request, response):
         response.success = True
+        return response
+    def on_break(self, request, response):
+        self.add_timer(0.01, lambda: 1 / 0)
         return response
     def cleanup(self):
         print("released", flush=True)
