@@ -1,0 +1,263 @@
+"""Bags of ROS 2 messages (MCAP), read and written without ROS.
+
+A message read from a bag has the attributes of the ROS message of its type.
+"""
+
+import heapq
+import warnings
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple, Self
+
+import yaml
+from rosbags.serde.errors import SerdeError
+from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.storage import bag_types
+from robocal_ros.storage.bag_writer import BagWriter
+from robocal_ros.storage.files import read_text
+from robocal_ros.storage.mcap_files import McapFile, Raw, open_file, read_block
+
+__all__ = ["BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "read_bag"]
+
+
+class BagMessage(NamedTuple):
+    """A recorded message; ``message`` is its CDR (bytes) when read raw."""
+
+    topic: str
+    msgtype: str
+    log_time_ns: int
+    message: Any
+
+
+class TopicInfo(NamedTuple):
+    """Type and number of messages of a topic."""
+
+    msgtype: str
+    messages: int
+
+
+@dataclass(frozen=True)
+class BagInfo:
+    """Content of a bag.
+
+    ``start_ns`` and ``end_ns`` (log time) are None when it holds no message. ``notes`` tell what
+    is wrong with it; ``truncated``: the recording broke off.
+    """
+
+    path: str
+    topics: Mapping[str, TopicInfo]
+    start_ns: int | None
+    end_ns: int | None
+    truncated: bool
+    notes: tuple[str, ...]
+
+    @property
+    def messages(self) -> int:
+        """Number of messages."""
+        return sum(topic.messages for topic in self.topics.values())
+
+
+class BagReader:
+    """A bag's messages in log-time order; a context manager.
+
+    Parameters
+    ----------
+    path : str or Path
+        An ``.mcap`` file, or a folder of ``ros2 bag record`` with one or more of them.
+
+    Raises
+    ------
+    InputError
+        When it is not such a file or folder; the message says what to do.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = Path(path)
+        paths, notes = _bag_files(self._path)
+        self._files = [open_file(file) for file in paths]
+        self._notes = (*notes, *(note for file in self._files for note in file.notes))
+        self._types: list[Typestore] = [get_typestore(Stores.EMPTY) for _ in self._files]
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    @property
+    def info(self) -> BagInfo:
+        """What the bag holds and what is wrong with it."""
+        counts: dict[str, int] = {}
+        types: dict[str, str] = {}
+        for file in self._files:
+            for number, channel in file.channels.items():
+                counts[channel.topic] = counts.get(channel.topic, 0) + file.counts[number]
+                types[channel.topic] = _msgtype(file, number)
+        starts = [file.start_ns for file in self._files if file.start_ns is not None]
+        ends = [file.end_ns for file in self._files if file.end_ns is not None]
+        return BagInfo(
+            path=str(self._path),
+            topics={topic: TopicInfo(types[topic], counts[topic]) for topic in sorted(counts)},
+            start_ns=min(starts, default=None),
+            end_ns=max(ends, default=None),
+            truncated=any(file.notes for file in self._files),
+            notes=self._notes,
+        )
+
+    def messages(
+        self, topics: Collection[str] | None = None, *, raw: bool = False
+    ) -> Iterator[BagMessage]:
+        """Messages of all topics, or of ``topics``, by log time, ties as they were recorded.
+
+        Raises
+        ------
+        InputError
+            When a message or a part of the file cannot be decoded.
+        """
+        wanted = [
+            {
+                number: (channel.topic, _msgtype(file, number))
+                for number, channel in file.channels.items()
+                if topics is None or channel.topic in topics
+            }
+            for file in self._files
+        ]
+        if not raw:
+            for number, channels in enumerate(wanted):
+                self._learn_types(number, channels)
+        for index, message in self._in_order(wanted):
+            topic, msgtype = wanted[index][message.channel]
+            content = bytes(message.data) if raw else self._decode(index, topic, msgtype, message)
+            yield BagMessage(topic, msgtype, message.log_time_ns, content)
+
+    def _learn_types(self, index: int, channels: Collection[int]) -> None:
+        file = self._files[index]
+        for number in channels:
+            channel = file.channels[number]
+            if channel.message_encoding != "cdr":
+                raise InputError(
+                    f"topic {channel.topic} is encoded as '{channel.message_encoding}'; only "
+                    f"'cdr', the encoding of ROS 2, can be read",
+                    file=str(file.path),
+                )
+            schema = file.schemas.get(channel.schema_id)
+            text = schema.data.decode("utf-8", "replace") if schema else ""
+            encoding = schema.encoding if schema else ""
+            bag_types.register_schema(
+                self._types[index], _msgtype(file, number), encoding, text, str(file.path)
+            )
+
+    def _in_order(self, wanted: list[dict[int, tuple[str, str]]]) -> Iterator[tuple[int, Raw]]:
+        """Merge the blocks of all files; a block is in memory only while it is needed."""
+        streams = [self._open(file) for file in self._files]
+        blocks = [
+            (block.start_ns, index, block)
+            for index, file in enumerate(self._files)
+            for block in file.blocks
+            if wanted[index]
+        ]
+        heap: list[_Entry] = []
+        for start_ns, index, block in sorted(blocks):
+            yield from _earlier(heap, start_ns)
+            messages = read_block(streams[index], self._files[index], block, wanted[index])
+            if messages:
+                heapq.heappush(heap, (messages[0].log_time_ns, index, block.offset, 0, messages))
+        yield from _earlier(heap, None)
+
+    def _open(self, file: McapFile) -> IO[bytes]:
+        try:
+            return self._stack.enter_context(file.path.open("rb"))
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", file=str(file.path)) from error
+
+    def _decode(self, index: int, topic: str, msgtype: str, message: Raw) -> Any:
+        try:
+            return self._types[index].deserialize_cdr(message.data, msgtype)
+        except (SerdeError, KeyError) as error:
+            raise InputError(
+                f"a message of {topic} at {message.log_time_ns} ns is not a {msgtype}: {error}",
+                file=str(self._files[index].path),
+            ) from error
+
+
+# time, file, block's offset, place in the block, the block's messages
+_Entry = tuple[int, int, int, int, list[Raw]]
+
+
+def _earlier(heap: list[_Entry], before_ns: int | None) -> Iterator[tuple[int, Raw]]:
+    """Take the messages before ``before_ns`` (None: all) off the heap, in order."""
+    while heap and (before_ns is None or heap[0][0] < before_ns):
+        _, index, offset, place, messages = heap[0]
+        yield index, messages[place]
+        if place + 1 < len(messages):
+            entry = (messages[place + 1].log_time_ns, index, offset, place + 1, messages)
+            heapq.heapreplace(heap, entry)
+        else:
+            heapq.heappop(heap)
+
+
+def _msgtype(file: McapFile, channel: int) -> str:
+    schema = file.schemas.get(file.channels[channel].schema_id)
+    return bag_types.full_name(schema.name) if schema else "unknown"
+
+
+def _bag_files(path: Path) -> tuple[list[Path], list[str]]:
+    """MCAP files of a bag in their order, and notes on what its folder lacks."""
+    if not path.is_dir():
+        return [path], []
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        files = sorted(path.glob("*.mcap"))
+        if not files:
+            raise InputError("no metadata.yaml and no .mcap file in this folder", file=str(path))
+        return files, [f"{path}: no metadata.yaml (the recording broke off); all .mcap files read"]
+    try:
+        content = yaml.safe_load(read_text(metadata, "bag's metadata"))
+        described = content["rosbag2_bagfile_information"]
+        storage, mode = described["storage_identifier"], described.get("compression_mode", "")
+        names = [str(name) for name in described["relative_file_paths"]]
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(
+            "this is not the metadata of a bag; 'ros2 bag reindex' makes it anew",
+            file=str(metadata),
+        ) from error
+    if storage != "mcap" or str(mode).upper() == "FILE":
+        kind = "compressed as whole files" if storage == "mcap" else f"stored as {storage}"
+        raise InputError(
+            f"this bag is {kind}; convert it with 'ros2 bag convert' (storage_id: mcap)",
+            file=str(path),
+        )
+    if not names:
+        raise InputError("this bag has no files", file=str(metadata))
+    return [path / name for name in names], []
+
+
+def read_bag(
+    path: str | Path, topics: Collection[str] | None = None, *, raw: bool = False
+) -> Iterator[BagMessage]:
+    """Messages of a bag by log time; see ``BagReader``, which also tells what is wrong with it.
+
+    A recording that broke off is read as far as it goes, with a warning.
+    """
+    with BagReader(path) as bag:
+        for note in bag.info.notes:
+            warnings.warn(note, stacklevel=2)
+        yield from bag.messages(topics, raw=raw)
+
+
+def bag_info(path: str | Path) -> BagInfo:
+    """Topics, counts and times of a bag.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    with BagReader(path) as bag:
+        return bag.info
