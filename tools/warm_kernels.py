@@ -1,28 +1,51 @@
-"""Compile every kernel once, so that no node pays for it at its start.
+"""Compile every kernel once, for all the array types it is called with.
 
-Numba keeps the machine code beside the source; a second run only loads it.
+Numba keeps the machine code beside the source, so that no node pays for it at its start.
 """
 
 import numpy as np
 
+from robocal_ros.core.identification import identify
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+
+POSES = 30
+
+
+def arm_of_six_joints() -> SerialArm:
+    """Return a small arm with a parallel pair; only its shape matters."""
+    turn = np.pi / 2
+    mdh = [
+        (0.3, 0.0, 0.0, turn, 0.0),
+        (0.0, 0.0, -0.6, 0.0, 0.0),
+        (0.1, 0.0, -0.5, turn, 0.0),
+        (0.2, 0.0, 0.0, -turn, 0.0),
+        (0.1, 0.0, 0.0, turn, 0.0),
+        (0.1, 0.0, 0.0, 0.0, 0.0),
+    ]
+    return SerialArm(
+        name="warm",
+        joint_names=tuple(f"joint_{i}" for i in range(6)),
+        mdh=np.array(mdh),
+        sign=np.ones(6),
+        prismatic=np.zeros(6, dtype=np.bool_),
+        lower=np.full(6, -np.pi),
+        upper=np.full(6, np.pi),
+    )
 
 
 def main() -> None:
-    """Call what nodes and commands call first, on an arm of two joints."""
-    arm = SerialArm(
-        name="warm",
-        joint_names=("turn", "slide"),
-        mdh=np.zeros((2, 5)),
-        sign=np.ones(2),
-        prismatic=np.array([False, True]),
-        lower=np.full(2, -np.inf),
-        upper=np.full(2, np.inf),
-    )
-    q = np.zeros((1, 2))
-    arm.fk(q)
+    """Call what nodes and commands call first."""
+    arm = arm_of_six_joints()
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-1.5, 1.5, (POSES, 6))
     arm.jacobian(q)
     arm.parameter_jacobian(q)
+    T = arm.fk(q)
+    names = tuple(str(i) for i in range(POSES))
+    noise = 1e-5 * rng.standard_normal((POSES, 3))
+    position = T[:, :3, 3] + 0.1 * T[:, :3, 2] + noise
+    identify(arm, Measurements(q=q, position=position, target=("tool",) * POSES, sample=names))
 
 
 if __name__ == "__main__":
