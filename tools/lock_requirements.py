@@ -1,6 +1,6 @@
 """Write requirements/constraints.txt: every version that pip put into this venv.
 
-Run with the venv's Python after a change of a requirement: .venv/bin/python tools/lock_requirements.py
+Run with the venv's Python after a change of a requirement (CONTRIBUTING.md).
 """
 
 from importlib.metadata import distributions

@@ -45,7 +45,8 @@ def main() -> None:
     names = tuple(str(i) for i in range(POSES))
     noise = 1e-5 * rng.standard_normal((POSES, 3))
     position = T[:, :3, 3] + 0.1 * T[:, :3, 2] + noise
-    identify(arm, Measurements(q=q, position=position, target=("tool",) * POSES, sample=names))
+    data = Measurements(q=q, position=position, target=("tool",) * POSES, sample=names)
+    identify(arm, data).cell.residual(data)
 
 
 if __name__ == "__main__":
