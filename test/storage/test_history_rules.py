@@ -14,7 +14,10 @@ from robocal_ros.core.errors import RobocalError
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 KINDS = ("thermal", "tool")
-numbers = st.integers(0, 12)
+WAYS = st.integers(0, 1)
+KIND = st.sampled_from(["thermal", "thermal", "thermal", "tool"])
+BACK = st.integers(-1, 6)  # from the newest id; -1 is unknown
+BELIEFS = st.sampled_from([None, None, 0, 0, -1, 1])  # off the revision in force; None: no belief
 
 
 class Reference:
@@ -105,10 +108,10 @@ class History(RuleBasedStateMachine):
         return "done"
 
     @rule(
-        way=st.integers(0, 1),
-        kind=st.sampled_from(KINDS),
-        code=st.sampled_from([Code.ACCEPT, Code.ACCEPT, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN]),
-        behind=st.sampled_from([0, 0, 0, 1]),
+        way=WAYS,
+        kind=KIND,
+        code=st.sampled_from([Code.ACCEPT, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN]),
+        behind=st.integers(0, 1),
     )
     def propose(self, way: int, kind: str, code: Code, behind: int) -> None:
         revision, _ = self.reference.head(kind)
@@ -118,28 +121,39 @@ class History(RuleBasedStateMachine):
         assert number == len(self.reference.given) + 1
         self.reference.given[number] = (kind, code, based_on)
 
-    @rule(way=st.integers(0, 1), newest=numbers, expected=st.none() | st.integers(0, 5))
-    def accept(self, way: int, newest: int, expected: int | None) -> None:
-        number = len(self.reference.given) - newest
+    def believed(self, kind: str, off: int | None) -> int | None:
+        return None if off is None else self.reference.head(kind)[0] + off
+
+    @rule(way=WAYS, back=BACK, off=BELIEFS)
+    def accept(self, way: int, back: int, off: int | None) -> None:
+        number = len(self.reference.given) - back
+        kind = self.reference.given.get(number, KINDS)[0]
+        expected = self.believed(kind, off)
         found = self.outcome(way, "accept", number, expected_head=expected)
         assert found == self.reference.accept(number, expected)
 
-    @rule(way=st.integers(0, 1), newest=numbers)
-    def reject(self, way: int, newest: int) -> None:
-        number = len(self.reference.given) - newest
+    @rule(way=WAYS, back=BACK)
+    def reject(self, way: int, back: int) -> None:
+        number = len(self.reference.given) - back
         assert self.outcome(way, "reject", number) == self.reference.reject(number)
 
-    @rule(
-        way=st.integers(0, 1),
-        to=st.none() | numbers,
-        kind=st.sampled_from(KINDS),
-        expected=st.none() | st.integers(0, 5),
-    )
-    def rollback(self, way: int, to: int | None, kind: str, expected: int | None) -> None:
+    @rule(way=WAYS, back=st.none() | BACK, kind=KIND, off=BELIEFS)
+    def rollback(self, way: int, back: int | None, kind: str, off: int | None) -> None:
+        to = None if back is None else max(0, len(self.reference.given) - back)
+        expected = self.believed(kind, off)
         found = self.outcome(way, "rollback", to, kind=kind, expected_head=expected)
         assert found == self.reference.rollback(to, kind, expected)
 
-    @rule(way=st.integers(0, 1))
+    @rule(way=WAYS, kind=KIND)
+    def propose_and_accept(self, way: int, kind: str) -> None:
+        self.propose(way, kind, Code.ACCEPT, 0)
+        self.accept(way, 0, None)
+
+    @rule(way=WAYS, kind=KIND)
+    def roll_back_once_more(self, way: int, kind: str) -> None:
+        self.rollback(way, None, kind, None)
+
+    @rule(way=WAYS)
     def reopen(self, way: int) -> None:
         self.handles[way].close()
         self.handles[way] = self.opened()
@@ -168,5 +182,5 @@ class History(RuleBasedStateMachine):
 
 TestHistory = History.TestCase
 TestHistory.settings = settings(
-    max_examples=40, stateful_step_count=30, deadline=None, derandomize=True, database=None
+    max_examples=60, stateful_step_count=50, deadline=None, derandomize=True, database=None
 )
