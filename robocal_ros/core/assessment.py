@@ -109,7 +109,7 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
             Code.TOO_FEW_SAMPLES,
             f"{len(gain)} held-out poses cannot judge: at least {FEWEST_GROUPS} are needed; {what}",
         )
-    if after.rms_m > LARGEST_RMS_M:
+    if min(before.rms_m, after.rms_m) > LARGEST_RMS_M:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
             f"{what}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "

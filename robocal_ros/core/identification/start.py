@@ -95,7 +95,7 @@ def _aligned(points: Array, measured: Array) -> Array:
         raise TooFewSamplesError(f"{len(points)} samples cannot place the base: 3 are needed")
     p, y = points - points.mean(axis=0), measured - measured.mean(axis=0)
     s = np.linalg.svd(p, compute_uv=False)
-    if s[1] < _SMALLEST_SPREAD * s[0]:
+    if s[1] < _SMALLEST_SPREAD * np.linalg.norm(points):
         raise RankDeficientError(
             "the points lie on one line and leave the base free to turn about it",
             ("base turns about the line of points: move off the line",),
