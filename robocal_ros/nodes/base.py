@@ -164,5 +164,6 @@ class HouseNode(EndpointNode):
             values[f"{topic} received"] = count.received
             values[f"{topic} ignored while inactive"] = count.ignored
             values[f"{topic} invalid"] = count.invalid
+            values[f"{topic} lost"] = count.lost
         health.values = values | health.values
         return health

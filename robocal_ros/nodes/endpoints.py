@@ -1,14 +1,18 @@
 """Inputs, outputs, services and timers of a lifecycle node, with the manners of this house."""
 
 import inspect
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from lifecycle_msgs.msg import State
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile
+from rclpy.timer import Timer
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -25,11 +29,12 @@ class NotActiveError(RobocalError):
 
 @dataclass
 class InputCount:
-    """Messages of one input: all, ignored while inactive, refused as invalid."""
+    """Messages of one input: all, ignored while inactive, refused as invalid, lost on the way."""
 
     received: int = 0
     ignored: int = 0
     invalid: int = 0
+    lost: int = 0
 
 
 class EndpointNode(LifecycleNode):
@@ -72,8 +77,16 @@ class EndpointNode(LifecycleNode):
                 count.invalid += 1
                 self.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=LOG_EVERY_S)
 
+        def lose(event: Any) -> None:
+            count.lost += event.total_count_change
+
         subscription = self.create_subscription(
-            kind, topic, receive, qos.own(profile), qos_overriding_options=qos.overridable()
+            kind,
+            topic,
+            receive,
+            qos.own(profile),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
+            qos_overriding_options=qos.overridable(),
         )
         self._release.append(lambda: self.destroy_subscription(subscription))
 
@@ -89,8 +102,9 @@ class EndpointNode(LifecycleNode):
         """Serve until cleanup; ``callback(request, response)`` may be ``async``.
 
         While inactive, and when the callback raises a `RobocalError`, the answer is
-        ``success = False`` with the reason in ``message`` and its code in ``status``. An async
-        callback may await other services; the node must then run in the plain executor.
+        ``success = False`` with the reason in ``message`` and its code in ``status``. A defect in
+        the callback is logged and answered too: it does not end the node. An async callback may
+        await other services; the node must then run in the plain executor.
         """
         if inspect.iscoroutinefunction(callback):
 
@@ -98,7 +112,7 @@ class EndpointNode(LifecycleNode):
                 try:
                     self._require_active(name)
                     return await callback(request, response)
-                except RobocalError as error:
+                except Exception as error:
                     return self._refuse(name, response, error)
 
             service = self.create_service(kind, name, serve, callback_group=self._async_group)
@@ -108,16 +122,25 @@ class EndpointNode(LifecycleNode):
                 try:
                     self._require_active(name)
                     return callback(request, response)
-                except RobocalError as error:
+                except Exception as error:
                     return self._refuse(name, response, error)
 
             service = self.create_service(kind, name, answer)
         self._release.append(lambda: self.destroy_service(service))
 
-    def add_timer(self, period_s: float, callback: Callable[[], None]) -> None:
-        """Call back every ``period_s`` of ROS time while active, until cleanup."""
-        timer = self.create_timer(period_s, lambda: callback() if self.is_active else None)
+    def add_timer(
+        self, period_s: float, callback: Callable[[], None], *, steady: bool = False
+    ) -> Timer:
+        """Call back every ``period_s`` of ROS time while active, until cleanup.
+
+        ``steady``: of the steady clock, which runs on when a simulation stops.
+        """
+        clock = Clock(clock_type=ClockType.STEADY_TIME) if steady else None
+        timer = self.create_timer(
+            period_s, lambda: callback() if self.is_active else None, clock=clock
+        )
         self._release.append(lambda: self.destroy_timer(timer))
+        return timer
 
     def release_endpoints(self) -> None:
         """Take down all of them, the last one first."""
@@ -128,10 +151,19 @@ class EndpointNode(LifecycleNode):
         if not self.is_active:
             raise NotActiveError(f"{self.get_name()} is {self.state}: activate it to use {name}")
 
-    def _refuse(self, name: str, response: Any, error: RobocalError) -> Any:
-        self.get_logger().warning(f"{name}: {error}")
+    def _refuse(self, name: str, response: Any, error: Exception) -> Any:
+        code = Code.BAD_INPUT
+        if isinstance(error, RobocalError):
+            code = error.code
+            self.get_logger().warning(f"{name}: {error}")
+        else:
+            self.get_logger().error(f"{name}:\n{''.join(traceback.format_exception(error))}")
         response.success = False
-        response.message = str(error)
+        response.message = str(error) if isinstance(error, RobocalError) else _defect(error)
         if hasattr(response, "status"):
-            response.status = int(error.code)
+            response.status = int(code)
         return response
+
+
+def _defect(error: Exception) -> str:
+    return f"a defect of this software, please report it: {type(error).__name__}: {error}"

@@ -16,7 +16,7 @@ class InForce:
     Attributes
     ----------
     head : head of the thermal models.
-    reference : the cold reference, or None.
+    reference, reference_id : the cold reference and its calibration, or None.
     fault : why the history could not be read at the last look; empty when it could.
     """
 
@@ -27,7 +27,7 @@ class InForce:
         decided = history.decisions()
         self._seen = decided[-1].seq if decided else 0
         self.head: Head = history.head(THERMAL)
-        self.reference = self._stored_reference()
+        self.reference, self.reference_id = self._stored_reference()
         self.fault = ""
 
     def look(self, own_wall_ns: int | None = None) -> list[Decision]:
@@ -43,7 +43,7 @@ class InForce:
                 return []
             decided = self._history.decisions(self._seen)
             self.head = self._history.head(THERMAL)
-            self.reference = self._stored_reference()
+            self.reference, self.reference_id = self._stored_reference()
         except RobocalError as error:
             self.fault = str(error)
             return []
@@ -51,6 +51,7 @@ class InForce:
         self._seen = decided[-1].seq if decided else self._seen
         return [d for d in decided if d.kind == THERMAL and d.wall_ns != own_wall_ns]
 
-    def _stored_reference(self) -> ColdReference | None:
-        model = self._history.head(REFERENCE).model
-        return None if model is None else reference_of(model, self._nominal)
+    def _stored_reference(self) -> tuple[ColdReference | None, int | None]:
+        head = self._history.head(REFERENCE)
+        reference = None if head.model is None else reference_of(head.model, self._nominal)
+        return reference, head.calibration_id

@@ -97,7 +97,7 @@ class ObservationDesk:
             self._begin(sample.stamp_ns)
         self.newest_ns[JOINTS] = sample.stamp_ns
         if self._pending:
-            self._pair()
+            self._pending = self._pair(self._pending)
 
     def _begin(self, first_ns: int) -> None:
         """Start at the first joint reading; what an earlier clock stamped means nothing now."""
@@ -121,18 +121,18 @@ class ObservationDesk:
             self._ignore_frame(topic, sample.frame)
             return
         self.newest_ns[topic] = max(sample.stamp_ns, self.newest_ns.get(topic, sample.stamp_ns))
-        self._pending.append(sample)
+        self._pending += self._pair([sample])
         if len(self._pending) > MOST_WAITING:
             del self._pending[0]
             self.ignore(topic, "no joint readings came")
-        self._pair()
 
     def _ignore_frame(self, topic: str, frame: str) -> None:
         self.ignore(topic, f"frame '{frame}' is not the measuring frame '{self.frame}'")
 
-    def _pair(self) -> None:
+    def _pair(self, samples: list[PointSample | PoseSample]) -> list[PointSample | PoseSample]:
+        """Make observations of these measurements; return those whose joints are to come."""
         waiting: list[PointSample | PoseSample] = []
-        for sample in self._pending:
+        for sample in samples:
             topic = POINT if isinstance(sample, PointSample) else POSE
             try:
                 reading = self.stream.standstill(sample.stamp_ns, self.rule)
@@ -153,9 +153,9 @@ class ObservationDesk:
                     reading.q, position, rotation,
                 )
             )  # fmt: skip
-        self._pending = waiting
         if len(self._observed) > MOST_KEPT:
             self.ignore(self._observed.pop(0).topic, "no command used it")
+        return waiting
 
     def window(self, after_ns: int, until_ns: int, marks: Mapping[str, int]) -> list[Observation]:
         """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``.

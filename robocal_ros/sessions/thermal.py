@@ -83,6 +83,11 @@ class ThermalSession:
         return self._current.reference
 
     @property
+    def reference_id(self) -> int | None:
+        """Calibration that is the cold reference, or None."""
+        return self._current.reference_id
+
+    @property
     def fault(self) -> str:
         """Why the history could not be read at the last look; empty when it could."""
         return self._current.fault
@@ -115,6 +120,9 @@ class ThermalSession:
             newest = max(self.desk.newest_ns.values(), default=0)
             near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
             command = replace(command, stamp_ns=clock_ns if near else newest)
+        if command.name == events.IDENTIFY and not command.arguments.get("cycle_id"):
+            named = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
+            command = replace(command, arguments={**command.arguments, "cycle_id": named})
         self._queue.append(command)
 
     @property
@@ -298,6 +306,7 @@ class ThermalSession:
                 expected_head=expected,
                 wall_ns=wall_ns,
             )
+        chosen = head.calibration_id or 0
         what = f"calibration {head.calibration_id}" if head.calibration_id else "the nominal model"
         return Outcome(
             command, Code.ACCEPT, f"revision {head.revision}: {what} in force", None, chosen

@@ -13,7 +13,10 @@ from robocal_ros.core.streams import StandstillRule
 from robocal_ros.core.thermal.priors import drift_prior, learned_prior
 from robocal_ros.sessions.history import History
 
+Prior = Literal["default", "learned"]
+
 METHODS: tuple[Method, ...] = ("map", "lsq")
+PRIORS: tuple[Prior, ...] = ("default", "learned")
 LEARN_FROM = 500
 
 
@@ -34,7 +37,7 @@ class ThermalConfig:
     """
 
     method: Method = "map"
-    prior: Literal["default", "learned"] = "default"
+    prior: Prior = "default"
     sigma_m: float = 3e-5
     hold_out: float = 0.5
     seed: int = 0

@@ -1,0 +1,158 @@
+"""Documents and history entries as messages: pure mapping. A number that is not finite stays."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Transform
+from robocal_msgs.msg import CalibrationQuality, CalibrationSummary, KinematicModel, SessionEvent
+from std_msgs.msg import Header
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics.parameters import COLUMNS
+from robocal_ros.core.proposals import Entry
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.records import arguments_text, outcome_text
+
+NS = 1_000_000_000
+
+
+def time_message(stamp_ns: int) -> Time:
+    """A stamp; one before the epoch or too late for the message becomes zero."""
+    sec, nanosec = divmod(stamp_ns, NS)
+    return Time(sec=sec, nanosec=nanosec) if 0 <= sec < 2**31 else Time()
+
+
+def header(stamp_ns: int, frame: str) -> Header:
+    """A header."""
+    return Header(stamp=time_message(stamp_ns), frame_id=frame)
+
+
+def transform_message(T: Any) -> Transform:
+    """A pose (4, 4), m."""
+    matrix = np.array(T, dtype=np.float64)
+    message = Transform()
+    t, r = message.translation, message.rotation
+    t.x, t.y, t.z = matrix[:3, 3].tolist()
+    r.x, r.y, r.z, r.w = frames.quat_xyzw(matrix).tolist()
+    return message
+
+
+def kinematic_model(
+    model: Mapping[str, Any],
+    *,
+    serial: str,
+    model_hash: str,
+    revision: int,
+    state: int,
+    stamp: Header,
+) -> KinematicModel:
+    """A model document (``core.documents.model_document``) as a message.
+
+    Raises
+    ------
+    InputError
+        When a number is not finite.
+    """
+    mdh = np.array(model["mdh"], dtype=np.float64)
+    covariance = np.array(model.get("covariance", []), dtype=np.float64)
+    _require_finite("model", [*mdh.ravel(), *covariance.ravel(), *np.ravel(model["T_base_root"])])
+    message = KinematicModel(
+        header=stamp,
+        robot=model["robot"],
+        serial=serial,
+        model_hash=model_hash,
+        revision=revision,
+        joint_names=list(model["joint_names"]),
+        prismatic=list(model["prismatic"]),
+        sign=list(model["sign"]),
+        base_root=transform_message(model["T_base_root"]),
+        parameter_names=[name.rsplit("_", 1)[0] for name in model.get("parameters", [])],
+        covariance=covariance.ravel().tolist(),
+        state=state,
+    )
+    for column, name in enumerate(COLUMNS):
+        setattr(message, name, mdh[:, column].tolist())
+    return message
+
+
+def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header) -> Any:
+    """The verdict on a candidate; without one the figures are 0 and the reason says why.
+
+    Raises
+    ------
+    InputError
+        When a figure is not finite.
+    """
+    message = CalibrationQuality(
+        header=stamp,
+        robot=robot,
+        serial=serial,
+        candidate_id=outcome.calibration_id,
+        code=int(outcome.status),
+        accept=outcome.done,
+        reason=outcome.message,
+        cycle_id=str(outcome.command.arguments.get("cycle_id", "")),
+        samples=outcome.samples,
+    )
+    document = outcome.document
+    if document is None:
+        return message
+    _set_errors(message, "current", document["in_force"]["held_out"])
+    _set_errors(message, "candidate", document["calibrated"]["held_out"])
+    message.predicted_rms_mm = document["calibrated"]["predicted"]["model_rms_mm"]
+    message.held_out = document["calibrated"]["held_out"]["n"]
+    message.rank = document["rank"]
+    message.condition = document["condition"]
+    message.unobservable = list(document["unobservable"])
+    message.rejected = list(document["rejected"])
+    _require_finite("quality", [message.predicted_rms_mm, message.condition])
+    return message
+
+
+def _set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
+    for name in ("mean_mm", "rms_mm", "p95_mm", "max_mm"):
+        _require_finite(f"{whose}_{name}", [errors[name]])
+        setattr(message, f"{whose}_{name}", float(errors[name]))
+
+
+def event_message(command: Command, outcome: Outcome | None, sequence: int) -> SessionEvent:
+    """A command and what came of it, None for the configuration."""
+    return SessionEvent(
+        stamp=time_message(command.stamp_ns or 0),
+        sequence=sequence,
+        command=command.name,
+        arguments=arguments_text(command),
+        outcome="{}" if outcome is None else outcome_text(outcome),
+    )
+
+
+def summary_message(entry: Entry) -> CalibrationSummary:
+    """A line of the history; an error that was not judged is 0."""
+    last = entry.decisions[-1] if entry.decisions else None
+    return CalibrationSummary(
+        id=entry.id,
+        revision=entry.revision,
+        kind=entry.kind,
+        state=entry.state.value,
+        code=int(entry.code),
+        stamp=time_message(entry.stamp_ns),
+        cycle_id=entry.cycle_id,
+        by=last.by if last else "",
+        reason=last.reason if last else "",
+        candidate_rms_mm=entry.candidate_rms_mm or 0.0,
+    )
+
+
+def trigger_text(number: int, status: Code, message: str) -> str:
+    """The answer of a Trigger twin: id, code and words, in this order, one blank between."""
+    return f"{number} {status.name} {message}"
+
+
+def _require_finite(what: str, values: Sequence[float]) -> None:
+    if not all(math.isfinite(value) for value in values):
+        raise InputError(f"the {what} holds a number that is not finite: it is not sent")

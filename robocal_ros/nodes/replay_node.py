@@ -1,0 +1,237 @@
+"""Plays a bag into the graph with /clock, and reports what was not received (docs/replay.md)."""
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.conversions import time_message
+from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.parameters import Setting
+from robocal_ros.nodes.replay_topics import CLOCK, ReplayTopics, chosen_topics
+from robocal_ros.nodes.run import run
+from robocal_ros.storage.bags import BagMessage, BagReader
+
+TICK_S = 0.002
+BATCH = 200
+STATUS_S = 1.0
+PATIENCE_S = 0.05  # a tick waits at most so long for acknowledgements
+EXIT_LOSS = 3
+
+WAITING, PLAYING, PAUSED, DONE, FAILED = "waiting", "playing", "paused", "done", "failed"
+
+SETTINGS = (
+    Setting("bag", "", "MCAP file, or folder of a recording"),
+    Setting(
+        "rate",
+        1.0,
+        "Speed of the recorded time; 0: as fast as it is acknowledged",
+        low=0.0,
+        high=1000.0,
+    ),
+    Setting("topics", [""], "What to play; empty: all but recorded session events"),
+    Setting("remap", [""], "Entries recorded:=played"),
+    Setting("latched", ["/tf_static"], "Played topics whose last messages are kept for latecomers"),
+    Setting("wait_for_subscribers", [""], "Played topics that must have a subscriber first"),
+    Setting("start_delay_s", 0.0, "Pause before the first message", unit="s", low=0.0, high=600.0),
+    Setting("start_paused", False, "Wait for ~/play"),
+    Setting(
+        "acknowledge_timeout_s",
+        5.0,
+        "Longest wait for a subscriber's acknowledgement before it is reported",
+        unit="s",
+        low=0.1,
+        high=600.0,
+    ),
+    Setting("exit_at_end", False, "End the process: status 0, or 3 when anything was lost"),
+)
+
+
+class ReplayNode(HouseNode):
+    """Plays a bag."""
+
+    NAME = "replay_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._reader: BagReader | None = None
+        self._topics: ReplayTopics | None = None
+        self._play_state, self._fault = WAITING, ""
+
+    def configure(self) -> None:
+        """Open the bag and make the publishers."""
+        settings = self.settings
+        if not settings["bag"]:
+            raise InputError("parameter 'bag' is empty: give an MCAP file or a recording's folder")
+        self._reader = BagReader(Path(settings["bag"]).expanduser())
+        self._info = self._reader.info
+        recorded = {name: topic.msgtype for name, topic in self._info.topics.items()}
+        chosen, left = chosen_topics(recorded, settings["topics"], settings["remap"])
+        self._topics = ReplayTopics(self, settings["latched"])
+        for topic, name in chosen.items():
+            self._topics.add(topic, name, recorded[topic])
+        self._topics.skipped |= left
+        self._clock_out = self.add_output(
+            Clock, CLOCK, QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        )
+        self._status = self.add_output(String, "~/status", qos.LATCHED)
+        self.add_service(Trigger, "~/play", self._play)
+        self.add_service(Trigger, "~/pause", self._pause)
+        self.add_timer(TICK_S, self._tick, steady=True)
+        self.add_timer(STATUS_S, self._report, steady=True)
+
+    def activate(self) -> None:
+        """Begin at the start of the bag."""
+        if self._reader is None or self._topics is None:
+            raise ValueError("activated before it was configured")
+        self._messages: Iterator[BagMessage] = self._reader.messages(
+            list(self._topics.played), raw=True
+        )
+        self._next = next(self._messages, None)
+        self._first_ns = self._position_ns = 0 if self._next is None else self._next.log_time_ns
+        self._begin = time.monotonic() + self.settings["start_delay_s"]
+        self._unsettled_since: float | None = None
+        self._set_state(PAUSED if self.settings["start_paused"] else WAITING)
+
+    def deactivate(self) -> None:
+        """Stop where it is."""
+        self._set_state(PAUSED)
+
+    def cleanup(self) -> None:
+        """Close the bag."""
+        if self._topics is not None:
+            self._topics.close()
+        if self._reader is not None:
+            self._reader.__exit__(None, None, None)
+        self._topics = self._reader = None
+
+    # ---- playing --------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        topics = self._topics
+        if topics is None or self._play_state not in (WAITING, PLAYING):
+            return
+        now = time.monotonic()
+        if self._play_state == WAITING:
+            if now < self._begin or not topics.heard(self.settings["wait_for_subscribers"]):
+                return
+            self._restart(now)
+            self._set_state(PLAYING)
+        if not self._settled(topics, now):
+            return
+        try:
+            self._send(topics, now)
+        except RobocalError as error:
+            self._fault = str(error)
+            self._end(FAILED)
+
+    def _send(self, topics: ReplayTopics, now: float) -> None:
+        rate, sent = self.settings["rate"], 0
+        while self._next is not None and sent < BATCH:
+            if rate and self._next.log_time_ns > self._due_ns(now, rate):
+                break
+            self._position_ns = max(self._position_ns, self._next.log_time_ns)
+            topics.publish(self._next.topic, self._next.message)
+            self._next = next(self._messages, None)
+            sent += 1
+        if sent or rate:
+            self._tell_time(now, rate)
+        self._unsettled_since = now if sent else self._unsettled_since
+        if self._next is None and self._settled(topics, time.monotonic()):
+            self._end(DONE)
+
+    def _due_ns(self, now: float, rate: float) -> int:
+        return self._from_ns + int((now - self._since) * rate * 1e9)
+
+    def _tell_time(self, now: float, rate: float) -> None:
+        """/clock runs on between messages, and never beyond the next one or back."""
+        if rate and self._next is not None:
+            self._position_ns = max(self._position_ns, self._due_ns(now, rate))
+        self._clock_out.publish(Clock(clock=time_message(self._position_ns)))
+
+    def _settled(self, topics: ReplayTopics, now: float) -> bool:
+        """Whether everything sent was acknowledged, or given up and reported."""
+        if self._unsettled_since is None:
+            return True
+        if not topics.settle(PATIENCE_S):
+            if now - self._unsettled_since < self.settings["acknowledge_timeout_s"]:
+                return False
+            topics.give_up()
+            self.get_logger().error(f"{topics.unacknowledged} messages were not acknowledged")
+        self._unsettled_since = None
+        return True
+
+    def _restart(self, now: float) -> None:
+        self._since, self._from_ns = now, self._position_ns
+
+    def _end(self, state: str) -> None:
+        self._set_state(state)
+        if self.settings["exit_at_end"]:
+            topics = self._topics
+            lost = state == FAILED or (topics is not None and topics.unacknowledged > 0)
+            raise SystemExit(EXIT_LOSS if lost else 0)
+
+    # ---- services and status --------------------------------------------------------------------
+
+    def _play(self, request: Any, response: Any) -> Any:
+        if self._play_state in (DONE, FAILED):
+            raise ConflictError(f"the bag is {self._play_state}: activate the node anew to repeat")
+        if self._play_state == PAUSED:
+            self._restart(time.monotonic())
+            self._set_state(PLAYING)
+        response.success, response.message = True, self._play_state
+        return response
+
+    def _pause(self, request: Any, response: Any) -> Any:
+        if self._play_state in (WAITING, PLAYING):
+            self._set_state(PAUSED)
+        response.success, response.message = True, self._play_state
+        return response
+
+    def _set_state(self, state: str) -> None:
+        self._play_state = state
+        self._report()
+
+    def _report(self) -> None:
+        if self._topics is None:
+            return
+        self._topics.look()
+        status = {
+            "state": self._play_state,
+            "bag": self._info.path,
+            "position_s": (self._position_ns - self._first_ns) * 1e-9,
+            "notes": list(self._info.notes),
+            "fault": self._fault,
+            **self._topics.report(),
+        }
+        self._status.publish(String(data=json.dumps(status, sort_keys=True)))
+
+    def health(self) -> Health:
+        """Tell how far it is and what was lost."""
+        health, topics = Health(message=self._play_state), self._topics
+        if topics is None:
+            return health
+        report = topics.report()
+        if self._fault:
+            health.worsen(ERROR, self._fault)
+        if topics.unacknowledged:
+            health.worsen(ERROR, f"{topics.unacknowledged} messages were not acknowledged")
+        for topic, nodes in report["best_effort"].items():
+            health.worsen(WARN, f"{topic}: {', '.join(nodes)} is best-effort, loss is not seen")
+        health.values = {f"{topic} sent": count for topic, count in report["sent"].items()}
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(ReplayNode)

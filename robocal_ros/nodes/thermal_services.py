@@ -1,0 +1,134 @@
+"""The services of the thermal node: each call becomes a command, its outcome the answer."""
+
+import json
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from robocal_msgs.srv import CaptureReference, Decide, Identify, ListCalibrations
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.nodes.conversions import summary_message, trigger_text
+from robocal_ros.sessions.events import (
+    ACCEPT,
+    CAPTURE_REFERENCE,
+    IDENTIFY,
+    REJECT,
+    ROLLBACK,
+    Command,
+    Outcome,
+)
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+LIST_LIMIT = 50
+TWIN = "trigger"
+
+AddService = Callable[[type, str, Callable[[Any, Any], Any]], None]
+Ask = Callable[[Command], Awaitable[Outcome]]
+
+
+class ThermalServices:
+    """Services and their Trigger twins.
+
+    Parameters
+    ----------
+    add : creates a service.
+    ask : gives a command to the session and awaits its outcome.
+    """
+
+    def __init__(self, add: AddService, ask: Ask, history: CalibrationHistory) -> None:
+        self._ask = ask
+        self._history = history
+        add(CaptureReference, "~/capture_reference", self._capture_reference)
+        add(Identify, "~/identify", self._identify)
+        add(ListCalibrations, "~/list", self._list)
+        add(Trigger, "~/capture_reference_trigger", self._twin(CAPTURE_REFERENCE, dict))
+        add(Trigger, "~/identify_trigger", self._twin(IDENTIFY, dict))
+        add(Trigger, "~/list_trigger", self._list_twin)
+        for name in (ACCEPT, REJECT, ROLLBACK):
+            add(Decide, f"~/{name}", self._decide(name))
+        add(Trigger, "~/accept_trigger", self._twin(ACCEPT, self._only_candidate))
+        add(Trigger, "~/reject_trigger", self._twin(REJECT, self._only_candidate))
+        add(Trigger, "~/rollback_trigger", self._twin(ROLLBACK, lambda: {"previous": True}))
+
+    async def _capture_reference(self, request: Any, response: Any) -> Any:
+        outcome = await self._ask(Command(CAPTURE_REFERENCE, {}))
+        response.samples = outcome.samples
+        return _answer(response, outcome)
+
+    async def _identify(self, request: Any, response: Any) -> Any:
+        arguments = {
+            "cycle_id": request.cycle_id,
+            "samples": request.samples,
+            "method": request.method,
+        }
+        outcome = await self._ask(Command(IDENTIFY, arguments))
+        response.candidate_id = outcome.calibration_id
+        _answer(response, outcome)
+        response.success = outcome.calibration_id > 0
+        return response
+
+    def _decide(self, name: str) -> Callable[[Any, Any], Any]:
+        async def decide(request: Any, response: Any) -> Any:
+            if name != ROLLBACK and request.id == 0:
+                raise InputError(f"{name} needs the id of a calibration; look at the list")
+            arguments = {"id": request.id, "by": request.by, "reason": request.reason}
+            outcome = await self._ask(Command(name, arguments))
+            response.revision = outcome.revision
+            return _answer(response, outcome)
+
+        return decide
+
+    def _list(self, request: Any, response: Any) -> Any:
+        entries = self._history.list(request.limit or LIST_LIMIT)
+        response.calibrations = [summary_message(entry) for entry in entries]
+        response.success, response.status = True, int(Code.ACCEPT)
+        return response
+
+    def _list_twin(self, request: Any, response: Any) -> Any:
+        lines = [
+            {
+                "id": entry.id,
+                "revision": entry.revision,
+                "kind": entry.kind,
+                "state": entry.state.value,
+                "code": entry.code.name,
+                "cycle_id": entry.cycle_id,
+                "candidate_rms_mm": entry.candidate_rms_mm,
+            }
+            for entry in self._history.list(LIST_LIMIT)
+        ]
+        response.success, response.message = True, json.dumps(lines, allow_nan=False)
+        return response
+
+    def _twin(self, name: str, arguments: Callable[[], dict[str, Any]]) -> Callable[..., Any]:
+        async def trigger(request: Any, response: Any) -> Any:
+            try:
+                outcome = await self._ask(Command(name, {"by": TWIN, **arguments()}))
+            except RobocalError as error:
+                response.message = trigger_text(0, error.code, str(error))
+                return response
+            response.success = outcome.done
+            response.message = trigger_text(outcome.calibration_id, outcome.status, outcome.message)
+            return response
+
+        return trigger
+
+    def _only_candidate(self) -> dict[str, Any]:
+        """The candidate that a twin decides about, when there is no doubt which."""
+        pending = [entry.id for entry in self._history.pending()]
+        if len(pending) != 1:
+            found = ", ".join(map(str, pending)) or "none"
+            raise ConflictError(
+                f"exactly one fresh candidate must be pending, found {found}: "
+                + ("decide by id" if pending else "identify first")
+            )
+        return {"id": pending[0]}
+
+
+def _answer(response: Any, outcome: Outcome) -> Any:
+    response.success = outcome.done
+    response.message = outcome.message
+    response.status = int(outcome.status)
+    return response

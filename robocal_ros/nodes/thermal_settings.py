@@ -1,0 +1,98 @@
+"""Parameters of the thermal node."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.core.samples import DEFAULT_TARGET
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.nodes.parameters import Setting
+from robocal_ros.sessions.thermal_config import METHODS, PRIORS, ThermalConfig
+
+SETTINGS = (
+    Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
+    Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    Setting("base_frame", "base", "Name of the robot's base frame"),
+    Setting("measuring_frame", "", "Frame of the measurements; empty: that of the first one used"),
+    Setting("target", DEFAULT_TARGET, "Target where a measurement's frame_id names none"),
+    Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
+    Setting("prior", PRIORS[0], "Expected drift: by default or as learned", choices=PRIORS),
+    Setting(
+        "sigma_mm",
+        0.03,
+        "Standard deviation of one measured coordinate, sensor and repeatability",
+        unit="mm",
+        low=1e-4,
+        high=10.0,
+    ),
+    Setting(
+        "hold_out",
+        0.5,
+        "Share of the poses kept to judge a calibration without a reference",
+        low=0.1,
+        high=0.9,
+    ),
+    Setting("seed", 0, "Which poses are held out", low=0, high=2**31 - 1),
+    Setting(
+        "standstill_before_s",
+        0.3,
+        "The robot stands still so long before a measurement's stamp",
+        unit="s",
+        low=0.0,
+        high=10.0,
+    ),
+    Setting("standstill_after_s", 0.1, "and so long after it", unit="s", low=0.0, high=10.0),
+    Setting(
+        "standstill_tolerance_deg",
+        0.02,
+        "Largest range of a joint that stands still",
+        unit="deg",
+        low=1e-4,
+        high=5.0,
+    ),
+    Setting(
+        "joint_gap_s",
+        0.25,
+        "Longest pause between two joint readings about a measurement",
+        unit="s",
+        low=1e-3,
+        high=10.0,
+    ),
+    Setting(
+        "lateness_s",
+        0.2,
+        "identify and capture_reference wait for joint readings so much newer than the call",
+        unit="s",
+        low=0.0,
+        high=5.0,
+    ),
+    Setting(
+        "command_timeout_s",
+        1.0,
+        "They wait at most so long (wall clock), then use what is there",
+        unit="s",
+        low=0.05,
+        high=30.0,
+    ),
+)
+
+
+def session_config(settings: Mapping[str, Any]) -> ThermalConfig:
+    """Settings of the session, in SI."""
+    return ThermalConfig(
+        method=settings["method"],
+        prior=settings["prior"],
+        sigma_m=settings["sigma_mm"] * 1e-3,
+        hold_out=settings["hold_out"],
+        seed=settings["seed"],
+        lateness_s=settings["lateness_s"],
+        measuring_frame=settings["measuring_frame"],
+        target=settings["target"],
+        standstill=StandstillRule(
+            before_s=settings["standstill_before_s"],
+            after_s=settings["standstill_after_s"],
+            tolerance_rad=float(np.radians(settings["standstill_tolerance_deg"])),
+            gap_s=settings["joint_gap_s"],
+        ),
+    )

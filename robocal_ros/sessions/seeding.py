@@ -1,0 +1,83 @@
+"""A session that starts where a recorded one started."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError, WrongRobotError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import THERMAL, Proposal
+from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.in_force import REFERENCE
+from robocal_ros.sessions.records import config_of
+from robocal_ros.sessions.thermal import ThermalSession
+
+BY = "replay"
+WHY = "in force when the recording began"
+
+
+def require_robot(nominal: SerialArm, configured: Command) -> None:
+    """Refuse a robot that the recording was not made with.
+
+    Raises
+    ------
+    WrongRobotError
+        Always then; the message names both models.
+    """
+    recorded = str(configured.arguments.get("model_hash", ""))
+    if recorded != nominal.model_hash:
+        raise WrongRobotError(
+            f"this was recorded with robot '{configured.arguments.get('robot', '')}' of nominal "
+            f"model {recorded}; '{nominal.name}' is {nominal.model_hash}"
+        )
+
+
+def session_as_recorded(
+    nominal: SerialArm, history: History, configured: Command, software: str
+) -> ThermalSession:
+    """Make a session with the recorded settings; an empty history gets what was in force.
+
+    Raises
+    ------
+    WrongRobotError
+        The recording was made with another nominal model.
+    InputError
+        The configuration cannot be read.
+    """
+    require_robot(nominal, configured)
+    arguments = configured.arguments
+    try:
+        model, reference, prior = arguments["model"], arguments["reference"], arguments["prior"]
+    except KeyError as error:
+        raise InputError(f"the recorded configuration lacks {error}") from error
+    if not history.list(1):
+        _bring_into_force(history, THERMAL, nominal, model, software)
+        _bring_into_force(history, REFERENCE, nominal, reference, software)
+    return ThermalSession(nominal, history, config_of(arguments), software, np.array(prior))
+
+
+def _bring_into_force(
+    history: History, kind: str, nominal: SerialArm, model: Mapping[str, Any] | None, software: str
+) -> None:
+    if model is None:
+        return
+    calibration_id = history.propose(
+        Proposal(
+            kind=kind,
+            model_hash=nominal.model_hash,
+            based_on=0,
+            cycle_id="",
+            stamp_ns=0,
+            created_ns=0,
+            software=software,
+            method="",
+            code=Code.ACCEPT,
+            reason=WHY,
+            document={},
+            model=model,
+        )
+    )
+    history.accept(calibration_id, by=BY, reason=WHY, expected_head=None, wall_ns=0)

@@ -1,0 +1,86 @@
+"""A small simulated shift: a robot moves from pose to pose, a ball on it is measured at rest."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robocal_ros.core import frames
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import JointSample, PointSample
+
+NS = 1_000_000_000
+PERIOD_NS = 10_000_000
+MOVE_S, STILL_S = 0.3, 0.6
+NOISE_M = 2e-5
+BALL = np.array([0.10, 0.05, 0.20, 1.0])
+T_SENSOR_BASE = frames.transform(frames.exp_rotation([0.3, -0.2, 1.0]), [2.0, 1.0, -0.5])
+
+Sample = JointSample | PointSample
+
+
+def postures(arm: SerialArm, count: int, seed: int = 3) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.uniform(np.maximum(arm.lower, -1.6), np.minimum(arm.upper, 1.6), (count, arm.n))
+
+
+def built(nominal: SerialArm, seed: int = 5) -> SerialArm:
+    """The robot as built: off its nominal model by tenths of a millimetre."""
+    rng = np.random.default_rng(seed)
+    size = np.where(nominal.parameters.is_length, 3e-4, np.radians(0.01))
+    return nominal.with_mdh(nominal.parameters.add(nominal.mdh, size * rng.normal(size=len(size))))
+
+
+def warmed(cold: SerialArm, kelvin: float = 15.0) -> SerialArm:
+    """The same robot with grown links."""
+    chosen = cold.parameters
+    length = np.where(chosen.is_length, chosen.read(cold.mdh), 0.0)
+    return cold.with_mdh(chosen.add(cold.mdh, length * 12e-6 * kelvin))
+
+
+@dataclass
+class Shift:
+    """Makes samples of one visit after the other; stamps run on from ``start_ns``."""
+
+    names: tuple[str, ...]
+    start_ns: int = 1_000 * NS
+    frame: str = "sensor/ball"
+    seed: int = 1
+    now_ns: int = field(init=False)
+    at: np.ndarray | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self.now_ns = self.start_ns
+        self.rng = np.random.default_rng(self.seed)
+
+    def visit(self, arm: SerialArm, q: np.ndarray) -> Iterator[Sample]:
+        """Go through the poses and measure once at each."""
+        for target in q:
+            yield from self._move(target)
+            yield from self._rest(arm, target)
+
+    def _move(self, target: np.ndarray) -> Iterator[Sample]:
+        start = target if self.at is None else self.at
+        steps = round(MOVE_S * NS / PERIOD_NS)
+        for step in range(1, steps + 1):
+            yield self._joints(start + (target - start) * step / steps)
+        self.at = target
+
+    def _rest(self, arm: SerialArm, target: np.ndarray) -> Iterator[Sample]:
+        steps = round(STILL_S * NS / PERIOD_NS)
+        for step in range(steps):
+            yield self._joints(target)
+            if step == 2 * steps // 3:
+                ball = (T_SENSOR_BASE @ arm.fk(target) @ BALL)[:3]
+                frame, _, name = self.frame.partition("/")
+                measured = ball + NOISE_M * self.rng.normal(size=3)
+                yield PointSample(self.now_ns - 3_000_000, frame, name or "tool", measured)
+
+    def _joints(self, q: np.ndarray) -> JointSample:
+        self.now_ns += PERIOD_NS
+        noisy = q + 1e-7 * self.rng.normal(size=len(q))
+        return JointSample(self.now_ns, self.names, noisy)
+
+
+def of_kind(samples: Sequence[Sample], kind: type) -> list[Sample]:
+    return [sample for sample in samples if isinstance(sample, kind)]

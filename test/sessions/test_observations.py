@@ -1,0 +1,218 @@
+"""Pairing of measurements and joints: by stamps alone."""
+
+import numpy as np
+import pytest
+
+from robocal_ros.core.samples import JointSample, PointSample, PoseSample
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.sessions.observations import (
+    JOINTS,
+    MOST_REASONS,
+    MOST_WAITING,
+    POINT,
+    POSE,
+    ObservationDesk,
+    as_measurements,
+)
+
+MS = 1_000_000
+NAMES = ("a", "b")
+ALL = {JOINTS: 2**62, POINT: 2**62, POSE: 2**62}
+RULE = StandstillRule(before_s=0.3, after_s=0.1, tolerance_rad=1e-3, gap_s=0.25)
+
+
+def joints(ms: int, *q: float, names: tuple[str, ...] = NAMES) -> JointSample:
+    return JointSample(ms * MS, names, np.array(q or (0.1, 0.2)))
+
+
+def point(ms: int, x: float = 1.0, frame: str = "sensor", target: str = "ball") -> PointSample:
+    return PointSample(ms * MS, frame, target, np.array([x, 2.0, 3.0]))
+
+
+def pose(ms: int, frame: str = "sensor", target: str = "ball") -> PoseSample:
+    return PoseSample(ms * MS, frame, target, np.eye(4))
+
+
+def desk(frame: str | None = None) -> ObservationDesk:
+    return ObservationDesk(NAMES, RULE, frame)
+
+
+def stand(desk: ObservationDesk, start_ms: int, end_ms: int, step_ms: int = 100) -> None:
+    for ms in range(start_ms, end_ms + 1, step_ms):
+        desk.add_joints(joints(ms))
+
+
+def everything(desk: ObservationDesk):
+    return desk.window(-1, 2**62, ALL)
+
+
+def test_a_measurement_gets_the_joints_of_its_stamp():
+    d = desk()
+    for ms in range(1000, 2001, 100):
+        d.add_joints(joints(ms, 0.1 + 1e-7 * ms, 0.2))
+    d.add_measurement(point(1650))
+    (found,) = everything(d)
+    assert found.q == pytest.approx([0.1 + 1e-7 * 1650, 0.2], abs=1e-12)
+    assert found.ready_ns == 1800 * MS  # the reading that ends the standstill window
+    assert (found.topic, found.frame, found.target) == (POINT, "sensor", "ball")
+
+
+@pytest.mark.parametrize("first", ["joints", "measurement"])
+def test_early_and_late_arrival_are_the_same(first):
+    d = desk()
+    if first == "measurement":
+        d.add_measurement(point(1500))
+        assert everything(d) == []
+    stand(d, 1000, 2000)
+    if first == "joints":
+        d.add_measurement(point(1500))
+    (found,) = everything(d)
+    assert found.ready_ns == 1600 * MS
+
+
+def test_a_measurement_waits_for_the_end_of_its_standstill():
+    d = desk()
+    stand(d, 1000, 1500)
+    d.add_measurement(point(1450))
+    assert everything(d) == []
+    d.add_joints(joints(1600))
+    assert len(everything(d)) == 1
+
+
+def test_a_robot_that_moves_after_the_measurement_spoils_it():
+    d = desk()
+    stand(d, 1000, 1500)
+    d.add_joints(joints(1600, 0.15, 0.2))
+    d.add_measurement(point(1500))
+    assert everything(d) == []
+    assert d.ignored[POINT] == {"a moved by # deg (allowed # deg)": 1}
+
+
+def test_a_pause_of_the_joints_spoils_a_measurement_and_is_counted():
+    d = desk()
+    stand(d, 1000, 1300)
+    stand(d, 1700, 2000)
+    d.add_measurement(point(1600))
+    assert everything(d) == []
+    assert d.stream.gap_count == 1
+    assert d.stream.longest_gap_ns == 400 * MS
+    assert d.ignored[POINT] == {"joint readings pause for # s (allowed # s)": 1}
+
+
+def test_a_measurement_before_the_first_joints_is_named():
+    d = desk()
+    d.add_measurement(point(1100))
+    stand(d, 1000, 1500)
+    assert d.ignored[POINT] == {"no joint readings from before the measurement": 1}
+    assert d.from_ns == 1300 * MS  # from here on windows are complete
+
+
+def test_joints_by_name_in_any_order_beside_others():
+    d = desk()
+    for ms in range(1000, 2001, 100):
+        d.add_joints(joints(ms, 9.0, 0.2, 0.1, names=("gripper", "b", "a")))
+    d.add_measurement(point(1500))
+    assert everything(d)[0].q == pytest.approx([0.1, 0.2])
+
+
+def test_unusable_joints_are_counted_by_reason():
+    d = desk()
+    stand(d, 1000, 2000)
+    d.add_joints(joints(2100, 0.1, names=("a",)))
+    d.add_joints(joints(2000))
+    d.add_joints(joints(1950))
+    d.add_joints(joints(0))
+    assert sum(d.ignored[JOINTS].values()) == 4
+    assert d.ignored[JOINTS]["joint state at # ns is not after # ns"] == 2
+    assert d.ignored[JOINTS]["no time stamp"] == 1
+    assert d.ignored[JOINTS]["joint state lacks b; it has a"] == 1
+    assert d.newest_ns[JOINTS] == 2000 * MS
+
+
+def test_a_clock_that_jumps_back_begins_anew():
+    d = desk()
+    stand(d, 10_000, 11_000)
+    d.add_measurement(point(10_500))
+    d.add_measurement(point(12_000))  # waits for joints that never come
+    d.use(10_200 * MS)
+    stand(d, 1000, 2000)
+    assert d.ignored[POINT] == {"the clock jumped back": 1}
+    assert d.newest_ns == {JOINTS: 2000 * MS}
+    d.add_measurement(point(1500))
+    assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
+    assert d.from_ns == 1300 * MS
+
+
+def test_another_frame_is_refused_where_the_frame_is_set():
+    d = desk("sensor")
+    stand(d, 1000, 2000)
+    d.add_measurement(point(1500, frame="camera"))
+    assert everything(d) == []
+    assert d.ignored[POINT] == {"frame 'camera' is not the measuring frame 'sensor'": 1}
+
+
+@pytest.mark.parametrize("order", [(1500, 1600), (1600, 1500)])
+def test_the_earliest_observation_gives_the_frame(order):
+    """Not the first that arrived: that would depend on the network."""
+    d = desk()
+    stand(d, 1000, 2000)
+    frames = {1500: "sensor", 1600: "camera"}
+    for ms in order:
+        d.add_measurement(point(ms, frame=frames[ms]))
+    assert [o.frame for o in everything(d)] == ["sensor"]
+    assert d.frame == "sensor"
+    assert sum(d.ignored[POINT].values()) == 1
+    d.add_measurement(point(1700, frame="camera"))
+    assert len(everything(d)) == 1
+
+
+def test_a_target_counts_once_at_a_stamp_and_the_pose_before_the_point():
+    d = desk()
+    stand(d, 1000, 2000)
+    d.add_measurement(point(1500, 1.0))
+    d.add_measurement(point(1500, 9.0))
+    d.add_measurement(point(1600))
+    d.add_measurement(pose(1600))
+    d.add_measurement(point(1500, 5.0, target="cube"))
+    found = everything(d)
+    assert [(o.stamp_ns // MS, o.target, o.topic) for o in found] == [
+        (1500, "ball", POINT),
+        (1500, "cube", POINT),
+        (1600, "ball", POSE),
+    ]
+    assert found[0].position[0] == 1.0
+    samples = as_measurements(found).sample
+    assert len(set(samples)) == 3
+
+
+def test_orientations_only_where_all_have_one():
+    d = desk()
+    stand(d, 1000, 2000)
+    d.add_measurement(pose(1500))
+    assert as_measurements(everything(d)).rotation is not None
+    d.add_measurement(point(1600))
+    assert as_measurements(everything(d)).rotation is None
+
+
+def test_a_window_holds_what_lies_between_its_bounds_and_before_its_marks():
+    d = desk()
+    stand(d, 1000, 3000)
+    for ms in (1500, 2000, 2500):
+        d.add_measurement(point(ms))
+    stamps = lambda *w: [o.stamp_ns // MS for o in d.window(*w)]  # noqa: E731
+    assert stamps(1500 * MS, 2500 * MS, ALL) == [2000, 2500]
+    assert stamps(-1, 2499 * MS, ALL) == [1500, 2000]
+    assert stamps(-1, 2500 * MS, ALL | {JOINTS: 2100 * MS}) == [1500, 2000]
+    assert stamps(-1, 2500 * MS, ALL | {POINT: 1500 * MS}) == [1500]
+    assert stamps(-1, 2500 * MS, {}) == []
+
+
+def test_nothing_grows_without_bound():
+    d = desk()
+    for ms in range(1000, 1000 + MOST_WAITING + 10):
+        d.add_measurement(point(ms))
+    assert d.ignored[POINT] == {"no joint readings came": 10}
+    for number in range(3 * MOST_REASONS):
+        d.ignore(POSE, f"frame 'f{number}' is unknown")
+    assert len(d.ignored[POSE]) == MOST_REASONS + 1
+    assert sum(d.ignored[POSE].values()) == 3 * MOST_REASONS
