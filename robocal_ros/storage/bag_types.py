@@ -21,13 +21,10 @@ _DTYPES = {"char": "uint8", "octet": "uint8"}
 def ros_types() -> Typestore:
     """The standard types of Jazzy, and those of robocal_msgs where they are found."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for folder in share_folders(INTERFACES, "msg_defs"):
-        files = sorted((folder / "msg").glob("*.msg"))
-        if files:
-            for file in files:
-                name = f"{INTERFACES}/msg/{file.stem}"
-                store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))
-            break
+    for folder in share_folders(INTERFACES, "msg", "msg_defs/msg")[:1]:
+        for file in sorted(folder.glob("*.msg")):
+            name = f"{INTERFACES}/msg/{file.stem}"
+            store.register(get_types_from_msg(file.read_text(encoding="utf-8"), name))
     return store
 
 

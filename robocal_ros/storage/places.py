@@ -15,10 +15,11 @@ def prefixes() -> list[Path]:
     return [*found, Path(sys.prefix)]
 
 
-def share_folders(package: str, source: str) -> list[Path]:
-    """Existing folders of a package's files, the best first.
+def share_folders(package: str, inside: str, source: str) -> list[Path]:
+    """Existing folders ``share/<package>/<inside>`` of all prefixes, the best first.
 
-    ``source`` is the folder in the source tree; it comes before the installed ones.
+    ``source`` is the same folder in the source tree; it comes before the installed ones.
     """
-    candidates = [SOURCE_ROOT / source, *(prefix / "share" / package for prefix in prefixes())]
-    return [folder for folder in dict.fromkeys(candidates) if folder.is_dir()]
+    installed = (prefix / "share" / package / inside for prefix in prefixes())
+    candidates = dict.fromkeys([SOURCE_ROOT / source, *installed])
+    return [folder for folder in candidates if folder.is_dir()]

@@ -1,0 +1,232 @@
+"""Robot files (YAML), described in docs/robot_file.md, and where the shipped ones are."""
+
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.storage.files import nearest, read_text, write_text
+from robocal_ros.storage.places import share_folders
+from robocal_ros.storage.robot_fields import Fields, load_yaml
+
+Array = NDArray[np.float64]
+
+CONVENTIONS = ("dh", "mdh")
+TYPES = ("revolute", "prismatic")
+RAD = float(np.pi / 180.0)
+MM = 1e-3
+GEOMETRY = {"d_mm": MM, "theta_deg": RAD, "a_mm": MM, "alpha_deg": RAD, "beta_deg": RAD}
+COMMON_KEYS = ("name", "type", "sign", *GEOMETRY)
+UNITS = {False: ("deg", RAD), True: ("mm", MM)}
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """Content of a robot file.
+
+    Attributes
+    ----------
+    max_velocity, max_acceleration : (n,) rad/s and rad/s² (prismatic: m), infinite when unknown.
+    notes : what the file leaves open, in words.
+    """
+
+    arm: SerialArm
+    path: Path
+    max_velocity: Array
+    max_acceleration: Array
+    notes: tuple[str, ...]
+
+
+def load_robot(name: str | Path) -> SerialArm:
+    """Arm of a robot file; warns of joint limits that the file does not give.
+
+    Parameters
+    ----------
+    name : path of a file, or name of one in the folders of ``robot_folders``.
+
+    Raises
+    ------
+    InputError
+        Naming file, joint and key, when the file is not as docs/robot_file.md says.
+    """
+    description = load_description(name)
+    for note in description.notes:
+        warnings.warn(f"{description.path}: {note}", stacklevel=2)
+    return description.arm
+
+
+def load_description(name: str | Path) -> RobotDescription:
+    """Everything that a robot file says; see ``load_robot``."""
+    path = find_robot(name)
+    top = Fields(load_yaml(read_text(path, "robot file"), str(path)), str(path), "")
+    top.only("robot", "convention", "joints", "base", "tool")
+    robot = top.text("robot")
+    convention = top.choice("convention", CONVENTIONS)
+    joints = [_Joint(fields, convention) for fields in top.items("joints", "joint")]
+    names = [joint.name for joint in joints]
+    doubled = next((name for name in names if names.count(name) > 1), None)
+    if doubled is not None:
+        top.fail(f"two joints have the name '{doubled}'", "joints")
+    arm = SerialArm(
+        name=robot,
+        joint_names=tuple(names),
+        mdh=np.array([joint.mdh for joint in joints]),
+        sign=np.array([joint.sign for joint in joints]),
+        prismatic=np.array([joint.prismatic for joint in joints]),
+        lower=np.array([joint.lower for joint in joints]),
+        upper=np.array([joint.upper for joint in joints]),
+        T_base_root=_pose(top, "base"),
+        T_flange_tool=_pose(top, "tool"),
+    )
+    velocity = np.array([joint.max_velocity for joint in joints])
+    acceleration = np.array([joint.max_acceleration for joint in joints])
+    return RobotDescription(arm, path, velocity, acceleration, _open_limits(arm))
+
+
+def robot_folders() -> list[Path]:
+    """Folders of robot files, in the order in which a name is looked up.
+
+    ``$ROBOCAL_CONFIG/robots``, the source tree's ``config/robots``, then
+    ``share/robocal_ros/config/robots`` of ROS' prefixes and of the one that this runs from.
+    """
+    own = os.environ.get("ROBOCAL_CONFIG")
+    shipped = share_folders("robocal_ros", "config/robots", "config/robots")
+    return [*([Path(own) / "robots"] if own else []), *shipped]
+
+
+def find_robot(name: str | Path) -> Path:
+    """File of a robot's name or path.
+
+    Raises
+    ------
+    InputError
+        When there is none; the message lists the known names.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    if path.suffix in (".yaml", ".yml") or len(path.parts) != 1:
+        raise InputError("no such robot file", file=str(name))
+    known: dict[str, Path] = {}
+    for folder in robot_folders():
+        for file in sorted(folder.glob("*.yaml")):
+            known.setdefault(file.stem, file)
+    if str(name) not in known:
+        raise InputError(
+            f"no robot '{name}'{nearest(str(name), known)}: give the path of a robot file, or one "
+            f"of {', '.join(sorted(known)) or '(no robot files are installed)'}"
+        )
+    return known[str(name)]
+
+
+def save_robot(arm: SerialArm, path: str | Path) -> None:
+    """Write an arm as a robot file; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    convention = "mdh" if np.any(arm.mdh[:, 4]) else "dh"
+    document: dict[str, Any] = {"robot": arm.name, "convention": convention}
+    document["joints"] = [_joint_document(arm, i, convention) for i in range(arm.n)]
+    for key, T in (("base", arm.T_base_root), ("tool", arm.T_flange_tool)):
+        if not np.array_equal(T, np.eye(4)):
+            xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
+            document[key] = {"xyz_mm": xyz, "quat_xyzw": frames.quat_xyzw(T).tolist()}
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
+    write_text(Path(path), text)
+
+
+class _Joint:
+    """One entry of ``joints``, in SI."""
+
+    def __init__(self, fields: Fields, convention: str) -> None:
+        self.name = fields.text("name")
+        fields.place += f" '{self.name}'"
+        self.prismatic = fields.choice("type", TYPES, "revolute") == "prismatic"
+        unit, factor = UNITS[self.prismatic]
+        limits = (f"lower_{unit}", f"upper_{unit}")
+        rates = (f"max_velocity_{unit}_s", f"max_acceleration_{unit}_s2")
+        fields.only(*COMMON_KEYS, *limits, *rates)
+        if convention == "dh" and "beta_deg" in fields.values:
+            fields.fail("is not part of convention dh; use convention mdh", "beta_deg")
+        self.sign = fields.number("sign", 1.0)
+        if self.sign not in (1.0, -1.0):
+            fields.fail(f"is {self.sign:g}; it must be 1 or -1", "sign")
+        self.mdh = [
+            fields.number(key, 0.0 if key == "beta_deg" else None) * to_si
+            for key, to_si in GEOMETRY.items()
+        ]
+        self.lower = fields.number(limits[0], -np.inf) * factor
+        self.upper = fields.number(limits[1], np.inf) * factor
+        if self.lower >= self.upper:
+            fields.fail(f"is not below {limits[1]}", limits[0])
+        self.max_velocity, self.max_acceleration = (
+            fields.positive(key, np.inf) * factor for key in rates
+        )
+
+
+def _pose(top: Fields, key: str) -> Array:
+    """Transform (4, 4) of an optional ``{xyz_mm, quat_xyzw or rpy_deg}``."""
+    if key not in top.values:
+        return np.eye(4)
+    fields = top.below(key)
+    fields.only("xyz_mm", "quat_xyzw", "rpy_deg")
+    xyz = np.array(fields.numbers("xyz_mm", 3)) * MM
+    if "quat_xyzw" in fields.values and "rpy_deg" in fields.values:
+        fields.fail("is given beside rpy_deg; use one of them", "quat_xyzw")
+    if "quat_xyzw" in fields.values:
+        quat = np.array(fields.numbers("quat_xyzw", 4))
+        length = float(np.linalg.norm(quat))
+        if abs(length - 1.0) > 1e-3:
+            fields.fail(f"has length {length:.6g}, not 1", "quat_xyzw")
+        return frames.transform_from_quat(xyz, quat)
+    roll, pitch, yaw = np.array(fields.numbers("rpy_deg", 3, (0.0, 0.0, 0.0))) * RAD
+    turns = ((0.0, 0.0, yaw), (0.0, pitch, 0.0), (roll, 0.0, 0.0))
+    Rz, Ry, Rx = (frames.exp_rotation(turn) for turn in turns)
+    return frames.transform(Rz @ Ry @ Rx, xyz)
+
+
+def _open_limits(arm: SerialArm) -> tuple[str, ...]:
+    both = np.isinf(arm.lower) & np.isinf(arm.upper)
+    notes = []
+    for missing, which in (
+        (both, "joint limits"),
+        (np.isinf(arm.lower) & ~both, "a lower limit"),
+        (np.isinf(arm.upper) & ~both, "an upper limit"),
+    ):
+        if np.any(missing):
+            names = ", ".join(np.array(arm.joint_names)[missing])
+            notes.append(f"{which} not given, nothing is assumed: {names}")
+    return tuple(notes)
+
+
+def _shown(value: float, factor: float) -> float:
+    """The shortest number that reads back as ``value``, where there is one."""
+    neat = float(f"{value / factor:.12g}")
+    return neat if neat * factor == value else value / factor
+
+
+def _joint_document(arm: SerialArm, joint: int, convention: str) -> dict[str, Any]:
+    prismatic = bool(arm.prismatic[joint])
+    document: dict[str, Any] = {"name": arm.joint_names[joint]}
+    if prismatic:
+        document["type"] = "prismatic"
+    document["sign"] = int(arm.sign[joint])
+    for (key, factor), value in zip(GEOMETRY.items(), arm.mdh[joint].tolist(), strict=True):
+        if convention == "mdh" or key != "beta_deg":
+            document[key] = _shown(value, factor)
+    unit, factor = UNITS[prismatic]
+    for side, limit in (("lower", arm.lower[joint]), ("upper", arm.upper[joint])):
+        if np.isfinite(limit):
+            document[f"{side}_{unit}"] = _shown(float(limit), factor)
+    return document

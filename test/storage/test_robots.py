@@ -1,0 +1,245 @@
+"""Robot files: the shipped ones, reading, writing, looking up, and every way to get one wrong."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.storage.robots import (
+    find_robot,
+    load_description,
+    load_robot,
+    robot_folders,
+    save_robot,
+)
+
+SHIPPED = ("bx200l", "kr150_r3100", "ur10")
+
+GOOD = """\
+robot: test arm
+convention: mdh
+joints:
+  - {name: one, sign: -1, d_mm: 100, theta_deg: 90, a_mm: 20, alpha_deg: 1e0, beta_deg: 0.5,
+     lower_deg: -90, upper_deg: 180, max_velocity_deg_s: 90, max_acceleration_deg_s2: 180}
+  - {name: two, type: prismatic, d_mm: 1e1, theta_deg: 0, a_mm: 0, alpha_deg: -90,
+     lower_mm: -5, upper_mm: 500, max_velocity_mm_s: 250}
+base: {xyz_mm: [1, 2, 3], rpy_deg: [0, 0, 90]}
+tool: {xyz_mm: [0, 0, 50], quat_xyzw: [0, 0, 0, 1]}
+"""
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "arm.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_every_key_is_read_in_si(tmp_path: Path) -> None:
+    description = load_description(write(tmp_path, GOOD))
+    arm = description.arm
+    assert (arm.name, arm.joint_names) == ("test arm", ("one", "two"))
+    expected = [[0.1, np.pi / 2, 0.02, np.pi / 180, np.pi / 360], [0.01, 0, 0, -np.pi / 2, 0]]
+    np.testing.assert_allclose(arm.mdh, expected, rtol=1e-15)
+    assert arm.sign.tolist() == [-1.0, 1.0]
+    assert arm.prismatic.tolist() == [False, True]
+    np.testing.assert_allclose(arm.lower, [-np.pi / 2, -0.005], rtol=1e-15)
+    np.testing.assert_allclose(arm.upper, [np.pi, 0.5], rtol=1e-15)
+    np.testing.assert_allclose(description.max_velocity, [np.pi / 2, 0.25], rtol=1e-15)
+    np.testing.assert_allclose(description.max_acceleration, [np.pi, np.inf], rtol=1e-15)
+    np.testing.assert_allclose(arm.T_base_root[:3, 3], [1e-3, 2e-3, 3e-3], rtol=1e-15)
+    np.testing.assert_allclose(arm.T_base_root[:3, 0], [0, 1, 0], atol=1e-15)
+    assert arm.T_flange_tool[:3, 3].tolist() == [0, 0, 0.05]
+    assert description.notes == ()
+
+
+def test_rpy_turns_about_the_fixed_axes_as_in_urdf(tmp_path: Path) -> None:
+    text = GOOD.replace("[0, 0, 90]", "[30, 40, 50]")
+    R = load_robot(write(tmp_path, text)).T_base_root[:3, :3]
+    r, p, y = np.radians([30, 40, 50])
+    # first column and last row of Rz(y) Ry(p) Rx(r), written out
+    np.testing.assert_allclose(
+        R[:, 0], [np.cos(y) * np.cos(p), np.sin(y) * np.cos(p), -np.sin(p)], atol=1e-15
+    )
+    np.testing.assert_allclose(
+        R[2], [-np.sin(p), np.cos(p) * np.sin(r), np.cos(p) * np.cos(r)], atol=1e-15
+    )
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_robots_have_limits_around_their_check_pose(name: str) -> None:
+    description = load_description(name)
+    assert description.notes == ()
+    pose = {"bx200l": (90, 0, 0, 0, 0, 0), "kr150_r3100": (0, -90, 90, 0, 0, 0)}
+    q = np.radians(pose.get(name, (0, 0, 0, 0, 0, 0)))
+    assert np.all((description.arm.lower <= q) & (q <= description.arm.upper))
+    assert len(description.arm.parameters) == 24
+
+
+def test_missing_limits_are_told_not_invented(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="joint limits not given.*joint1, joint2, joint3"):
+        arm = load_robot("p1r2p3")
+    assert np.all(np.isneginf(arm.lower))
+    assert np.all(np.isposinf(arm.upper))
+    one_sided = GOOD.replace("lower_deg: -90, ", "").replace(", upper_mm: 500", "")
+    notes = load_description(write(tmp_path, one_sided)).notes
+    assert [note.split(" ", 3)[1:] for note in notes] == [
+        ["lower", "limit", "not given, nothing is assumed: one"],
+        ["upper", "limit", "not given, nothing is assumed: two"],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("robot: test arm\n", "", "robot is missing"),
+        ("robot: test arm", "robot: 10", "robot must be a text, not 10"),
+        ("robot: test arm", "robot:", "robot has no value"),
+        ("convention: mdh", "convention: craig", "convention is 'craig'; it must be dh or mdh"),
+        ("convention: mdh", "convention: dh", "joint 1 'one', beta_deg is not part of"),
+        ("convention: mdh", "convetion: mdh", "'convetion' is not a known key .*'convention'"),
+        ("name: one, ", "", "joint 1, name is missing"),
+        ("name: two", "name: one", "two joints have the name 'one'"),
+        ("d_mm: 100, ", "", "joint 1 'one', d_mm is missing"),
+        ("d_mm: 100", "d_mm: long", "joint 1 'one', d_mm is 'long', not a number"),
+        ("d_mm: 100", "d_mm: .nan", "joint 1 'one', d_mm is nan, not a finite"),
+        ("d_mm: 100", "d_mm: [1]", "d_mm must be a number, not a list"),
+        ("d_mm: 100", "d_mm: true", "d_mm must be a number, not True"),
+        ("d_mm: 100", "d: 100", "joint 1 'one', 'd' is not a known key"),
+        ("d_mm: 100", "d_m: 100", "did you mean 'd_mm'"),
+        ("d_mm: 100", "d_mm: 100, d_mm: 101", "key 'd_mm' appears twice"),
+        ("sign: -1", "sign: 2", "joint 1 'one', sign is 2; it must be 1 or -1"),
+        ("type: prismatic", "type: prismatik", "did you mean 'prismatic'"),
+        ("lower_mm: -5", "lower_deg: -5", "joint 2 'two', 'lower_deg' is not .*'lower_mm'"),
+        ("lower_mm: -5", "lower_mm: 500", "lower_mm is not below upper_mm"),
+        ("lower_mm: -5", "lower_mm: -.inf", "lower_mm is -inf, not a finite"),
+        ("velocity_mm_s: 250", "velocity_mm_s: 0", "max_velocity_mm_s is 0; it must be above 0"),
+        ("xyz_mm: [0, 0, 50]", "xyz_mm: [0, 0]", "tool, xyz_mm must be a list of 3 numbers"),
+        ("xyz_mm: [0, 0, 50], ", "", "tool, xyz_mm is missing"),
+        ("quat_xyzw: [0, 0, 0, 1]", "quat_xyzw: [0, 0, 0, 2]", "quat_xyzw has length 2, not 1"),
+        ("quat_xyzw: [0", "rpy_deg: [0, 0, 0], quat_xyzw: [0", "given beside rpy_deg"),
+        ("quat_xyzw", "quat_wxyz", "tool, 'quat_wxyz' is not a known key .*'quat_xyzw'"),
+        ("base: {xyz_mm: [1, 2, 3], rpy_deg: [0, 0, 90]}", "base: 3", "base must be keys and"),
+        (GOOD, "robot: a\nconvention: dh\njoints: []\n", "joints must be a list with at least"),
+        (GOOD, "robot: a\nconvention: dh\njoints: [1]\n", "joint 1 must be keys and values"),
+        (GOOD, "- 1\n", "the file must be keys and values, not a list"),
+        (GOOD, "\n", "is empty"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, words: str) -> None:
+    assert GOOD.count(old) == 1
+    path = write(tmp_path, GOOD.replace(old, new))
+    with pytest.raises(InputError, match=words) as caught:
+        load_robot(path)
+    assert caught.value.file == str(path)
+
+
+def test_broken_yaml_is_refused_with_its_row(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD.replace("convention: mdh", "convention: [mdh"))
+    with pytest.raises(InputError, match="not valid YAML") as caught:
+        load_robot(path)
+    assert caught.value.row == 3
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_calibrated_arm_is_saved_and_read_back(tmp_path: Path, name: str) -> None:
+    nominal = load_robot(name)
+    rng = np.random.default_rng(3)
+    parameters = nominal.parameters
+    arm = replace(
+        nominal.with_mdh(parameters.add(nominal.mdh, 1e-3 * rng.normal(size=len(parameters)))),
+        T_base_root=frames.transform(frames.exp_rotation([0.1, 0.2, 0.3]), [0.5, -0.25, 1.0]),
+        T_flange_tool=frames.transform(frames.exp_rotation([-1.0, 0.2, 0.3]), [0.0, 0.1, 0.3]),
+    )
+    save_robot(arm, tmp_path / "calibrated.yaml")
+    back = load_robot(tmp_path / "calibrated.yaml")
+    for field in ("mdh", "sign", "prismatic", "lower", "upper", "T_base_root", "T_flange_tool"):
+        np.testing.assert_allclose(getattr(back, field), getattr(arm, field), atol=1e-15)
+    q = rng.uniform(-1, 1, (50, arm.n))
+    np.testing.assert_allclose(back.fk(q), arm.fk(q), atol=1e-14)
+    assert back.joint_names == arm.joint_names
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_nominal_arm_keeps_its_identity_through_a_file(tmp_path: Path, name: str) -> None:
+    arm = load_robot(name)
+    save_robot(arm, tmp_path / "copy.yaml")
+    copy = load_robot(tmp_path / "copy.yaml")
+    assert copy.model_hash == arm.model_hash
+    assert copy.mdh.tolist() == arm.mdh.tolist()
+    assert copy.name == arm.name
+
+
+def test_infinite_limits_and_sliding_joints_are_saved(tmp_path: Path) -> None:
+    arm = SerialArm(
+        "slide", ("s",), np.zeros((1, 5)), np.ones(1), np.ones(1), -np.full(1, np.inf), np.ones(1)
+    )
+    save_robot(arm, tmp_path / "slide.yaml")
+    description = load_description(tmp_path / "slide.yaml")
+    assert description.arm.prismatic.tolist() == [True]
+    assert (description.arm.lower[0], description.arm.upper[0]) == (-np.inf, 1.0)
+    assert len(description.notes) == 1
+
+
+def test_own_files_come_before_shipped_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "config" / "robots"
+    folder.mkdir(parents=True)
+    (folder / "ur10.yaml").write_text(GOOD)
+    (folder / "mine.yaml").write_text(GOOD)
+    assert find_robot("ur10").parent != folder
+    monkeypatch.setenv("ROBOCAL_CONFIG", str(tmp_path / "config"))
+    assert find_robot("ur10") == folder / "ur10.yaml"
+    assert load_robot("mine").name == "test arm"
+    assert load_robot("bx200l").name == "BX200L"
+
+
+def test_prefixes_of_ros_are_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "share" / "robocal_ros" / "config" / "robots"
+    folder.mkdir(parents=True)
+    (folder / "overlay.yaml").write_text(GOOD)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere{os.pathsep}{tmp_path}")
+    assert load_robot("overlay").name == "test arm"
+    assert robot_folders()[-1] == folder or folder in robot_folders()
+
+
+def test_an_unknown_name_lists_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no robot 'ur01' \(did you mean 'ur10'\?\).*bx200l, kr1"):
+        load_robot("ur01")
+    with pytest.raises(InputError, match="no such robot file"):
+        load_robot(tmp_path / "ur10.yaml")
+    with pytest.raises(InputError, match="no such robot file"):
+        load_robot("ur10.yaml")
+
+
+def test_an_installed_copy_finds_its_files_from_anywhere(tmp_path: Path) -> None:
+    """A prefix without ROS' variables: packages and share folder as pip installs them."""
+    prefix = tmp_path / "prefix"
+    packages = prefix / "lib" / "python3" / "site-packages"
+    packages.mkdir(parents=True)
+    import robocal_ros
+
+    source = Path(robocal_ros.__file__).resolve().parent
+    subprocess.run(["cp", "-r", str(source), str(packages)], check=True)
+    share = prefix / "share" / "robocal_ros" / "config"
+    share.mkdir(parents=True)
+    subprocess.run(["cp", "-r", str(find_robot("ur10").parent), str(share)], check=True)
+    script = "from robocal_ros.storage.robots import find_robot; print(find_robot('ur10'))"
+    environment = {k: v for k, v in os.environ.items() if k != "AMENT_PREFIX_PATH"}
+    environment["PYTHONPATH"] = str(packages)
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment,
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(done.stdout.strip()) == share / "robots" / "ur10.yaml"
