@@ -13,6 +13,9 @@ from robocal_ros.core.identification import CellModel, identify, identify_and_ju
 from robocal_ros.core.identification.cell import CellProblem, make_layout
 from robocal_ros.core.identification.start import linear_start
 
+# the sliding arm's limits depend on what was bought
+pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
+
 NOISE_M = 5e-5
 GAUGE = ("d1_mm", "theta1_deg", "d6_mm", "theta6_deg", "a6_mm", "alpha6_deg")
 
@@ -282,7 +285,7 @@ def test_a_joint_that_never_moves(cell, joint):
     q = cell.postures(60, rng)
     q[:, joint] = q[0, joint]
     data = cell.measure(q, rng, noise_m=NOISE_M)
-    still = f"joint_{joint + 1} moves only 0 deg"
+    still = f"{cell.nominal.joint_names[joint]} moves only 0 deg"
     with pytest.raises(RankDeficientError, match=still):
         identify(cell.nominal, data, method="lsq")
     result = identify(cell.nominal, data, method="map")
@@ -440,19 +443,33 @@ def test_mixed_up_joint_readings_are_refused(cell):
     assert not identify_and_judge(cell.nominal, mixed, check).verdict.accept
 
 
-def test_a_small_corner_of_the_workspace_does_not_pass_for_all_of_it(make_cell):
-    """Train and check agree within 5 deg about one posture: the fit is good there only."""
-    cell, rng = make_cell(), np.random.default_rng(27)
+@pytest.mark.parametrize("method", ["map", "lsq"])
+@pytest.mark.parametrize("size", [0.2, 1.0])
+def test_a_small_corner_of_the_workspace_does_not_pass_for_all_of_it(make_cell, size, method):
+    """Train and check agree within some degrees of one posture: the fit may be good there only.
+
+    Whatever is accepted must be better throughout the workspace than the nominal model.
+    """
+    rng, refused = np.random.default_rng(27), 0
     middle = np.radians([0.0, -80.0, 80.0, 20.0, 40.0, 0.0])
-    q = middle + rng.uniform(-0.09, 0.09, (60, 6))
-    data = cell.measure(q, rng, noise_m=NOISE_M)
-    half = np.arange(60) % 2 == 0
-    result = identify_and_judge(cell.nominal, data.take(half), data.take(~half), method="lsq")
-    fresh = errors(result.identification.cell, cell.truth, cell.postures(200, rng))
-    far = float(np.sqrt(np.mean(np.sum(fresh**2, axis=-1))))
-    assert result.candidate.rms_m < 2e-4
-    assert far > 10.0 * result.candidate.rms_m
-    assert result.verdict.code is Code.POSES_NOT_INFORMATIVE
+    for seed, spread_deg in enumerate((5.0, 5.0, 5.0, 17.0, 17.0, 34.0, 57.0)):
+        cell = make_cell(seed=seed, length_m=size * 5e-4, angle_rad=size * 1e-3)
+        q = middle + np.radians(spread_deg) * rng.uniform(-1.0, 1.0, (120, 6))
+        data, half = cell.measure(q, rng, noise_m=NOISE_M), np.arange(120) % 2 == 0
+        result = identify_and_judge(cell.nominal, data.take(half), data.take(~half), method=method)
+        everywhere = cell.measure(cell.postures(200, rng), rng)
+
+        def rms(arm, everywhere=everywhere) -> float:
+            placed = identify(arm, everywhere, fit=("base", "tool"), robust=False).cell
+            return float(np.sqrt(np.mean(placed.residual(everywhere) ** 2)))
+
+        if result.verdict.accept:
+            assert rms(result.identification.cell.arm) < rms(cell.nominal)
+        elif spread_deg == 5.0:
+            refused += 1
+        if spread_deg == 57.0:
+            assert result.verdict.accept
+    assert refused == 3
 
 
 def test_compared_is_the_model_in_force(make_cell):

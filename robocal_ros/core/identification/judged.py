@@ -70,7 +70,7 @@ def identify_and_judge(
         before = _check_error(_set_up(in_force, train, set_up), check, check_refit)
     after = _check_error(result.cell, check, check_refit)
     predicted, total = _predicted(result, check, check_refit)
-    doubt = uninformative(result, summarise(before).rms_m)
+    doubt = uninformative(result, summarise(before).rms_m, in_force or arm)
     verdict = judge(before, after, pose_groups(check.q), doubt)
     if "geometry" not in fit and verdict.code is Code.WORSE_THAN_CURRENT:
         why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
@@ -87,26 +87,26 @@ def identify_and_judge(
     )
 
 
-def uninformative(result: Identification, current_rms_m: float) -> str:
+def uninformative(result: Identification, current_rms_m: float, in_force: SerialArm) -> str:
     """Say why the poses do not carry over to the workspace; empty when they do.
 
-    The error expected throughout the joint limits must be below the present one, or, with a
-    prior, at most half of what the prior alone leaves.
+    The error expected throughout the joint limits must be below the present one at the check
+    poses, or clearly below what the candidate changes there. Where the prior is right, the
+    change is sqrt(3) of that error exactly when the data halve the prior's uncertainty; where
+    the prior is too wide, noise cannot pass for a change.
     """
     if not result.estimate.converged:
         return (
             f"the solution still crept after {result.estimate.iterations} iterations along "
             "directions that the poses hardly show"
         )
-    after = result.workspace_rms(result.estimate.covariance)
-    prior = result.prior_covariance
-    before = np.inf if prior is None else result.workspace_rms(prior)
-    if after <= max(current_rms_m, 0.0 if prior is None else 0.5 * before):
+    error = result.workspace_rms(result.estimate.covariance)
+    change = result.workspace_change(in_force)
+    if error <= max(current_rms_m, change / np.sqrt(3.0)):
         return ""
-    so_far = "" if prior is None else f" ({before * 1e3:.3f} mm without any measurement)"
     return (
-        f"over the whole workspace the measured poses leave {after * 1e3:.3f} mm rms{so_far}: "
-        "spread them and turn every joint, the wrist too"
+        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
+        f"for a change of {change * 1e3:.3f} mm: spread them and turn every joint, the wrist too"
     )
 
 

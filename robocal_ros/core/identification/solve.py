@@ -75,13 +75,21 @@ class Identification:
         ``covariance`` is of the unknowns, or of the leading ones (the model parameters). What
         another base or target would explain does not count: it belongs to the set-up.
         """
+        rows = self._workspace_rows()[..., : len(covariance)]
+        return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+
+    def workspace_change(self, arm: SerialArm) -> float:
+        """Rms target displacement, m, over the same postures from ``arm``'s model to this one."""
+        joint, column, place = self.layout.geometry
+        change = (self.cell.arm.mdh - arm.mdh)[joint, column]
+        moved = self._workspace_rows()[..., place] @ change
+        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+    def _workspace_rows(self) -> Array:
+        """Position rows (t * 60, 3, k) of each target at the same random postures."""
         q = random_postures(self.nominal)
-        total = 0.0
-        for t in range(len(self.cell.targets)):
-            J = self._jacobian(q, np.full(len(q), t, dtype=np.int64), ("base", "tool"))
-            rows = J.reshape(-1, J.shape[2])[:, : len(covariance)]
-            total += float(np.einsum("nk,kl,nl->", rows, covariance, rows))
-        return float(np.sqrt(total / (len(q) * len(self.cell.targets))))
+        targets = np.repeat(np.arange(len(self.cell.targets))[:, None], len(q), axis=1)
+        return np.vstack([self._jacobian(q, target, ("base", "tool")) for target in targets])
 
     def _jacobian(self, q: Array, target: NDArray[np.int64], without: Collection[Part]) -> Array:
         """Position rows (m, 3, k); what ``without`` could explain over all of them is removed."""

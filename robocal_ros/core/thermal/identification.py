@@ -113,6 +113,7 @@ def identify_drift(
     current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
     before = np.linalg.norm(current.residual(data), axis=1)
     predicted = float(np.sqrt(model.mean()))
+    doubt = uninformative(result, summarise(before).rms_m, in_force)
     return JudgedIdentification(
         identification=result,
         nominal=summarise(reference.cell.residual(data)),
@@ -121,7 +122,7 @@ def identify_drift(
         predicted_rms_m=predicted,
         predicted_total_rms_m=float(np.sqrt(model.mean() + 3.0 * noise**2)),
         workspace_rms_m=result.workspace_rms(result.estimate.covariance),
-        verdict=judge(before, after, groups, uninformative(result, summarise(before).rms_m)),
+        verdict=judge(before, after, groups, doubt),
     )
 
 
