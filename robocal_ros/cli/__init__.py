@@ -1,0 +1,1 @@
+"""The ``robocal`` command: works on files and bags, needs no ROS graph."""
