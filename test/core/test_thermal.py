@@ -29,9 +29,7 @@ def cold(nominal: SerialArm) -> SerialArm:
     """The robot as built: off its nominal model by tenths of a millimetre and hundredths of a deg."""
     rng = np.random.default_rng(5)
     size = np.where(nominal.parameters.is_length, 3e-4, np.radians(0.01))
-    return nominal.with_mdh(
-        nominal.parameters.add(nominal.mdh, size * rng.normal(size=len(size)))
-    )
+    return nominal.with_mdh(nominal.parameters.add(nominal.mdh, size * rng.normal(size=len(size))))
 
 
 def drifted(cold: SerialArm, covariance: np.ndarray, rng: np.random.Generator) -> SerialArm:
