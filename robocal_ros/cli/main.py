@@ -41,6 +41,8 @@ from robocal_ros.cli.parsing import (
 from robocal_ros.core.errors import InputError, RobocalError
 
 COMMANDS = {
+    "identify": "identify",
+    "replay": "replay",
     "history": "history",
 }
 """Name of each command and its module, in the order of the help."""

@@ -1,0 +1,80 @@
+"""Kinds of arguments and messages that several commands share."""
+
+import argparse
+import sys
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robocal_ros.storage.robots import RobotDescription
+
+PARTS = ("base", "tool", "geometry")
+ROBOT_HELP = "robot file, or name of a shipped robot (ur10, kr150_r3100 …)"
+
+
+def parts(value: str) -> tuple[str, ...]:
+    """Type of a list such as ``base,tool``; in the order of ``PARTS``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For a part that is unknown or given twice, and for none.
+    """
+    names = [name.strip() for name in value.split(",")]
+    for name in names:
+        if name not in PARTS:
+            raise argparse.ArgumentTypeError(f"'{name}' is not one of {', '.join(PARTS)}")
+    if len(set(names)) != len(names):
+        raise argparse.ArgumentTypeError(f"'{value}' names a part twice")
+    return tuple(name for name in PARTS if name in names)
+
+
+def share(value: str) -> float:
+    """Type of a share between 0 and 1.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    try:
+        number = float(value)
+    except ValueError:
+        number = 0.0
+    if not 0.0 < number < 1.0:
+        raise argparse.ArgumentTypeError(f"'{value}' is not a share between 0 and 1")
+    return number
+
+
+def seed(value: str) -> int:
+    """Type of a seed of a random choice: a whole number from 0.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    if not (value.isascii() and value.isdigit()):
+        raise argparse.ArgumentTypeError(f"'{value}' is not a whole number from 0")
+    return int(value)
+
+
+def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":
+    """Read a robot file; what it leaves open is added to ``warnings``.
+
+    Raises
+    ------
+    InputError
+        When there is no such robot, or its file is not as docs/robot_file.md says.
+    """
+    from robocal_ros.storage.robots import load_description
+
+    description = load_description(name)
+    warnings += [f"{description.path}: {note}" for note in description.notes]
+    return description
+
+
+def warn(messages: Iterable[str]) -> None:
+    """Tell people on standard error what may have escaped them."""
+    for message in messages:
+        print(f"robocal: warning: {message}", file=sys.stderr)

@@ -1,0 +1,113 @@
+"""A bag as a recording of a thermal session: its inputs, its commands, its beginning."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import stamp_ns
+from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.observations import JOINTS, POINT, POSE
+from robocal_ros.sessions.replay import EVENTS, input_topics, read_events, topic_kind
+from robocal_ros.storage.bags import BagMessage, BagReader
+
+INPUTS = (JOINTS, POINT, POSE)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What a bag says before its samples are read.
+
+    Attributes
+    ----------
+    inputs : topic of the bag to input of the session.
+    configured : the recorded configuration, or None.
+    commands : recorded commands, each with its recorded outcome.
+    start_ns : stamp of the first joint reading.
+    """
+
+    reader: BagReader
+    inputs: Mapping[str, str]
+    configured: Command | None
+    commands: list[tuple[Command, dict[str, Any]]]
+    start_ns: int
+    warnings: tuple[str, ...]
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last log time."""
+        info = self.reader.info
+        return info.start_ns or 0, info.end_ns or 0
+
+    def samples(self) -> Iterator[BagMessage]:
+        """Messages of the inputs, as they were recorded."""
+        return self.reader.messages(self.inputs)
+
+
+def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
+    """Read the events and find the inputs.
+
+    ``given``: input (or ``session_events``) to topic, where the user named it.
+
+    Raises
+    ------
+    InputError
+        When a topic is missing or ambiguous, or an event cannot be read.
+    """
+    info = reader.info
+    _require_topics(given, info.topics, info.path)
+    event_topic = given.get(EVENTS) or _event_topic(info.topics, info.path)
+    configured, _ = _events(reader, event_topic, 0)
+    inputs = {topic: kind for kind, topic in given.items() if kind != EVENTS}
+    others = [topic for topic in info.topics if topic not in inputs]
+    found = input_topics(others, configured)
+    inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
+    start_ns = _first_joint_stamp(reader, inputs)
+    configured, commands = _events(reader, event_topic, start_ns)
+    warnings = list(info.notes)
+    if not {POINT, POSE} & set(inputs.values()):
+        warnings.append(f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}")
+    return Recording(reader, inputs, configured, commands, start_ns, tuple(warnings))
+
+
+def _has(topics: Mapping[str, Any]) -> str:
+    return f"it has {', '.join(topics)}" if topics else "it has no topics"
+
+
+def _require_topics(given: Mapping[str, str], topics: Mapping[str, Any], path: str) -> None:
+    for kind, topic in given.items():
+        if kind not in (*INPUTS, EVENTS):
+            known = ", ".join((*INPUTS, EVENTS))
+            raise InputError(f"--topic {kind}: the inputs are {known}")
+        if topic not in topics:
+            raise InputError(f"no topic {topic}; {_has(topics)}", file=path)
+
+
+def _event_topic(topics: Mapping[str, Any], path: str) -> str | None:
+    found = [topic for topic in topics if topic_kind(topic) == EVENTS]
+    if len(found) > 1:
+        raise InputError(
+            f"session events of more than one node: {', '.join(found)}; choose with "
+            f"--topic {EVENTS}:=TOPIC",
+            file=path,
+        )
+    return found[0] if found else None
+
+
+def _events(
+    reader: BagReader, topic: str | None, from_ns: int
+) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
+    return (None, []) if topic is None else read_events(reader.messages([topic]), from_ns)
+
+
+def _first_joint_stamp(reader: BagReader, inputs: Mapping[str, str]) -> int:
+    topics = [topic for topic, kind in inputs.items() if kind == JOINTS]
+    if not topics:
+        raise InputError(
+            f"no joint states; {_has(reader.info.topics)}; choose with --topic {JOINTS}:=TOPIC",
+            file=reader.info.path,
+        )
+    first = next(iter(reader.messages(topics)), None)
+    if first is None:
+        raise InputError(f"topic {topics[0]} has no messages", file=reader.info.path)
+    return stamp_ns(first.message.header.stamp)

@@ -1,0 +1,218 @@
+"""From a bag to its calibrations: what ``robocal replay`` computes, without its printing."""
+
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from robocal_ros import __version__
+from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.replay import (
+    ReplayReport,
+    automatic_commands,
+    feed,
+    replay,
+    window_commands,
+)
+from robocal_ros.sessions.seeding import session_as_recorded
+from robocal_ros.sessions.thermal import ThermalSession
+from robocal_ros.sessions.thermal_config import ThermalConfig
+from robocal_ros.storage.bags import BagMessage, BagReader
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+Document = dict[str, Any]
+Window = tuple[float, float]
+Commands = Sequence[tuple[Command, Mapping[str, Any]]]
+Watch = Callable[[str, Recording], Iterator[BagMessage]]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to replay and how.
+
+    Attributes
+    ----------
+    find_robot : gives the arm for the recorded configuration (None: nothing was recorded).
+    cold, warm : windows, s from the first joint reading; without any the recorded commands.
+    topics : input to topic of the bag, where given.
+    state : folder of a history that is kept; None: one that is not.
+    """
+
+    bag: Path
+    find_robot: Callable[[Command | None], SerialArm]
+    cold: Window | None = None
+    warm: tuple[Window, ...] = ()
+    auto: bool = False
+    topics: Mapping[str, str] = field(default_factory=dict)
+    state: Path | None = None
+
+
+def replay_bag(request: Request, watch: Watch) -> Document:
+    """Replay a bag: the document, with ``error`` in it where the data gave no candidate.
+
+    ``watch`` reads a recording's samples; it may show how far it is.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag cannot be read, or lacks what a replay needs.
+    """
+    with BagReader(request.bag) as reader:
+        recording = open_recording(reader, request.topics)
+        if not (request.auto or request.cold or request.warm or recording.commands):
+            raise InputError(_NO_COMMANDS, file=str(request.bag))
+        arm = request.find_robot(recording.configured)
+        with _history(request, arm) as history:
+            session = _session(recording, arm, history)
+            commands = _commands(request, recording, arm, history, watch)
+            samples = watch("replaying", recording)
+            report = replay(session, samples, commands, recording.inputs)
+            used = commands is recording.commands
+            return _document(report, session, recording) | {"recorded": used}
+
+
+_NO_COMMANDS = (
+    "the bag holds no commands (session_events): say when the robot was measured with --warm T0:T1 "
+    "(repeat it for more cycles; --cold T0:T1 for a cold reference), in seconds from the first "
+    "joint reading, or let --auto find the cycles"
+)
+
+
+@contextmanager
+def _history(request: Request, arm: SerialArm) -> Iterator[CalibrationHistory]:
+    serial = request.bag.resolve().stem
+    with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
+        state_dir = request.state or Path(folder)
+        with CalibrationHistory.open(
+            serial, model_hash=arm.model_hash, state_dir=state_dir
+        ) as history:
+            yield history
+
+
+def _session(recording: Recording, arm: SerialArm, history: CalibrationHistory) -> ThermalSession:
+    if recording.configured is None:
+        return ThermalSession(arm, history, ThermalConfig(), __version__)
+    return session_as_recorded(arm, history, recording.configured, __version__)
+
+
+def _commands(
+    request: Request,
+    recording: Recording,
+    arm: SerialArm,
+    history: CalibrationHistory,
+    watch: Watch,
+) -> Commands:
+    """The user's windows, else what --auto finds, else what was recorded."""
+    if request.cold or request.warm:
+        cold = None if request.cold is None else _stamps(request.cold, recording)
+        return window_commands(cold, [_stamps(window, recording) for window in request.warm])
+    if not request.auto:
+        return recording.commands
+    scout = _session(recording, arm, history)
+    for sample in watch("looking for cycles", recording):
+        feed(scout, sample, recording.inputs)
+    newest = max(scout.desk.newest_ns.values(), default=0)
+    observed = scout.desk.window(-1, newest, scout.desk.newest_ns)
+    if not observed:
+        raise InputError(
+            f"no measurement at standstill in this recording{_ignored_words(scout)}",
+            file=str(request.bag),
+        )
+    return automatic_commands(observed)
+
+
+def _stamps(window: Window, recording: Recording) -> tuple[int, int]:
+    start, end = (recording.start_ns + round(t * 1e9) for t in window)
+    return start, end
+
+
+def _ignored_words(session: ThermalSession) -> str:
+    worst = [
+        f"{topic}: {reason} ({count} times)"
+        for topic, reasons in session.desk.ignored.items()
+        for reason, count in reasons.most_common(1)
+    ]
+    return f"; ignored: {'; '.join(worst)}" if worst else ""
+
+
+def _document(report: ReplayReport, session: ThermalSession, recording: Recording) -> Document:
+    made = [outcome for outcome in report.outcomes if outcome.document is not None]
+    place = {outcome.calibration_id: index for index, outcome in enumerate(made)}
+    head = session.in_force
+    topic = {kind: name for name, kind in recording.inputs.items()}
+    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.desk.ignored.items()}
+    stream = session.desk.stream
+    return _failure(report, made) | {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "start_ns": recording.start_ns,
+        "topics": topic,
+        "candidates": [_candidate(outcome) for outcome in made],
+        "accepted": [
+            _accepted(outcome, place)
+            for outcome in report.outcomes
+            if outcome.command.name == events.ACCEPT and outcome.done
+        ],
+        "final_model": model_document(session.arm) | {"revision": head.revision},
+        "ignored": {name: sum(why.values()) for name, why in ignored.items()},
+        "ignored_reasons": ignored,
+        "gaps": {"count": stream.gap_count, "longest_s": stream.longest_gap_ns * 1e-9},
+        "commands": [_command(outcome) for outcome in report.outcomes],
+        "differs": report.differs,
+        "warnings": list(recording.warnings),
+    }
+
+
+def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
+    """Error and verdict where a reference or every identification failed; else empty.
+
+    A drift without its cold reference would be judged as a calibration. A recorded session that
+    went on without one is followed.
+    """
+    asked = [o for o in report.outcomes if o.command.name == events.IDENTIFY]
+    failed = [o for o in report.outcomes if o.command.name == events.CAPTURE_REFERENCE]
+    failed = [o for o in failed if not o.done and o.command.arguments.get("by") == "replay"]
+    if not failed and (made or not asked):
+        return {}
+    first = next((o for o in (*failed, *asked) if not o.done), asked[0])
+    code, message = first.status.name, first.message
+    return {
+        "error": {"code": code, "message": message, "file": None, "row": None, "column": None},
+        "verdict": {"accept": False, "code": code, "reason": message},
+    }
+
+
+def _seconds(stamp_ns: int | None) -> float:
+    return (stamp_ns or 0) * 1e-9
+
+
+def _candidate(outcome: Outcome) -> Document:
+    return {"stamp": _seconds(outcome.command.stamp_ns), **dict(outcome.document or {})}
+
+
+def _accepted(outcome: Outcome, place: Mapping[int, int]) -> Document:
+    arguments = outcome.command.arguments
+    return {
+        "stamp": _seconds(outcome.command.stamp_ns),
+        "revision": outcome.revision,
+        "candidate": place.get(outcome.calibration_id),
+        "by": str(arguments.get("by", "")),
+        "reason": str(arguments.get("reason", "")),
+    }
+
+
+def _command(outcome: Outcome) -> Document:
+    return {
+        "command": outcome.command.name,
+        "stamp": _seconds(outcome.command.stamp_ns),
+        "code": outcome.status.name,
+        "message": outcome.message,
+        "samples": outcome.samples,
+    }
