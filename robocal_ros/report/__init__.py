@@ -1,0 +1,1 @@
+"""What was found, for people: figures and a self-contained page. It states what is simulated."""
