@@ -1,0 +1,1 @@
+"""Benchmarks: accuracy on real measurements, speed beside other libraries."""

@@ -1,0 +1,166 @@
+"""Real measurements as tables and bags: a UR10 with a Leica tracker and T-Mac, four campaigns.
+
+Data: Landgraf, Ernst, Schleth, Fabritius, Huber, IEEE CASE 2021 (MIT licence), in the folder
+``ur10_tmac`` below $ROBOCAL_DATA. Writes for each series, say A:
+
+- ``A.csv`` for ``robocal identify``, and the same rows in two halves, ``A_train.csv`` and
+  ``A_check.csv``; rows with equal joint targets are in the same half;
+- ``A.mcap`` for ``robocal replay`` and the live nodes: ``joint_states`` around each measurement,
+  so that the robot is seen at standstill, and ``measured_pose``.
+
+    python bench/ur10_campaigns.py --out DIR [--series A B C D]
+"""
+
+import argparse
+import csv
+import os
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from robocal_ros.core import frames
+from robocal_ros.core.assessment import hold_out, pose_groups
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import Measurements
+from robocal_ros.storage.bag_writer import ros_time
+from robocal_ros.storage.bags import BagWriter
+from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.tables import write_measurements
+
+SERIES = {
+    "A": "measurements_grid.csv",
+    "B": "measurements_joint_configurations.csv",
+    "C": "measurements_random_poses.csv",
+    "D": "measurements_iso_cubes.csv",
+}
+# Only series A has its times, to the second. In the others a spreadsheet left year and month:
+# their stamps here are made, one pose every 30 s from an arbitrary day of that month on.
+MADE_START = {
+    "B": datetime(2020, 11, 2, tzinfo=UTC),
+    "C": datetime(2020, 11, 9, tzinfo=UTC),
+    "D": datetime(2021, 3, 1, tzinfo=UTC),
+}
+MADE_STEP_NS = 30_000_000_000
+AROUND_NS = tuple(int(offset * 1e6) for offset in (-400, -200, 0, 200, 400))
+FRAME, TARGET = "tracker", "tmac"
+SPLIT_SEED = 0
+
+
+def data_folder() -> Path:
+    """Folder of the campaigns."""
+    root = Path(__file__).resolve().parent.parent
+    return Path(os.environ.get("ROBOCAL_DATA", root.parent / "shared" / "data")) / "ur10_tmac"
+
+
+def load_campaign(series: str, folder: Path | None = None) -> Measurements:
+    """Read a series in order of time: joint targets and poses of the T-Mac in the tracker frame.
+
+    Orientation is intrinsic XYZ in degrees. A sample's id is the series and its row in the file
+    (the header is row 1). The tracker's own scatter is not passed on as ``sigma``: the robot's
+    repeatability is several times larger.
+
+    Raises
+    ------
+    InputError
+        When the file is not there.
+    """
+    path = (folder or data_folder()) / f"Series_{series}" / SERIES[series]
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            rows = list(csv.DictReader(stream, delimiter=";"))
+    except OSError as error:
+        raise InputError(
+            "these measurements are not here; set ROBOCAL_DATA to the folder that holds ur10_tmac",
+            file=str(path),
+        ) from error
+    joints = load_robot("ur10").joint_names
+    columns = [*joints, *(f"measurement_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))]
+    values = np.array([[float(row[name].replace(",", ".")) for name in columns] for row in rows])
+    stamps = _stamps(series, [row["Timestamp"] for row in rows])
+    data = Measurements(
+        q=values[:, :6],
+        position=values[:, 6:9] * 1e-3,
+        rotation=Rotation.from_euler("XYZ", values[:, 9:], degrees=True).as_matrix(),
+        target=(TARGET,) * len(rows),
+        sample=tuple(f"{series}{row}" for row in range(2, len(rows) + 2)),
+        stamp_ns=stamps,
+    )
+    return data.take(np.argsort(stamps))
+
+
+def _stamps(series: str, texts: Sequence[str]) -> NDArray[np.int64]:
+    """Nanoseconds of each row; series A's clock is taken as UTC and its file is not in order."""
+    if series in MADE_START:
+        start_ns = int(MADE_START[series].timestamp()) * 1_000_000_000
+        return start_ns + MADE_STEP_NS * np.arange(len(texts), dtype=np.int64)
+    times = [datetime.strptime(text, "%Y%m%d%H%M%S").replace(tzinfo=UTC) for text in texts]
+    return np.array([int(time.timestamp()) * 1_000_000_000 for time in times], dtype=np.int64)
+
+
+def halves(data: Measurements) -> tuple[Measurements, Measurements]:
+    """Split at random (seeded); visits of one pose stay together."""
+    held = hold_out(pose_groups(data.q), 0.5, SPLIT_SEED)
+    return data.take(~held), data.take(held)
+
+
+def write_bag(path: Path, data: Measurements, joint_names: tuple[str, ...]) -> None:
+    """Write a bag in which the robot stands at each row's joints while it is measured.
+
+    The joints are the targets: the controller's readings are not in the data.
+    """
+    if data.stamp_ns is None or data.rotation is None:
+        raise ValueError("a bag needs stamps and orientations")
+    quat = frames.quat_xyzw(data.rotation)
+    names = list(joint_names)
+    with BagWriter(path) as bag:
+        for i, stamp_ns in enumerate(data.stamp_ns.tolist()):
+            for offset_ns in AROUND_NS:
+                at_ns = stamp_ns + offset_ns
+                header = {"stamp": ros_time(at_ns), "frame_id": "base"}
+                state = {"header": header, "name": names, "position": data.q[i]}
+                bag.write("/joint_states", "sensor_msgs/msg/JointState", state, at_ns)
+                if offset_ns == 0:
+                    pose = _pose(stamp_ns, data.position[i].tolist(), quat[i].tolist())
+                    bag.write("/measured_pose", "geometry_msgs/msg/PoseStamped", pose, at_ns)
+
+
+def _pose(stamp_ns: int, xyz: list[float], quat: list[float]) -> dict[str, object]:
+    return {
+        "header": {"stamp": ros_time(stamp_ns), "frame_id": f"{FRAME}/{TARGET}"},
+        "pose": {
+            "position": dict(zip("xyz", xyz, strict=True)),
+            "orientation": dict(zip("xyzw", quat, strict=True)),
+        },
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write tables and bags of the chosen series."""
+    parser = argparse.ArgumentParser(description="UR10 and T-Mac campaigns as tables and bags")
+    parser.add_argument("--out", type=Path, required=True, help="folder to write to")
+    parser.add_argument("--series", nargs="+", choices=list(SERIES), default=list(SERIES))
+    options = parser.parse_args(arguments)
+    arm = load_robot("ur10")
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        for series in options.series:
+            data = load_campaign(series)
+            train, check = halves(data)
+            write_measurements(options.out / f"{series}.csv", data, arm)
+            write_measurements(options.out / f"{series}_train.csv", train, arm)
+            write_measurements(options.out / f"{series}_check.csv", check, arm)
+            write_bag(options.out / f"{series}.mcap", data, arm.joint_names)
+            print(f"{series}: {len(data)} poses ({len(train)} to train, {len(check)} to check)")
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,101 @@
+"""Real campaigns become tables and bags that say the same."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bench import ur10_campaigns
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import Measurements, joint_sample, pose_sample
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.sessions.observations import ObservationDesk
+from robocal_ros.storage.bags import bag_info, read_bag
+from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.tables import beyond_limits, read_measurements
+
+
+@pytest.fixture(scope="module")
+def campaign(data_dir: Path) -> Measurements:
+    return ur10_campaigns.load_campaign("D", data_dir / "ur10_tmac")
+
+
+@pytest.mark.data
+def test_orientations_turn_as_the_arm_turns(data_dir: Path) -> None:
+    """The turn from pose to pose does not depend on base or tool: it shows the convention."""
+    campaign = ur10_campaigns.load_campaign("C", data_dir / "ur10_tmac")
+    arm = load_robot("ur10")
+    assert campaign.rotation is not None
+
+    def angles(R: np.ndarray) -> np.ndarray:
+        return Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).magnitude()
+
+    flange = angles(arm.fk(campaign.q)[:, :3, :3])
+    euler = Rotation.from_matrix(campaign.rotation).as_euler("XYZ")
+    assert np.median(np.abs(angles(campaign.rotation) - flange)) < np.radians(0.05)
+    extrinsic = angles(Rotation.from_euler("xyz", euler).as_matrix())
+    assert np.median(np.abs(extrinsic - flange)) > np.radians(0.25)
+
+
+@pytest.mark.data
+def test_table_and_bag_say_the_same(campaign: Measurements, tmp_path: Path) -> None:
+    assert ur10_campaigns.main(["--out", str(tmp_path), "--series", "D"]) == 0
+    arm = load_robot("ur10")
+    table = read_measurements(tmp_path / "D.csv", arm)
+    assert len(table) == 632
+    assert (table.sample[0], table.sample[-1]) == ("D2", "D633")
+    assert beyond_limits(table, arm) == ()
+    np.testing.assert_allclose(table.q, campaign.q, atol=1e-11)
+
+    topics = {name: topic.messages for name, topic in bag_info(tmp_path / "D.mcap").topics.items()}
+    assert topics == {"/joint_states": 5 * 632, "/measured_pose": 632}
+    desk = ObservationDesk(arm.joint_names, StandstillRule())
+    stamps = []
+    for recorded in read_bag(tmp_path / "D.mcap"):
+        if recorded.topic == "/joint_states":
+            sample = joint_sample(recorded.message)
+            stamps.append(sample.stamp_ns)
+            desk.add_joints(sample)
+        else:
+            pose = pose_sample(recorded.message)
+            assert (pose.frame, pose.target) == ("tracker", "tmac")
+            desk.add_measurement(pose)
+    assert np.all(np.diff(stamps) > 0)
+    assert not desk.ignored
+    observed = desk._observed
+    assert [o.stamp_ns for o in observed] == list(table.stamp_ns)
+    np.testing.assert_allclose([o.q for o in observed], table.q, atol=1e-11)
+    np.testing.assert_allclose([o.position for o in observed], table.position, atol=1e-11)
+    np.testing.assert_allclose([o.rotation for o in observed], table.rotation, atol=1e-11)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("series", "visits"), [("D", 1), ("B", 2)])
+def test_halves_keep_visits_of_a_pose_together(data_dir: Path, series: str, visits: int) -> None:
+    data = ur10_campaigns.load_campaign(series, data_dir / "ur10_tmac")
+    train, check = ur10_campaigns.halves(data)
+    assert abs(len(train) - len(check)) < 0.15 * len(data)
+    assert sorted(train.sample + check.sample) == sorted(data.sample)
+    distance = np.max(np.abs(train.q[:, None] - check.q[None]), axis=2)
+    assert np.min(distance) > 1e-3
+    nearest = np.sort(np.max(np.abs(train.q[:, None] - train.q[None]), axis=2), axis=1)[:, 1]
+    assert np.mean(nearest < 1e-3) > (0.3 if visits == 2 else 0.0)
+    again = ur10_campaigns.halves(data)
+    assert again[0].sample == train.sample
+
+
+@pytest.mark.data
+def test_series_a_is_put_in_order_of_its_clock(data_dir: Path) -> None:
+    data = ur10_campaigns.load_campaign("A", data_dir / "ur10_tmac")
+    assert data.stamp_ns is not None
+    assert len(data) == 11911
+    assert np.all(np.diff(data.stamp_ns) >= 3_000_000_000)
+    assert data.stamp_ns[0] == 1594744744_000_000_000  # 2020-07-14 16:39:04
+
+
+def test_absent_data_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOCAL_DATA", str(tmp_path))
+    with pytest.raises(InputError, match="ROBOCAL_DATA"):
+        ur10_campaigns.load_campaign("A")
+    assert ur10_campaigns.main(["--out", str(tmp_path / "out"), "--series", "A"]) == 2
