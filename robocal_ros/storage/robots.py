@@ -127,8 +127,12 @@ def find_robot(name: str | Path) -> Path:
     return known[str(name)]
 
 
-def save_robot(arm: SerialArm, path: str | Path) -> None:
+def save_robot(arm: SerialArm, path: str | Path, like: RobotDescription | None = None) -> None:
     """Write an arm as a robot file; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    like : robot file that the arm was made from; its joint speeds are kept.
 
     Raises
     ------
@@ -138,6 +142,8 @@ def save_robot(arm: SerialArm, path: str | Path) -> None:
     convention = "mdh" if np.any(arm.mdh[:, 4]) else "dh"
     document: dict[str, Any] = {"robot": arm.name, "convention": convention}
     document["joints"] = [_joint_document(arm, i, convention) for i in range(arm.n)]
+    if like is not None:
+        _add_speeds(document["joints"], like)
     for key, T in (("base", arm.T_base_root), ("tool", arm.T_flange_tool)):
         if not np.array_equal(T, np.eye(4)):
             xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
@@ -230,3 +236,13 @@ def _joint_document(arm: SerialArm, joint: int, convention: str) -> dict[str, An
         if np.isfinite(limit):
             document[f"{side}_{unit}"] = _shown(float(limit), factor)
     return document
+
+
+def _add_speeds(documents: list[dict[str, Any]], like: RobotDescription) -> None:
+    for joint, document in enumerate(documents):
+        unit, factor = UNITS[bool(like.arm.prismatic[joint])]
+        speeds = {
+            f"max_velocity_{unit}_s": float(like.max_velocity[joint]),
+            f"max_acceleration_{unit}_s2": float(like.max_acceleration[joint]),
+        }
+        document |= {key: _shown(v, factor) for key, v in speeds.items() if np.isfinite(v)}

@@ -176,6 +176,14 @@ def test_a_nominal_arm_keeps_its_identity_through_a_file(tmp_path: Path, name: s
     assert copy.name == arm.name
 
 
+def test_joint_speeds_are_kept(tmp_path: Path) -> None:
+    description = load_description(write(tmp_path, GOOD))
+    save_robot(description.arm, tmp_path / "copy.yaml", like=description)
+    copy = load_description(tmp_path / "copy.yaml")
+    assert copy.max_velocity.tolist() == description.max_velocity.tolist()
+    assert copy.max_acceleration.tolist() == description.max_acceleration.tolist()
+
+
 def test_infinite_limits_and_sliding_joints_are_saved(tmp_path: Path) -> None:
     arm = SerialArm(
         "slide", ("s",), np.zeros((1, 5)), np.ones(1), np.ones(1), -np.full(1, np.inf), np.ones(1)
