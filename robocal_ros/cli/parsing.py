@@ -78,7 +78,8 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
     """Join ``--option -1,2`` to ``--option=-1,2``, which argparse would take for an option."""
     joined: list[str] = []
     for argument in arguments:
-        if joined and joined[-1].startswith("--") and _NEGATIVE.match(argument):
+        before = joined[-1] if joined else ""
+        if before.startswith("--") and before != "--json" and _NEGATIVE.match(argument):
             joined[-1] += f"={argument}"
         else:
             joined.append(argument)

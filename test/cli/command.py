@@ -1,0 +1,54 @@
+"""Run the real ``robocal`` in a process of its own, and check what it prints."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from jsonschema import Draft202012Validator
+from referencing import Registry, Resource
+
+ROOT = Path(__file__).parents[2]
+SCHEMAS = {path.name: json.loads(path.read_text()) for path in (ROOT / "docs/schemas").glob("*")}
+REGISTRY: Registry = Registry().with_resources(
+    (name, Resource.from_contents(schema)) for name, schema in SCHEMAS.items()
+)
+COMMAND = [sys.executable, "-m", "robocal_ros.cli.main"]
+
+
+def environment(**variables: str) -> dict[str, str]:
+    plain = {name: value for name, value in os.environ.items() if name != "ROBOCAL_STATE"}
+    return plain | {"PYTHONPATH": f"{ROOT}:{plain.get('PYTHONPATH', '')}"} | variables
+
+
+def robocal(
+    *arguments: object, timeout_s: float = 60.0, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run it; nothing is checked."""
+    return subprocess.run(
+        [*COMMAND, *(str(argument) for argument in arguments)],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        env=environment(**variables),
+        check=False,
+    )
+
+
+def conforms(document: Any, schema: str) -> None:
+    """Fail unless the document follows a schema of docs/schemas."""
+    Draft202012Validator(SCHEMAS[schema], registry=REGISTRY).validate(document)
+
+
+def robocal_json(schema: str, *arguments: object, status: int = 0, **variables: str) -> Any:
+    """Run it with ``--json``: exit status, exactly one document, and its schema are checked."""
+    done = robocal(*arguments, "--json", **variables)
+    assert done.returncode == status, done.stderr
+    document = json.loads(done.stdout)
+    conforms(document, schema)
+    if status:
+        conforms(document, "error.json")
+        assert "Traceback" not in done.stderr
+    return document

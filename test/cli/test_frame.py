@@ -1,0 +1,281 @@
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from command import COMMAND, ROOT, SCHEMAS, conforms, environment, robocal
+from jsonschema import Draft202012Validator
+
+from robocal_ros import __version__
+from robocal_ros.cli import main as frame
+from robocal_ros.cli.output import Outcome, exit_status, failure
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import (
+    ConflictError,
+    InputError,
+    RankDeficientError,
+    RobocalError,
+    StorageError,
+    TooFewSamplesError,
+    WrongRobotError,
+)
+
+
+@pytest.mark.parametrize("name", sorted(SCHEMAS))
+def test_schemas_are_schemas(name):
+    Draft202012Validator.check_schema(SCHEMAS[name])
+    assert SCHEMAS[name]["$id"] == name
+
+
+class TestUsage:
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            (),
+            ("no-such-command",),
+            ("--no-such-option",),
+            ("history",),
+            ("history", "no-such-action"),
+            ("history", "accept"),
+            ("history", "accept", "x"),
+            ("history", "list", "--limit", "0"),
+            ("history", "list", "--lim", "3"),  # no abbreviations
+            ("history", "rollback", "--to", "-1"),
+        ],
+    )
+    def test_wrong_usage(self, arguments):
+        plain = robocal(*arguments)
+        assert plain.returncode == 2
+        assert plain.stdout == ""
+        assert "usage: robocal" in plain.stderr
+        assert "[BAD_INPUT]" in plain.stderr
+        for place in range(len(arguments) + 1):
+            done = robocal(*arguments[:place], "--json", *arguments[place:])
+            assert done.returncode == 2
+            document = json.loads(done.stdout)
+            conforms(document, "error.json")
+            assert document["error"]["code"] == "BAD_INPUT"
+            assert document["error"]["message"] in plain.stderr or place < len(arguments)
+
+    def test_help_and_version(self):
+        done = robocal("--version")
+        assert (done.returncode, done.stdout) == (0, f"robocal {__version__}\n")
+        done = robocal("--help")
+        assert done.returncode == 0
+        for name in frame.COMMANDS:
+            assert f"\n    {name}" in done.stdout
+            assert "--json" in robocal(name, "--help").stdout
+        assert "bring a pending" in robocal("history", "accept", "--help").stdout
+
+    def test_help_and_version_as_json(self):
+        assert json.loads(robocal("--version", "--json").stdout)["version"].endswith(__version__)
+        done = robocal("history", "accept", "--json", "--help")
+        assert done.returncode == 0
+        assert json.loads(done.stdout)["help"].startswith("usage: robocal history accept")
+
+
+class TestStart:
+    def test_help_is_fast_and_loads_nothing_heavy(self):
+        took = []
+        for _ in range(5):
+            start = time.perf_counter()
+            assert robocal("--help").returncode == 0
+            took.append(time.perf_counter() - start)
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-c", "pass"], check=True, env=environment())
+        bare = time.perf_counter() - start
+        assert min(took) - bare < 0.15
+        heavy = "import sys; from robocal_ros.cli.main import main; main(['--help']); print(sorted("
+        heavy += "{'numpy', 'scipy', 'rich', 'rclpy', 'numba'} & set(sys.modules)))"
+        done = subprocess.run(
+            [sys.executable, "-c", heavy], check=True, capture_output=True, env=environment()
+        )
+        assert done.stdout.endswith(b"\n[]\n")
+
+    def test_one_blas_thread(self):
+        code = (
+            "import os, robocal_ros.cli.main; import numpy; print("
+            "os.environ['OPENBLAS_NUM_THREADS'], os.environ['OMP_NUM_THREADS'], "
+            "os.environ['MKL_NUM_THREADS'], len(os.listdir('/proc/self/task')))"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            check=True,
+            capture_output=True,
+            env=environment(OPENBLAS_NUM_THREADS="4"),
+        )
+        assert done.stdout == b"1 1 1 1\n"
+
+    def test_installed_command(self):
+        from importlib.metadata import entry_points
+
+        found = [point for point in entry_points(group="console_scripts", name="robocal")]
+        for point in found:
+            assert point.value == "robocal_ros.cli.main:main"
+
+
+def with_command(monkeypatch, run):
+    """A frame whose only command is this function."""
+    module = SimpleNamespace(HELP="made for a test", add_arguments=lambda parser: None, run=run)
+    monkeypatch.setattr(frame, "COMMANDS", {"probe": "probe"})
+    monkeypatch.setattr(frame, "import_module", lambda name: module)
+
+
+def fails_with(monkeypatch, capsys, error, *arguments):
+    def run(args):
+        raise error
+
+    with_command(monkeypatch, run)
+    status = frame.main(["probe", *arguments])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+class TestOutcomes:
+    @pytest.mark.parametrize(
+        ("error", "status"),
+        [
+            (InputError("no number", file="a.csv", row=3, column="q1_deg"), 2),
+            (StorageError("disk full"), 2),
+            (WrongRobotError("another robot"), 2),
+            (TooFewSamplesError("3 of 20"), 3),
+            (RankDeficientError("one direction", ["d6 with a6"]), 3),
+            (ConflictError("too late"), 3),
+        ],
+    )
+    def test_errors(self, monkeypatch, capsys, error, status):
+        assert fails_with(monkeypatch, capsys, error, "--json")[0] == status
+        found, out, err = fails_with(monkeypatch, capsys, error, "--json")
+        document = json.loads(out)
+        conforms(document, "error.json")
+        assert found == status
+        assert document["error"]["code"] == document["verdict"]["code"] == error.code.name
+        assert document["error"]["row"] == getattr(error, "row", None)
+        assert document["error"]["file"] == getattr(error, "file", None)
+        assert document.get("unobservable", []) == list(getattr(error, "directions", []))
+        assert str(error) in err
+        assert "Traceback" not in err
+        assert fails_with(monkeypatch, capsys, error)[:2] == (status, "")
+
+    def test_every_code_has_a_status(self):
+        for code in set(Code) - {Code.ACCEPT}:
+            error = RobocalError("x")
+            error.code = code
+            assert exit_status(error) in (2, 3)
+            conforms(failure(error), "error.json")
+
+    def test_missing_file_is_no_crash(self, monkeypatch, capsys):
+        error = FileNotFoundError(2, "No such file or directory", "bag.mcap")
+        status, out, _ = fails_with(monkeypatch, capsys, error, "--json")
+        assert status == 2
+        assert json.loads(out)["error"]["file"] == "bag.mcap"
+
+    def test_crash(self, monkeypatch, capsys):
+        status, out, err = fails_with(monkeypatch, capsys, ZeroDivisionError("oh"), "--json")
+        assert status == 1
+        conforms(json.loads(out), "error.json")
+        assert "Traceback" in err
+        status, out, err = fails_with(monkeypatch, capsys, ZeroDivisionError("oh"))
+        assert (status, out) == (1, "")
+        assert "ZeroDivisionError: oh" in err
+
+    def test_nan_never_leaves(self, monkeypatch, capsys):
+        with_command(monkeypatch, lambda args: Outcome({"x": float("nan")}, lambda console: None))
+        assert frame.main(["probe", "--json"]) == 1
+        assert json.loads(capsys.readouterr().out)["error"]["code"] == "NONE"
+
+    def test_exit_code_and_noise(self, monkeypatch, capsys):
+        def run(args):
+            print("a library speaks")
+            return Outcome({"x": 1}, lambda console: console.print("one"), exit_code=3)
+
+        with_command(monkeypatch, run)
+        assert frame.main(["--json", "probe"]) == 3
+        out, err = capsys.readouterr()
+        assert json.loads(out) == {"x": 1}
+        assert "a library speaks" in err
+        assert frame.main(["probe"]) == 3
+        assert capsys.readouterr().out == "a library speaks\none\n"
+
+    def test_negative_values(self, monkeypatch):
+        seen = []
+        with_command(monkeypatch, lambda args: seen.append(args.at) or Outcome({}, lambda c: None))
+        probe = frame.import_module("")
+        probe.add_arguments = lambda parser: parser.add_argument("--at")
+        for value in ("-90,0,1", "-.5", "-1e-3"):
+            assert frame.main(["probe", "--at", value, "--json"]) == 0
+            assert frame.main(["probe", f"--at={value}", "--json"]) == 0
+        assert seen == ["-90,0,1", "-90,0,1", "-.5", "-.5", "-1e-3", "-1e-3"]
+
+    def test_ctrl_c(self, monkeypatch, capsys):
+        status, out, err = fails_with(monkeypatch, capsys, KeyboardInterrupt(), "--json")
+        assert (status, out, err) == (130, "", "robocal: interrupted\n")
+
+
+SLOW = """
+import sys, time
+from types import SimpleNamespace
+from robocal_ros.cli import main as frame
+from robocal_ros.cli.output import Outcome
+def run(args):
+    if args.wait:
+        print("ready", file=sys.stderr, flush=True)
+        time.sleep(30)
+    return Outcome({"x": "y" * 1000}, lambda console: [console.print("line") for _ in range(9999)])
+frame.COMMANDS = {"probe": "probe"}
+frame.import_module = lambda name: SimpleNamespace(
+    HELP="", run=run, add_arguments=lambda p: p.add_argument("--wait", action="store_true"))
+sys.exit(frame.main(sys.argv[1:]))
+"""
+
+
+class TestSignals:
+    def test_interrupt(self):
+        command = [sys.executable, "-c", SLOW, "probe", "--wait"]
+        with subprocess.Popen(command, stderr=subprocess.PIPE, env=environment()) as process:
+            try:
+                assert process.stderr.readline() == b"ready\n"
+                process.send_signal(signal.SIGINT)
+                assert process.wait(timeout=10) == 130
+                assert process.stderr.read() == b"robocal: interrupted\n"
+            finally:
+                process.kill()
+
+    @pytest.mark.parametrize("more", [[], ["--json"]])
+    def test_reader_goes_away(self, more):
+        for code in (["-c", SLOW, "probe"], ["-m", "robocal_ros.cli.main", "--help"]):
+            listen, speak = os.pipe()
+            os.close(listen)
+            done = subprocess.run(
+                [sys.executable, *code, *more],
+                stdout=speak,
+                stderr=subprocess.PIPE,
+                env=environment(),
+                timeout=20,
+                check=False,
+            )
+            os.close(speak)
+            assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_piped_tables_stay_whole():
+    stream = io.StringIO()
+    from robocal_ros.cli.output import show
+
+    show(Outcome({}, lambda console: console.print("x" * 150)), stream)
+    assert stream.getvalue() == "x" * 150 + "\n"
+
+
+def test_runs_from_any_folder(tmp_path: Path):
+    done = subprocess.run(
+        [*COMMAND, "--version"], cwd=tmp_path, env=environment(), capture_output=True, check=True
+    )
+    assert done.stdout.startswith(b"robocal ")
+    assert not list(tmp_path.iterdir())
+    assert ROOT.is_absolute()

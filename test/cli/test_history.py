@@ -1,0 +1,237 @@
+import getpass
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import conforms, environment, robocal, robocal_json
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.proposals import Proposal, State
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+SERIAL = "KR/7"
+STAMP_NS = 1_700_000_000_123_456_789
+
+
+def proposal(**changes: Any) -> Proposal:
+    plain: dict[str, Any] = {
+        "model_hash": "0123456789abcdef",
+        "based_on": 0,
+        "cycle_id": "morning [bold]",
+        "stamp_ns": STAMP_NS,
+        "created_ns": STAMP_NS + 1,
+        "software": "0.1.0",
+        "method": "map",
+        "code": Code.ACCEPT,
+        "reason": "0.11 mm instead of 0.31 mm",
+        "candidate_rms_mm": 0.11,
+        "document": {"verdict": {"accept": True}},
+        "model": {"d": [0.1, 1 / 3]},
+        "inputs": {"q": np.zeros((5, 6))},
+    }
+    return Proposal(**(plain | changes))
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> Path:
+    """One calibration in force (1), one pending (2), one refused by its verdict (3)."""
+    with CalibrationHistory.open(SERIAL, state_dir=tmp_path) as history:
+        first = history.propose(proposal())
+        history.accept(first, by="node", reason="", wall_ns=STAMP_NS + 2)
+        history.propose(proposal(based_on=1))
+        history.propose(
+            proposal(based_on=1, code=Code.WORSE_THAN_CURRENT, candidate_rms_mm=None, reason="no")
+        )
+    return tmp_path
+
+
+def head(state: Path) -> tuple[int, int | None]:
+    with CalibrationHistory.open(SERIAL, state_dir=state) as history:
+        found = history.head()
+    return found.revision, found.calibration_id
+
+
+class TestReading:
+    def test_list(self, state):
+        document = robocal_json("history.list.json", "history", "list", "--state", state)
+        assert document["serial"] == SERIAL
+        assert document["file"] == str(state / "KR%2F7.sqlite")
+        assert document["damaged"] is None
+        assert document["in_force"] == [{"kind": "thermal", "revision": 1, "calibration_id": 1}]
+        found = [(c["id"], c["state"], c["code"]) for c in document["calibrations"]]
+        assert found == [
+            (3, "refused", "WORSE_THAN_CURRENT"),
+            (2, "pending", "ACCEPT"),
+            (1, "in_force", "ACCEPT"),
+        ]
+        first = document["calibrations"][2]
+        assert first["stamp_ns"] == STAMP_NS
+        assert first["decisions"][0]["by"] == "node"
+        one = robocal_json("history.list.json", "history", "list", "--state", state, "--limit", "1")
+        assert [c["id"] for c in one["calibrations"]] == [3]
+
+    def test_list_for_people(self, state):
+        done = robocal("history", "list", ROBOCAL_STATE=str(state))
+        assert done.returncode == 0
+        assert "Robot KR/7" in done.stdout
+        assert "morning [bold]" in done.stdout  # not taken for markup
+        assert "2023-11-14 22:13:20" in done.stdout
+        assert "In force: calibration 1, thermal revision 1" in done.stdout
+        assert done.stderr == ""
+
+    def test_show(self, state):
+        document = robocal_json("history.show.json", "history", "show", "1", "--state", state)
+        assert document["calibration"]["state"] == "in_force"
+        assert document["model"] == {"d": [0.1, 1 / 3]}
+        assert document["document"] == {"verdict": {"accept": True}}
+        assert document["inputs"] == {"q": {"dtype": "float64", "shape": [5, 6]}}
+        done = robocal("history", "show", "3", "--state", state)
+        assert done.returncode == 0
+        assert "WORSE_THAN_CURRENT" in done.stdout
+        assert "float64 5 x 6" in done.stdout
+
+    def test_reading_starts_no_history(self, tmp_path):
+        for more in ((), ("--robot-serial", "KR-8")):
+            robocal_json(
+                "error.json", "history", "list", "--state", tmp_path / "new", *more, status=2
+            )
+        assert not (tmp_path / "new").exists()
+
+    def test_serial_must_be_named_among_several(self, state):
+        with CalibrationHistory.open("UR-2", state_dir=state) as history:
+            history.propose(proposal())
+        document = robocal_json("error.json", "history", "list", "--state", state, status=2)
+        assert "KR/7, UR-2" in document["error"]["message"]
+        document = robocal_json(
+            "history.list.json", "history", "list", "--state", state, "--robot-serial", "UR-2"
+        )
+        assert document["serial"] == "UR-2"
+        assert document["in_force"] == []
+
+
+class TestDeciding:
+    def test_accept(self, state):
+        before = time.time_ns()
+        document = robocal_json(
+            "history.decision.json",
+            *("history", "accept", "2", "--state", state),
+            *("--by", "Ada", "--reason", "probe", "--expect-revision", "1"),
+        )
+        assert head(state) == (2, 2)
+        assert (document["revision"], document["calibration_id"]) == (2, 2)
+        assert document["verdict"]["accept"]
+        with CalibrationHistory.open(SERIAL, state_dir=state) as history:
+            decision = history.get(2).decisions[-1]
+            assert history.get(1).state is State.SUPERSEDED
+        assert (decision.by, decision.reason) == ("Ada", "probe")
+        assert before < decision.wall_ns < time.time_ns()
+
+    def test_default_name(self, state):
+        document = robocal_json("history.decision.json", "history", "reject", "2", "--state", state)
+        assert document["by"] == getpass.getuser()
+        assert head(state) == (1, 1)
+
+    def test_for_people(self, state):
+        done = robocal("history", "accept", "2", "--state", state)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout == "Calibration 2 is in force as thermal revision 2\n"
+        done = robocal("history", "rollback", "--state", state)
+        assert done.stdout == "Calibration 1 is in force again, as thermal revision 3\n"
+
+    @pytest.mark.parametrize(
+        ("arguments", "status", "code"),
+        [
+            (("accept", "1"), 3, "CONFLICT"),
+            (("accept", "2", "--expect-revision", "0"), 3, "CONFLICT"),
+            (("accept", "3"), 3, "WORSE_THAN_CURRENT"),
+            (("accept", "9"), 2, "BAD_INPUT"),
+            (("accept", "-1"), 2, "BAD_INPUT"),
+            (("accept", "99999999999999999999"), 2, "BAD_INPUT"),
+            (("show", "9"), 2, "BAD_INPUT"),
+            (("reject", "1"), 3, "CONFLICT"),
+            (("rollback", "--to", "2"), 3, "CONFLICT"),
+            (("rollback", "--kind", "tool"), 3, "CONFLICT"),
+            (("rollback", "--expect-revision", "7"), 3, "CONFLICT"),
+            (("accept", "2", "--by", os.fsdecode(b"\xff")), 2, "BAD_INPUT"),
+        ],
+    )
+    def test_refusals_change_nothing(self, state, arguments, status, code):
+        document = robocal_json(
+            "error.json", "history", *arguments, "--state", state, status=status
+        )
+        assert document["error"]["code"] == document["verdict"]["code"] == code
+        assert head(state) == (1, 1)
+
+    def test_rollbacks(self, state):
+        def rollback(*more):
+            return robocal_json(
+                "history.decision.json", "history", "rollback", "--state", state, *more
+            )
+
+        assert rollback()["calibration_id"] is None
+        assert rollback("--to", "1")["revision"] == 3
+        assert rollback("--to", "nominal")["revision"] == 4
+        assert rollback("--to", "1", "--expect-revision", "4")["revision"] == 5
+        assert rollback("--to", "previous")["calibration_id"] is None
+        assert head(state) == (6, None)
+        document = robocal_json("history.list.json", "history", "list", "--state", state)
+        assert document["in_force"] == [{"kind": "thermal", "revision": 6, "calibration_id": None}]
+        assert (
+            "the nominal model, thermal revision 6"
+            in robocal("history", "list", "--state", state).stdout
+        )
+
+    def test_two_commands_at_once(self, state):
+        command = [sys.executable, "-m", "robocal_ros.cli.main", "history", "accept", "2", "--json"]
+        both = [
+            subprocess.Popen(
+                [*command, "--state", str(state)],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                env=environment(),
+            )
+            for _ in range(2)
+        ]
+        said = [json.loads(process.communicate(timeout=30)[0]) for process in both]
+        assert sorted(process.returncode for process in both) == [0, 3]
+        for document in said:
+            conforms(document, "history.decision.json")
+        assert sorted(document["verdict"]["code"] for document in said) == ["ACCEPT", "CONFLICT"]
+        assert head(state) == (2, 2)
+
+    def test_seen_by_others_within_a_second(self, state):
+        with CalibrationHistory.open(SERIAL, state_dir=state) as history:
+            seen = history.data_version()
+            robocal_json("history.decision.json", "history", "accept", "2", "--state", state)
+            assert history.data_version() != seen
+            assert history.head().revision == 2
+
+
+class TestTrouble:
+    def test_damaged_file_is_reported_and_kept(self, state):
+        path = state / "KR%2F7.sqlite"
+        path.write_bytes(b"\xff" * 5000)
+        done = robocal("history", "list", "--state", state, "--json")
+        assert done.returncode == 0
+        document = json.loads(done.stdout)
+        conforms(document, "history.list.json")
+        assert Path(document["damaged"]).read_bytes() == b"\xff" * 5000
+        assert document["calibrations"] == []
+        assert "was damaged" in done.stderr
+        path.write_bytes(b"\xff" * 5000)
+        done = robocal("history", "list", "--state", state)
+        assert "The history was damaged and is kept as" in done.stdout
+
+    def test_state_is_no_folder(self, tmp_path):
+        place = tmp_path / "file"
+        place.write_text("")
+        more = ("--robot-serial", "x", "--state", place)
+        document = robocal_json("error.json", "history", "list", *more, status=2)
+        assert document["error"]["code"] in ("BAD_INPUT", "STORAGE_FAILED")
+        assert place.read_text() == ""
