@@ -41,9 +41,11 @@ from robocal_ros.cli.parsing import (
 from robocal_ros.core.errors import InputError, RobocalError
 
 COMMANDS = {
+    "fk": "fk",
     "identify": "identify",
     "replay": "replay",
     "history": "history",
+    "import-ur": "import_ur",
 }
 """Name of each command and its module, in the order of the help."""
 
