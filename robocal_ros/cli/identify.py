@@ -1,11 +1,11 @@
 """``robocal identify``: a robot's model from measurements, judged on measurements not used."""
 
 import argparse
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robocal_ros import __version__
 from robocal_ros.cli.arguments import (
     PARTS,
     ROBOT_HELP,
@@ -15,8 +15,9 @@ from robocal_ros.cli.arguments import (
     share,
     warn,
 )
-from robocal_ros.cli.identify_view import show_identification
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.identify_view import headline, show_identification
+from robocal_ros.cli.output import DONE, NO_ANSWER, Outcome, refusal
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,7 +94,11 @@ def run(args: argparse.Namespace) -> Outcome:
         _save(robot, answer, args.output, document, warnings)
     document["warnings"] = warnings
     warn(warnings)
-    return Outcome(document, partial(show_identification, document=document))
+    status = DONE
+    if answer.judged.verdict.code is Code.TOO_FEW_SAMPLES:
+        document |= refusal(Code.TOO_FEW_SAMPLES, answer.judged.verdict.reason)
+        status = NO_ANSWER
+    return Outcome(document, partial(show_identification, document=document), status)
 
 
 def _require_sense(args: argparse.Namespace) -> None:
@@ -132,9 +137,16 @@ def _save(
     """Write the identified robot file, if the verdict accepts: a script may use it at once."""
     from robocal_ros.storage.robots import save_robot
 
-    if not answer.judged.verdict.accept:
-        warnings.append(f"{path} is not written: the verdict is {answer.judged.verdict.code.name}")
+    verdict = answer.judged.verdict
+    if not verdict.accept:
+        warnings.append(f"{path} is not written: the verdict is {verdict.code.name}")
         return
-    identified = replace(robot.arm, mdh=answer.judged.identification.cell.arm.mdh)
-    save_robot(identified, path)
+    arm = robot.arm.with_mdh(answer.judged.identification.cell.arm.mdh)
+    used = document["data"]
+    comment = (
+        f"Identified by robocal {__version__} from {used['file']}, {used['train']} measurements, "
+        f"method {document['method']};\nnominal model {robot.arm.model_hash} of {robot.path}.\n"
+        f"{headline(document)}."
+    )
+    save_robot(arm, path, like=robot, comment=comment)
     document["output"] = str(path)

@@ -54,7 +54,7 @@ def exit_status(error: RobocalError) -> int:
 def failure(error: RobocalError) -> Document:
     """JSON document of a command that ends with this error."""
     where = error if isinstance(error, InputError) else None
-    document = _refusal(error.code, str(error))
+    document = refusal(error.code, str(error))
     document["error"] |= {
         "file": where and where.file,
         "row": where and where.row,
@@ -67,10 +67,11 @@ def failure(error: RobocalError) -> Document:
 
 def crash(error: BaseException) -> Document:
     """JSON document of a crash: no verdict came about."""
-    return _refusal(Code.NONE, f"internal error, {type(error).__name__}: {error}")
+    return refusal(Code.NONE, f"internal error, {type(error).__name__}: {error}")
 
 
-def _refusal(code: Code, message: str) -> Document:
+def refusal(code: Code, message: str) -> Document:
+    """``error`` and ``verdict`` of a command that cannot answer."""
     place = {"file": None, "row": None, "column": None}
     return {
         "error": {"code": code.name, "message": message, **place},

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros import __version__
+from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
@@ -27,7 +28,6 @@ from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.storage.bags import BagMessage, BagReader
 from robocal_ros.storage.calibrations import CalibrationHistory
 
-Document = dict[str, Any]
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
 Watch = Callable[[str, Recording], Iterator[BagMessage]]
@@ -182,11 +182,7 @@ def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
     if not failed and (made or not asked):
         return {}
     first = next((o for o in (*failed, *asked) if not o.done), asked[0])
-    code, message = first.status.name, first.message
-    return {
-        "error": {"code": code, "message": message, "file": None, "row": None, "column": None},
-        "verdict": {"accept": False, "code": code, "reason": message},
-    }
+    return refusal(first.status, first.message)
 
 
 def _seconds(stamp_ns: int | None) -> float:

@@ -127,12 +127,15 @@ def find_robot(name: str | Path) -> Path:
     return known[str(name)]
 
 
-def save_robot(arm: SerialArm, path: str | Path, like: RobotDescription | None = None) -> None:
+def save_robot(
+    arm: SerialArm, path: str | Path, like: RobotDescription | None = None, comment: str = ""
+) -> None:
     """Write an arm as a robot file; the file appears whole or not at all.
 
     Parameters
     ----------
     like : robot file that the arm was made from; its joint speeds are kept.
+    comment : lines to begin the file with.
 
     Raises
     ------
@@ -149,7 +152,8 @@ def save_robot(arm: SerialArm, path: str | Path, like: RobotDescription | None =
             xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
             document[key] = {"xyz_mm": xyz, "quat_xyzw": frames.quat_xyzw(T).tolist()}
     text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
-    write_text(Path(path), text)
+    remarks = "".join(f"# {line}\n" for line in comment.splitlines())
+    write_text(Path(path), remarks + text)
 
 
 class _Joint:
