@@ -8,13 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from jsonschema import Draft202012Validator
-from referencing import Registry, Resource
 
 ROOT = Path(__file__).parents[2]
 SCHEMAS = {path.name: json.loads(path.read_text()) for path in (ROOT / "docs/schemas").glob("*")}
-REGISTRY: Registry = Registry().with_resources(
-    (name, Resource.from_contents(schema)) for name, schema in SCHEMAS.items()
-)
 COMMAND = [sys.executable, "-m", "robocal_ros.cli.main"]
 
 
@@ -37,9 +33,25 @@ def robocal(
     )
 
 
+def _bundled(name: str, part: Any) -> Any:
+    """A schema with its references made local to one that holds them all."""
+    if isinstance(part, list):
+        return [_bundled(name, one) for one in part]
+    if not isinstance(part, dict):
+        return part
+    bundled = {key: _bundled(name, one) for key, one in part.items() if key != "$id"}
+    if isinstance(part.get("$ref"), str):
+        file, _, place = part["$ref"].partition("#")
+        bundled["$ref"] = f"#/$defs/{file or name}{place}"
+    return bundled
+
+
+BUNDLE = {name: _bundled(name, schema) for name, schema in SCHEMAS.items()}
+
+
 def conforms(document: Any, schema: str) -> None:
     """Fail unless the document follows a schema of docs/schemas."""
-    Draft202012Validator(SCHEMAS[schema], registry=REGISTRY).validate(document)
+    Draft202012Validator({"$ref": f"#/$defs/{schema}", "$defs": BUNDLE}).validate(document)
 
 
 def robocal_json(schema: str, *arguments: object, status: int = 0, **variables: str) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command import conforms, environment, robocal, robocal_json
+from jsonschema import ValidationError
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import Proposal, State
@@ -113,6 +114,14 @@ class TestReading:
         )
         assert document["serial"] == "UR-2"
         assert document["in_force"] == []
+
+    def test_schema_is_strict(self, state):
+        document = robocal_json("history.list.json", "history", "list", "--state", state)
+        for change in ({"extra": 1}, {"in_force": None}, {"calibrations": [{"id": 1}]}):
+            with pytest.raises(ValidationError):
+                conforms(document | change, "history.list.json")
+        with pytest.raises(ValidationError):
+            conforms({"error": {"code": "CONFLICT"}}, "history.list.json")
 
 
 class TestDeciding:
