@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm, kernels
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 
 Array = NDArray[np.float64]
@@ -37,6 +37,8 @@ class CellModel:
 
     def predict(self, q: Array, target: Index) -> Array:
         """T_frame_target (m, 4, 4) at joint vectors (m, n), ``target`` (m,) by index."""
+        from robocal_ros.core.kinematics import kernels
+
         T = np.empty((len(q), 4, 4))
         kernels.fk_batch(np.ascontiguousarray(q), self.arm.links, self.T_frame_root, T)
         return np.asarray(T @ self.T_flange_target[target])
@@ -75,6 +77,8 @@ class Layout:
 
     def jacobian(self, state: CellModel, q: Array, target: Index) -> tuple[Array, Array]:
         """T_frame_target (m, 4, 4) and its twist [v; w] by the unknowns (m, tool_size, k)."""
+        from robocal_ros.core.kinematics import kernels
+
         T = np.empty((len(q), 4, 4))
         J = np.zeros((len(q), self.tool_size, len(self.names)))
         arm = state.arm

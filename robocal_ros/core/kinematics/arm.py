@@ -1,4 +1,8 @@
-"""Serial arms in Hayati's five-parameter modified Denavit-Hartenberg form."""
+"""Serial arms in Hayati's five-parameter modified Denavit-Hartenberg form.
+
+The compiled kernels are loaded when they are first used: a quarter of a second that reading a
+robot file and the start of a node do not need.
+"""
 
 import hashlib
 from dataclasses import dataclass, field, replace
@@ -7,7 +11,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core.kinematics import kernels
 from robocal_ros.core.kinematics.parameters import ParameterSet, free_parameters
 
 Array = NDArray[np.float64]
@@ -68,6 +71,8 @@ class SerialArm:
     @cached_property
     def links(self) -> Array:
         """Constants of the joints (n, 9) for the compiled kernels."""
+        from robocal_ros.core.kinematics import kernels
+
         return kernels.pack_links(self.mdh, self.sign, self.prismatic)
 
     @cached_property
@@ -101,6 +106,8 @@ class SerialArm:
 
     def fk(self, q: ArrayLike) -> Array:
         """T_base_flange (..., 4, 4) at joint vectors (..., n)."""
+        from robocal_ros.core.kinematics import kernels
+
         joints, lead = self._batch(q)
         T = np.empty((len(joints), 4, 4))
         kernels.fk_batch(joints, self.links, self.T_base_root, T)
@@ -108,6 +115,8 @@ class SerialArm:
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Geometric Jacobian (..., 6, n): [v; w] of the flange in base axes per unit joint rate."""
+        from robocal_ros.core.kinematics import kernels
+
         joints, lead = self._batch(q)
         T = np.empty((len(joints), 4, 4))
         J = np.empty((len(joints), 6, self.n))
@@ -116,6 +125,8 @@ class SerialArm:
 
     def parameter_jacobian(self, q: ArrayLike, p_flange: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Twist (..., 6, k) in base of the frame at ``p_flange`` (3,) per unit free parameter."""
+        from robocal_ros.core.kinematics import kernels
+
         joints, lead = self._batch(q)
         k = len(self.parameters)
         T, J = np.empty((len(joints), 4, 4)), np.zeros((len(joints), 6, k))
