@@ -62,7 +62,7 @@ def exp_rotation(rotvec: ArrayLike) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad."""
     from scipy.spatial.transform import Rotation
 
-    w = np.array(rotvec, dtype=np.float64)  # a copy, as above
+    w = np.array(rotvec, dtype=np.float64)  # a copy: SciPy 1.11 takes none that is read-only
     return np.asarray(Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix().reshape(*w.shape, 3))
 
 
@@ -70,7 +70,7 @@ def log_rotation(rotation: Array) -> Array:
     """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3)."""
     from scipy.spatial.transform import Rotation
 
-    R = np.array(rotation, dtype=np.float64)  # a copy, as above
+    R = np.array(rotation, dtype=np.float64)  # a copy: SciPy 1.11 takes none that is read-only
     return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
 
 
