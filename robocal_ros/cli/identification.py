@@ -7,22 +7,26 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.assessment import hold_out, pose_groups
+from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import identification_document
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification import (
-    CellModel,
     JudgedIdentification,
     Method,
     Part,
     identify_and_judge,
 )
-from robocal_ros.core.identification.mismatch import explain_mismatch
-from robocal_ros.core.identification.start import linear_start
+from robocal_ros.core.identification.mismatch import explain_mismatch, require_match
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.storage.tables import beyond_limits, read_measurements
 
 Document = dict[str, Any]
+
+_OTHER_SET_UP = (
+    "if the check data come from another set-up (measuring device or targets moved), say so with "
+    "--check-refit base,tool"
+)
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,8 @@ def identify_files(arm: SerialArm, request: Request) -> Answer:
     """
     warnings: list[str] = []
     data = _read(request.data_file, arm, warnings)
-    _require_fit(arm, data, request)
+    base, tool = "base" in request.fit, "tool" in request.fit
+    require_match(arm, data, base=base, tool=tool, file=str(request.data_file))
     if request.check_file is None:
         held = hold_out(pose_groups(data.q), request.hold_out, request.seed)
         train, check = data.take(~held), data.take(held)
@@ -81,6 +86,8 @@ def identify_files(arm: SerialArm, request: Request) -> Answer:
     )
     if request.check_file is not None:
         _require_check_fits(judged, check, request)
+        if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not request.check_refit:
+            warnings.append(_OTHER_SET_UP)
     document = identification_document(judged) | {"data": _data_document(request, train, check)}
     return Answer(judged, document, tuple(warnings))
 
@@ -105,30 +112,17 @@ def _data_document(request: Request, train: Measurements, check: Measurements) -
     }
 
 
-def _require_fit(arm: SerialArm, data: Measurements, request: Request) -> None:
-    """Refuse data that miss the nominal robot as no robot does and whose mistake can be named."""
-    base, tool = "base" in request.fit, "tool" in request.fit
-
-    def residual(measured: Measurements) -> Any:
-        return linear_start(arm, measured, base=base, tool=tool).residual(measured)
-
-    if mistake := explain_mismatch(arm, data, residual):
-        raise InputError(mistake, file=str(request.data_file))
-
-
 def _require_check_fits(
     judged: JudgedIdentification, check: Measurements, request: Request
 ) -> None:
-    """The same for check data, against the identified model."""
-    cell: CellModel = judged.identification.cell
-    base, tool = "base" in request.check_refit, "tool" in request.check_refit
-
-    def residual(measured: Measurements) -> Any:
-        refitted = linear_start(cell.arm, measured, base=base, tool=tool) if base or tool else cell
-        return refitted.residual(measured)
-
-    if mistake := explain_mismatch(cell.arm, check, residual):
-        raise InputError(mistake, file=str(request.check_file))
+    """Name the mistake in check data that miss the identified model, as for training data."""
+    arm, refit, file = judged.identification.cell.arm, request.check_refit, str(request.check_file)
+    if frozenset(refit) >= {"base", "tool"}:
+        require_match(arm, check, base=True, tool=True, file=file)
+    elif not refit and (
+        mistake := explain_mismatch(arm, check, judged.identification.cell.residual)
+    ):
+        raise InputError(mistake, file=file)
 
 
 def _require_other_data(train: Measurements, check: Measurements, request: Request) -> None:

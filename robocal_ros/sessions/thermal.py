@@ -17,6 +17,7 @@ from robocal_ros.core.documents import (
 )
 from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_judge
+from robocal_ros.core.identification.mismatch import require_match
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Decision, Head, Proposal
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
@@ -246,6 +247,7 @@ class ThermalSession:
                 prior_covariance=self.prior,
                 method=method,
             )
+        require_match(self.nominal, data, base=True, tool=True)
         held = hold_out(pose_groups(data.q), self.config.hold_out, self.config.seed)
         in_force = self.arm if self.in_force.model is not None else None
         return identify_and_judge(

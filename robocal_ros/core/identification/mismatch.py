@@ -7,6 +7,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 
@@ -17,6 +19,28 @@ CLEAR_M = 0.01
 CLEAR_RATIO = 20.0
 _ENOUGH_ROWS = 300
 _DEGREE = float(np.pi / 180.0)
+
+
+def require_match(
+    arm: SerialArm, data: Measurements, *, base: bool, tool: bool, file: str | None = None
+) -> None:
+    """Refuse data that miss the nominal arm as no robot does, where the mistake can be named.
+
+    ``base``, ``tool``: whether they are placed from the data or known (see ``linear_start``).
+
+    Raises
+    ------
+    InputError
+        Naming the mistake, and ``file``.
+    TooFewSamplesError, RankDeficientError
+        When the data cannot place base and targets.
+    """
+
+    def residual(measured: Measurements) -> Array:
+        return linear_start(arm, measured, base=base, tool=tool).residual(measured)
+
+    if mistake := explain_mismatch(arm, data, residual):
+        raise InputError(mistake, file=file)
 
 
 def explain_mismatch(
