@@ -118,9 +118,8 @@ class SerialArm:
         from robocal_ros.core.kinematics import kernels
 
         joints, lead = self._batch(q)
-        T = np.empty((len(joints), 4, 4))
         J = np.empty((len(joints), 6, self.n))
-        kernels.jacobian_batch(joints, self.links, self.T_base_root, T, J)
+        kernels.jacobian_batch(joints, self.links, self.T_base_root, J)
         return J.reshape(*lead, 6, self.n)
 
     def parameter_jacobian(self, q: ArrayLike, p_flange: ArrayLike = (0.0, 0.0, 0.0)) -> Array:

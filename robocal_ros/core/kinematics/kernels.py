@@ -23,6 +23,71 @@ def pack_links(mdh: Array, sign: Array, prismatic: NDArray[np.bool_]) -> Array:
     )
 
 
+# Frames are carried as twelve numbers: LLVM keeps them in registers, which arrays would prevent.
+Frame = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float
+]  # columns x, y, z and origin p
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _root(T: Array) -> Frame:
+    """The columns of a transform."""
+    # fmt: off
+    return (
+        T[0, 0], T[1, 0], T[2, 0], T[0, 1], T[1, 1], T[2, 1],
+        T[0, 2], T[1, 2], T[2, 2], T[0, 3], T[1, 3], T[2, 3],
+    )
+    # fmt: on
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _link(links: Array, i: int, q: float, frame: Frame) -> Frame:
+    """One link but for beta: Trans(z, d) Rot(z, theta) Trans(x, a) Rot(x, alpha)."""
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
+    d, theta = links[i, 0], links[i, 1]
+    if links[i, 8] > 0.5:
+        d += links[i, 7] * q
+    else:
+        theta += links[i, 7] * q
+    c, s = np.cos(theta), np.sin(theta)
+    # fmt: off
+    x0, x1, x2, y0, y1, y2 = (
+        c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2,
+        c * y0 - s * x0, c * y1 - s * x1, c * y2 - s * x2,
+    )
+    a, ca, sa = links[i, 2], links[i, 3], links[i, 4]
+    return (
+        x0, x1, x2, ca * y0 + sa * z0, ca * y1 + sa * z1, ca * y2 + sa * z2,
+        ca * z0 - sa * y0, ca * z1 - sa * y1, ca * z2 - sa * y2,
+        p0 + (d * z0 + a * x0), p1 + (d * z1 + a * x1), p2 + (d * z2 + a * x2),
+    )
+    # fmt: on
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _bend(links: Array, i: int, frame: Frame) -> Frame:
+    """The rest of a link: Rot(y, beta)."""
+    cb, sb = links[i, 5], links[i, 6]
+    if sb == 0.0 and cb == 1.0:
+        return frame
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
+    # fmt: off
+    return (
+        cb * x0 - sb * z0, cb * x1 - sb * z1, cb * x2 - sb * z2, y0, y1, y2,
+        cb * z0 + sb * x0, cb * z1 + sb * x1, cb * z2 + sb * x2, p0, p1, p2,
+    )
+    # fmt: on
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _store(frame: Frame, T: Array) -> None:
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
+    T[0, 0], T[0, 1], T[0, 2], T[0, 3] = x0, y0, z0, p0
+    T[1, 0], T[1, 1], T[1, 2], T[1, 3] = x1, y1, z1, p1
+    T[2, 0], T[2, 1], T[2, 2], T[2, 3] = x2, y2, z2, p2
+    T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> None:
     """Forward kinematics that keeps each joint's axes.
@@ -30,94 +95,72 @@ def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> 
     ``frames`` (n, 5, 3) receives per joint: z of the joint axis and its point, x of the link
     (after theta), the link frame's origin, and the y axis about which beta turns.
     """
-    x0, x1, x2 = T_root[0, 0], T_root[1, 0], T_root[2, 0]
-    y0, y1, y2 = T_root[0, 1], T_root[1, 1], T_root[2, 1]
-    z0, z1, z2 = T_root[0, 2], T_root[1, 2], T_root[2, 2]
-    p0, p1, p2 = T_root[0, 3], T_root[1, 3], T_root[2, 3]
+    frame = _root(T_root)
     for i in range(links.shape[0]):
-        d, theta = links[i, 0], links[i, 1]
-        if links[i, 8] > 0.5:
-            d += links[i, 7] * q[i]
-        else:
-            theta += links[i, 7] * q[i]
-        frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = z0, z1, z2
-        frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = p0, p1, p2
-        c, s = np.cos(theta), np.sin(theta)
-        # fmt: off
-        x0, x1, x2, y0, y1, y2 = (
-            c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2,
-            c * y0 - s * x0, c * y1 - s * x1, c * y2 - s * x2,
-        )
-        # fmt: on
-        a = links[i, 2]
-        p0 += d * z0 + a * x0
-        p1 += d * z1 + a * x1
-        p2 += d * z2 + a * x2
-        frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = x0, x1, x2
-        frames[i, 3, 0], frames[i, 3, 1], frames[i, 3, 2] = p0, p1, p2
-        ca, sa, cb, sb = links[i, 3], links[i, 4], links[i, 5], links[i, 6]
-        # fmt: off
-        y0, y1, y2, z0, z1, z2 = (
-            ca * y0 + sa * z0, ca * y1 + sa * z1, ca * y2 + sa * z2,
-            ca * z0 - sa * y0, ca * z1 - sa * y1, ca * z2 - sa * y2,
-        )
-        # fmt: on
-        frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = y0, y1, y2
-        # fmt: off
-        x0, x1, x2, z0, z1, z2 = (
-            cb * x0 - sb * z0, cb * x1 - sb * z1, cb * x2 - sb * z2,
-            cb * z0 + sb * x0, cb * z1 + sb * x1, cb * z2 + sb * x2,
-        )
-        # fmt: on
-    T_out[0, 0], T_out[0, 1], T_out[0, 2], T_out[0, 3] = x0, y0, z0, p0
-    T_out[1, 0], T_out[1, 1], T_out[1, 2], T_out[1, 3] = x1, y1, z1, p1
-    T_out[2, 0], T_out[2, 1], T_out[2, 2], T_out[2, 3] = x2, y2, z2, p2
-    T_out[3, 0], T_out[3, 1], T_out[3, 2], T_out[3, 3] = 0.0, 0.0, 0.0, 1.0
+        frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = frame[6], frame[7], frame[8]
+        frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = frame[9], frame[10], frame[11]
+        frame = _link(links, i, q[i], frame)
+        frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = frame[0], frame[1], frame[2]
+        frames[i, 3, 0], frames[i, 3, 1], frames[i, 3, 2] = frame[9], frame[10], frame[11]
+        frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = frame[3], frame[4], frame[5]
+        frame = _bend(links, i, frame)
+    _store(frame, T_out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fk_batch(q: Array, links: Array, T_root: Array, T_out: Array) -> None:
     """Flange poses (m, 4, 4) of joint vectors (m, n)."""
-    frames = np.empty((links.shape[0], 5, 3))
     for k in range(q.shape[0]):
-        walk(q[k], links, T_root, frames, T_out[k])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _turn(axis: Array, centre: Array, p0: float, p1: float, p2: float, J: Array, c: int) -> None:
-    """Column ``c`` of ``J``: velocity of p (and, in six rows, the turn) about an axis."""
-    r0, r1, r2 = p0 - centre[0], p1 - centre[1], p2 - centre[2]
-    J[0, c] = axis[1] * r2 - axis[2] * r1
-    J[1, c] = axis[2] * r0 - axis[0] * r2
-    J[2, c] = axis[0] * r1 - axis[1] * r0
-    if J.shape[0] == 6:
-        J[3, c], J[4, c], J[5, c] = axis[0], axis[1], axis[2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _slide(axis: Array, J: Array, c: int) -> None:
-    """Column ``c`` of ``J``: translation along an axis."""
-    J[0, c], J[1, c], J[2, c] = axis[0], axis[1], axis[2]
-    if J.shape[0] == 6:
-        J[3, c], J[4, c], J[5, c] = 0.0, 0.0, 0.0
+        frame = _root(T_root)
+        for i in range(links.shape[0]):
+            frame = _bend(links, i, _link(links, i, q[k, i], frame))
+        _store(frame, T_out[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def jacobian_batch(q: Array, links: Array, T_root: Array, T_out: Array, J: Array) -> None:
-    """Flange poses (m, 4, 4) and geometric Jacobians (m, 6, n): [v; w] of the flange in base."""
+def jacobian_batch(q: Array, links: Array, T_root: Array, J: Array) -> None:
+    """Geometric Jacobians (m, 6, n) of joint vectors (m, n): [v; w] of the flange in base."""
     n = links.shape[0]
-    frames = np.empty((n, 5, 3))
+    axes = np.empty((n, 6))
     for k in range(q.shape[0]):
-        walk(q[k], links, T_root, frames, T_out[k])
-        p0, p1, p2 = T_out[k, 0, 3], T_out[k, 1, 3], T_out[k, 2, 3]
+        frame = _root(T_root)
         for i in range(n):
+            for r in range(6):
+                axes[i, r] = frame[6 + r]
+            frame = _bend(links, i, _link(links, i, q[k, i], frame))
+        p0, p1, p2 = frame[9], frame[10], frame[11]
+        for i in range(n):
+            s = links[i, 7]
+            a0, a1, a2 = s * axes[i, 0], s * axes[i, 1], s * axes[i, 2]
             if links[i, 8] > 0.5:
-                _slide(frames[i, 0], J[k], i)
+                J[k, 0, i], J[k, 1, i], J[k, 2, i] = a0, a1, a2
+                J[k, 3, i], J[k, 4, i], J[k, 5, i] = 0.0, 0.0, 0.0
             else:
-                _turn(frames[i, 0], frames[i, 1], p0, p1, p2, J[k], i)
-            if links[i, 7] < 0.0:
-                for r in range(6):
-                    J[k, r, i] = -J[k, r, i]
+                r0, r1, r2 = p0 - axes[i, 3], p1 - axes[i, 4], p2 - axes[i, 5]
+                J[k, 0, i], J[k, 1, i] = a1 * r2 - a2 * r1, a2 * r0 - a0 * r2
+                J[k, 2, i] = a0 * r1 - a1 * r0
+                J[k, 3, i], J[k, 4, i], J[k, 5, i] = a0, a1, a2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _turn(
+    f: Array, i: int, axis: int, centre: int, p0: float, p1: float, p2: float,
+    J: Array, k: int, c: int,
+) -> None:  # fmt: skip
+    """Column ``c`` of ``J[k]``: velocity of p (and, in six rows, the turn) about an axis."""
+    a0, a1, a2 = f[i, axis, 0], f[i, axis, 1], f[i, axis, 2]
+    r0, r1, r2 = p0 - f[i, centre, 0], p1 - f[i, centre, 1], p2 - f[i, centre, 2]
+    J[k, 0, c] = a1 * r2 - a2 * r1
+    J[k, 1, c] = a2 * r0 - a0 * r2
+    J[k, 2, c] = a0 * r1 - a1 * r0
+    if J.shape[1] == 6:
+        J[k, 3, c], J[k, 4, c], J[k, 5, c] = a0, a1, a2
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _slide(f: Array, i: int, axis: int, J: Array, k: int, c: int) -> None:
+    """Column ``c`` of ``J[k]``, zeroed before: translation along an axis."""
+    J[k, 0, c], J[k, 1, c], J[k, 2, c] = f[i, axis, 0], f[i, axis, 1], f[i, axis, 2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -157,20 +200,19 @@ def parameter_batch(
                 T_out[k, r, c] = value
         T_out[k, 3, 0], T_out[k, 3, 1], T_out[k, 3, 2], T_out[k, 3, 3] = 0.0, 0.0, 0.0, 1.0
         p0, p1, p2 = T_out[k, 0, 3], T_out[k, 1, 3], T_out[k, 2, 3]
-        Jk = J[k]
         for i in range(n):
-            f = frames[i]
             if slot[i, 0] >= 0:
-                _slide(f[0], Jk, slot[i, 0])
+                _slide(frames, i, 0, J, k, slot[i, 0])
             if slot[i, 1] >= 0:
-                _turn(f[0], f[1], p0, p1, p2, Jk, slot[i, 1])
+                _turn(frames, i, 0, 1, p0, p1, p2, J, k, slot[i, 1])
             if slot[i, 2] >= 0:
-                _slide(f[2], Jk, slot[i, 2])
+                _slide(frames, i, 2, J, k, slot[i, 2])
             if slot[i, 3] >= 0:
-                _turn(f[2], f[3], p0, p1, p2, Jk, slot[i, 3])
+                _turn(frames, i, 2, 3, p0, p1, p2, J, k, slot[i, 3])
             if slot[i, 4] >= 0:
-                _turn(f[4], f[3], p0, p1, p2, Jk, slot[i, 4])
+                _turn(frames, i, 4, 3, p0, p1, p2, J, k, slot[i, 4])
         if base_column >= 0:
+            Jk = J[k]
             r0, r1, r2 = p0 - root[0], p1 - root[1], p2 - root[2]
             b = base_column
             Jk[0, b], Jk[1, b + 1], Jk[2, b + 2] = 1.0, 1.0, 1.0
@@ -183,6 +225,6 @@ def parameter_batch(
         if t >= 0:
             for r in range(3):
                 for c in range(3):
-                    Jk[r, t + c] = T_flange[r, c]
+                    J[k, r, t + c] = T_flange[r, c]
                     if rows == 6:
-                        Jk[3 + r, t + 3 + c] = T_flange[r, c]
+                        J[k, 3 + r, t + 3 + c] = T_flange[r, c]
