@@ -20,6 +20,7 @@ S = TypeVar("S")
 FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
 MOST_ITERATIONS = 50
 STEP_TOLERANCE = 1e-4  # of a standard deviation
+FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
 SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
 
 
@@ -114,7 +115,8 @@ def solve(
     keep = np.ones(m, dtype=np.bool_)
     run = _Run(start, residual, jacobian, 0, False)
     if robust:
-        run = descent.run(run, keep, huber=float(np.sqrt(chi2_quantile(0.95, c))))
+        limit = float(np.sqrt(chi2_quantile(0.95, c)))
+        run = descent.run(run, keep, huber=limit, tolerance=FIRST_TOLERANCE)
         keep = descent.inliers(run, keep)
     for _ in range(10):
         if flat and not np.all(keep):
@@ -168,7 +170,13 @@ class _Descent(Generic[S]):
     prior: Array
     scale_components: int
 
-    def run(self, run: _Run[S], keep: NDArray[np.bool_], huber: float = np.inf) -> _Run[S]:
+    def run(
+        self,
+        run: _Run[S],
+        keep: NDArray[np.bool_],
+        huber: float = np.inf,
+        tolerance: float = STEP_TOLERANCE,
+    ) -> _Run[S]:
         """Minimise the (Huber) cost until a step is far below a standard deviation."""
         k = run.jacobian.shape[2]
         state, residual, jacobian = run.state, run.residual, run.jacobian
@@ -182,7 +190,7 @@ class _Descent(Generic[S]):
                 step = _damped_step(normal, gradient, damping)
                 trial = self.problem.retract(state, step)
                 new_residual, new_jacobian = self.problem.linearise(trial)
-                small = float(step @ normal @ step) < STEP_TOLERANCE**2 * k
+                small = float(step @ normal @ step) < tolerance**2 * k
                 if small or self._cost(trial, new_residual, keep, scale, huber) <= cost:
                     break
                 damping = max(10.0 * damping, 1e-4)
@@ -223,26 +231,27 @@ class _Descent(Generic[S]):
         scale: float,
         huber: float,
     ) -> tuple[Array, Array, float]:
-        distance = np.linalg.norm(residual, axis=1)
-        pull = np.minimum(1.0, huber * scale / np.maximum(distance, np.finfo(float).tiny))
-        root = np.sqrt(np.where(keep, pull, 0.0)) / scale
-        J = (jacobian * root[:, None, None]).reshape(-1, jacobian.shape[2])
-        gradient = J.T @ (residual * root[:, None]).ravel()
+        weight = np.where(keep, 1.0, 0.0)
+        if huber < np.inf:
+            distance = _lengths(residual)
+            weight *= np.minimum(1.0, huber * scale / np.maximum(distance, np.finfo(float).tiny))
+        J = jacobian.reshape(-1, jacobian.shape[2])
+        gradient = J.T @ (residual * weight[:, None]).ravel() / scale**2
         gradient += self.prior @ self.problem.deviation(state)
-        return J.T @ J + self.prior, gradient, self._cost(state, residual, keep, scale, huber)
+        information = _information(jacobian, weight) / scale**2 + self.prior
+        return information, gradient, self._cost(state, residual, keep, scale, huber)
 
     def _cost(
         self, state: S, residual: Array, keep: NDArray[np.bool_], scale: float, huber: float
     ) -> float:
-        distance = np.linalg.norm(residual[keep], axis=1) / scale
+        distance = _lengths(residual[keep]) / scale
         near = np.minimum(distance, huber)
         away = self.problem.deviation(state)
         return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
 
     def posterior(self, run: _Run[S], keep: NDArray[np.bool_], scale: float) -> Array:
         """Covariance (k, k) of the unknowns."""
-        J = run.jacobian[keep].reshape(-1, run.jacobian.shape[2]) / scale
-        information = J.T @ J + self.prior
+        information = _information(run.jacobian, keep) / scale**2 + self.prior
         unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         inverse = np.linalg.inv(information * np.outer(unit, unit))
         return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
@@ -252,7 +261,8 @@ class _Descent(Generic[S]):
         m, c, _ = run.jacobian.shape
         scale = self.robust_scale(run.residual, keep)
         J = run.jacobian
-        spread = J @ self.posterior(run, keep, scale) @ np.swapaxes(J, 1, 2)
+        JC = (J.reshape(m * c, -1) @ self.posterior(run, keep, scale)).reshape(J.shape)
+        spread = JC @ np.swapaxes(J, 1, 2)
         sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
@@ -261,6 +271,19 @@ class _Descent(Generic[S]):
         )
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep
+
+
+def _lengths(rows: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("mc,mc->m", rows, rows)))
+
+
+def _information(jacobian: Array, weight: NDArray[np.float64 | np.bool_]) -> Array:
+    """Normal matrix (k, k) of a Jacobian (m, c, k) whose samples have weights (m,)."""
+    used = jacobian
+    if not np.all(weight == 1.0):
+        used = jacobian * np.sqrt(weight)[:, None, None]
+    J = used.reshape(-1, jacobian.shape[2])
+    return np.asarray(J.T @ J)
 
 
 def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-8  # of the largest singular value, columns scaled to unit length
+_CLEAR = 1e-10  # squared singular value above which normal equations, being quicker, suffice
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,12 @@ class Observability:
 
 def observability(jacobian: Array) -> Observability:
     """Rank, condition and null space of a Jacobian (N, k)."""
-    length = np.linalg.norm(jacobian, axis=0)
+    length = np.sqrt(np.einsum("nk,nk->k", jacobian, jacobian))
     scale = np.where(length > 0.0, length, 1.0)
+    squared = np.linalg.eigvalsh((jacobian.T @ jacobian) / np.outer(scale, scale))
+    if squared[0] > _CLEAR * squared[-1]:
+        condition = float(np.sqrt(squared[-1] / squared[0]))
+        return Observability(len(scale), condition, np.empty((len(scale), 0)))
     triangle = np.linalg.qr(jacobian / scale, mode="r")
     _, s, Vt = np.linalg.svd(triangle)
     s = np.concatenate([s, np.zeros(Vt.shape[0] - len(s))])

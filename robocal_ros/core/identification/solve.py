@@ -187,8 +187,10 @@ def _solve(
     sigma = np.ones(len(data)) if data.sigma is None else data.sigma
     reach = float(np.linalg.norm(initial.T_flange_target[:, :3, 3], axis=1).mean())
     most = max(_ORIENTATION_SHARE * reach, _SHORTEST_LEVER_M)
-    unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm.mdh)
-    lever = _lever(unit.linearise(initial)[0] * sigma[:, None], 1.0, most)
+    lever = most
+    if data.rotation is not None:
+        unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm.mdh)
+        lever = _lever(unit.linearise(initial)[0] * sigma[:, None], 1.0, most)
     state = initial
     for _ in range(_LEVER_ROUNDS):
         problem = CellProblem(layout, data, initial.targets, sigma, lever, arm.mdh)
@@ -199,6 +201,8 @@ def _solve(
             noise_known=data.sigma is not None,
             robust=robust,
         )
+        if data.rotation is None:
+            break
         used = (estimate.residual * sigma[:, None])[~estimate.rejected]
         state, settled = estimate.state, _lever(used, lever, most)
         if abs(settled / lever - 1.0) < 0.1:
@@ -209,8 +213,6 @@ def _solve(
 
 def _lever(residual: Array, lever: float, most: float) -> float:
     """Length, m, by which a turn counts: ``most``, or the scatters' ratio where that is less."""
-    if residual.shape[1] == 3:
-        return most
     position = np.median(np.linalg.norm(residual[:, :3], axis=1))
     turn = np.median(np.linalg.norm(residual[:, 3:], axis=1)) / lever
     return float(min(most, max(position, 1e-9) / max(turn, 1e-9)))
@@ -228,11 +230,9 @@ def random_postures(arm: SerialArm, count: int = 60) -> Array:
 def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> tuple[str, ...]:
     """Model parameters whose effect base, targets or earlier parameters have at every posture."""
     q = random_postures(arm)
-    blocks = [
-        layout.jacobian(cell, q, np.full(len(q), t, dtype=np.int64))[1]
-        for t in range(len(cell.targets))
-    ]
-    J = np.vstack(blocks).reshape(-1, len(layout.names))
+    target = np.repeat(np.arange(len(cell.targets)), len(q))
+    J = layout.jacobian(cell, np.tile(q, (len(cell.targets), 1)), target)[1]
+    J = J.reshape(-1, len(layout.names))
     order = [*range(count, J.shape[1]), *range(count)]
     J = J[:, order] / np.linalg.norm(J[:, order], axis=0)
     dependent = np.abs(np.diag(np.linalg.qr(J, mode="r"))) < 1e-9
