@@ -66,8 +66,6 @@ def identify_files(arm: SerialArm, request: Request) -> Answer:
     """
     warnings: list[str] = []
     data = _read(request.data_file, arm, warnings)
-    base, tool = "base" in request.fit, "tool" in request.fit
-    require_match(arm, data, base=base, tool=tool, file=str(request.data_file))
     if request.check_file is None:
         held = hold_out(pose_groups(data.q), request.hold_out, request.seed)
         train, check = data.take(~held), data.take(held)
@@ -76,6 +74,8 @@ def identify_files(arm: SerialArm, request: Request) -> Answer:
         _require_other_data(train, check, request)
         _require_known_targets(train, check, request)
         warnings += _compared(train, check, request)
+    base, tool = "base" in request.fit, "tool" in request.fit
+    require_match(arm, data, base=base, tool=tool, file=str(request.data_file))
     judged = identify_and_judge(
         arm,
         train,

@@ -247,8 +247,8 @@ class ThermalSession:
                 prior_covariance=self.prior,
                 method=method,
             )
-        require_match(self.nominal, data, base=True, tool=True)
         held = hold_out(pose_groups(data.q), self.config.hold_out, self.config.seed)
+        require_match(self.nominal, data, base=True, tool=True)
         in_force = self.arm if self.in_force.model is not None else None
         return identify_and_judge(
             self.nominal, data.take(~held), data.take(held), method=method, in_force=in_force

@@ -1,0 +1,367 @@
+"""``robocal identify`` on tables: figures that hold, refusals that say why, exit status, JSON."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaign import NOISE_M, ROBOT, edited, measured, renamed, table, true_arm, with_rotations
+from command import conforms, robocal, robocal_json
+
+from robocal_ros.cli.main import main
+from robocal_ros.storage.robots import load_description, load_robot
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("tables")
+
+
+@pytest.fixture(scope="module")
+def data(folder: Path) -> Path:
+    return table(folder / "data.csv", measured(100))
+
+
+@pytest.fixture
+def identify(capsys: pytest.CaptureFixture[str]):
+    """Run the command in this process: exit status and its one document, checked."""
+
+    def run(*arguments: object, robot: str = ROBOT):
+        command = ["identify", "--robot", robot, *map(str, arguments), "--json"]
+        status = main(command)
+        document = json.loads(capsys.readouterr().out)
+        conforms(document, "identify.json")
+        if status:
+            conforms(document, "error.json")
+        return status, document
+
+    return run
+
+
+class TestAnswer:
+    def test_held_out_figures_are_those_of_fresh_poses(self, data: Path, identify) -> None:
+        """The judged error is what 400 poses that nobody measured see, noise added."""
+        status, document = identify("--data", data)
+        assert status == 0
+        assert document["verdict"] == document["verdict"] | {"accept": True, "code": "ACCEPT"}
+        assert document["data"]["train"] + document["data"]["check"] == 100
+        assert document["nominal"] == document["in_force"]
+        held_out = document["calibrated"]["held_out"]
+        assert held_out["n"] == document["data"]["check"] == 50
+        fresh = measured(400, 77)
+        nominal = load_robot(ROBOT)
+        found = [row["value"] for row in document["parameters"].values()]
+        chosen = nominal.parameters
+        arm = nominal.with_mdh(
+            chosen.add(nominal.mdh, np.array(found) / chosen.to_display - chosen.read(nominal.mdh))
+        )
+        base, ball = document["T_frame_base"], document["T_flange_target"]["ball"]
+        error = np.linalg.norm(_predicted(arm, base, ball, fresh.q) - fresh.position, axis=1) * 1e3
+        rms = float(np.sqrt(np.mean(error**2)))
+        assert held_out["rms_mm"] == pytest.approx(rms, rel=0.2)  # 50 held-out poses: 8 %
+        assert document["calibrated"]["predicted"]["total_rms_mm"] == pytest.approx(rms, rel=0.2)
+        assert document["noise_mm"] == pytest.approx(NOISE_M * 1e3, rel=0.2)
+        assert document["nominal"]["held_out"]["rms_mm"] > 5 * rms
+
+    def test_the_whole_command_and_its_one_document(self, data: Path) -> None:
+        document = robocal_json("identify.json", "identify", "--robot", ROBOT, "--data", data)
+        assert document["verdict"]["accept"]
+        assert (document["rank"], document["unknowns"]) == (27, 33)
+        assert len(document["unobservable"]) == 6
+
+    def test_people_read_the_verdict_first(self, data: Path) -> None:
+        done = robocal("identify", "--robot", ROBOT, "--data", data)
+        assert done.returncode == 0
+        first = done.stdout.splitlines()[0]
+        assert first.startswith("ACCEPT: held-out mean 0.0")
+        assert "at 50 measurements not used to solve" in first
+        assert "theta3_deg" in done.stdout
+        assert "Not seen in the data, left to the prior" in done.stdout
+
+    def test_the_same_seed_gives_the_same_document(self, data: Path, identify) -> None:
+        once, again = (identify("--data", data, "--seed", 5)[1] for _ in range(2))
+        assert once == again
+        _, other = identify("--data", data, "--seed", 6)
+        assert other["calibrated"] != once["calibrated"]
+        assert once["data"]["seed"] == 5
+
+    def test_share_and_groups(self, folder: Path, identify) -> None:
+        """Three visits of each pose stay on one side."""
+        one = measured(30, 4)
+        q = np.tile(one.q, (3, 1))
+        path = table(folder / "visits.csv", measured(90, 4, q=q))
+        _, document = identify("--data", path, "--hold-out", "0.3")
+        assert document["data"] == document["data"] | {"hold_out": 0.3, "train": 63, "check": 27}
+
+    def test_check_file(self, data: Path, folder: Path, identify) -> None:
+        check = table(folder / "check.csv", measured(60, 9))
+        status, document = identify("--data", data, "--check", check)
+        assert status == 0
+        assert document["verdict"]["accept"]
+        assert document["calibrated"]["held_out"]["n"] == 60
+        assert document["data"]["train"] == 100
+        assert document["data"]["hold_out"] is None
+
+    def test_check_in_another_set_up(self, data: Path, folder: Path, identify) -> None:
+        """The device moved and another target hangs on the flange."""
+        moved = measured(60, 9, place=(-1.0, 0.5, 0.2), targets=("peg",))
+        check = table(folder / "moved.csv", moved)
+        status, document = identify("--data", data, "--check", check, "--check-refit", "base,tool")
+        assert status == 0
+        assert document["verdict"]["accept"]
+        assert document["calibrated"]["held_out"]["mean_mm"] < 0.12
+        status, document = identify("--data", data, "--check", check)
+        assert status == 2
+        assert "target 'peg' is not in" in document["error"]["message"]
+        assert document["error"]["file"] == str(check)
+        assert "--check-refit" in document["error"]["message"]
+
+    def test_another_set_up_unsaid_is_no_calibration_error(
+        self, data: Path, folder: Path, identify
+    ) -> None:
+        check = table(folder / "aside.csv", measured(60, 9, place=(-1.0, 0.5, 0.2)))
+        status, document = identify("--data", data, "--check", check)
+        assert status == 0
+        assert document["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
+        assert any("--check-refit base,tool" in words for words in document["warnings"])
+
+    def test_several_targets_and_sigma(self, folder: Path, identify) -> None:
+        two = measured(120, 3, targets=("ball", "peg"))
+        two = replace(two, sigma=np.full(len(two), NOISE_M))
+        _, document = identify("--data", table(folder / "two.csv", two))
+        assert set(document["T_flange_target"]) == {"ball", "peg"}
+        assert document["verdict"]["accept"]
+        assert document["noise_mm"] == pytest.approx(NOISE_M * 1e3)
+
+    def test_an_outlier_is_named(self, data: Path, folder: Path, identify) -> None:
+        clean = measured(100)
+        position = clean.position.copy()
+        position[[7, 30]] += [0.0, 0.0, 2e-3]
+        path = table(folder / "outlier.csv", replace(clean, position=position))
+        check = table(folder / "clean.csv", measured(60, 9))
+        _, document = identify("--data", path, "--check", check)
+        assert document["rejected"] == ["1-7", "1-30"]
+        assert document["verdict"]["accept"]
+        _, without = identify("--data", data, "--check", check)
+        gained = document["calibrated"]["held_out"]["rms_mm"]
+        assert gained == pytest.approx(without["calibrated"]["held_out"]["rms_mm"], rel=0.05)
+
+    def test_least_squares_names_what_it_holds(self, data: Path, identify) -> None:
+        _, document = identify("--data", data, "--method", "lsq")
+        assert document["method"] == "lsq"
+        assert len(document["held"]) == 6
+        assert all(document["parameters"][name]["sigma"] is None for name in document["held"])
+        assert document["verdict"]["accept"]
+
+    def test_without_geometry_nothing_can_be_gained(self, data: Path, identify) -> None:
+        status, document = identify("--data", data, "--fit", "base,tool")
+        assert status == 0
+        assert document["verdict"]["code"] == "NO_SIGNIFICANT_GAIN"
+        assert "geometry stays" in document["verdict"]["reason"]
+        assert document["calibrated"]["held_out"] == document["nominal"]["held_out"]
+        assert all(row["sigma"] is None for row in document["parameters"].values())
+
+    def test_a_good_model_is_not_replaced_by_chance(self, folder: Path, identify) -> None:
+        nominal = load_robot(ROBOT)
+        path = table(folder / "nominal.csv", measured(60, 2, arm=nominal))
+        status, document = identify("--data", path)
+        assert status == 0
+        assert document["verdict"]["code"] in ("WORSE_THAN_CURRENT", "NO_SIGNIFICANT_GAIN")
+
+    def test_a_joint_that_never_moved(self, folder: Path, identify) -> None:
+        still = measured(80, 6)
+        q = still.q.copy()
+        q[:, 2] = 0.4
+        path = table(folder / "still.csv", measured(80, 6, q=q))
+        _, document = identify("--data", path)
+        assert document["verdict"]["code"] == "POSES_NOT_INFORMATIVE"
+        status, document = identify("--data", path, "--method", "lsq")
+        assert status == 3
+        assert document["error"]["code"] == "RANK_DEFICIENT"
+        assert "joint_a3 moves only 0 deg" in document["error"]["message"]
+        assert document["unobservable"]
+
+    def test_orientations_in_one_file_only(self, data: Path, folder: Path, identify) -> None:
+        turned = with_rotations(measured(40, 9), true_arm())
+        check = table(folder / "turned.csv", turned)
+        status, document = identify("--data", data, "--check", check)
+        assert (status, document["verdict"]["code"]) == (0, "ACCEPT")
+        assert any("has orientations" in words for words in document["warnings"])
+        status, document = identify("--data", check, "--check", data)
+        assert (status, document["verdict"]["code"]) == (0, "ACCEPT")
+
+    def test_readings_beyond_the_limits_are_told(self, folder: Path, identify) -> None:
+        beyond = measured(60)
+        q = beyond.q.copy()
+        q[3, 1] = 0.1
+        path = table(folder / "beyond.csv", measured(60, q=q))
+        _, document = identify("--data", path)
+        (words,) = document["warnings"]
+        assert "joint 2 (joint_a2): 1 of 60 readings beyond -140" in words
+
+
+class TestOutput:
+    def test_an_accepted_model_is_a_robot_file(self, data: Path, folder: Path, identify) -> None:
+        path = folder / "model.yaml"
+        _, document = identify("--data", data, "--output", path)
+        assert document["output"] == str(path)
+        written = load_description(path)
+        nominal = load_description(ROBOT)
+        shown = written.arm.parameters.read(written.arm.mdh) * written.arm.parameters.to_display
+        values = [row["value"] for row in document["parameters"].values()]
+        np.testing.assert_allclose(shown, values, rtol=1e-12, atol=1e-12)
+        np.testing.assert_array_equal(written.arm.lower, nominal.arm.lower)
+        text = path.read_text()
+        assert text.startswith("# Identified by robocal")
+        assert "# ACCEPT: held-out mean" in text
+        assert nominal.arm.model_hash in text
+
+    def test_a_refused_model_is_not_written(self, folder: Path, identify) -> None:
+        nominal = load_robot(ROBOT)
+        source = table(folder / "same.csv", measured(60, 2, arm=nominal))
+        path = folder / "refused.yaml"
+        status, document = identify("--data", source, "--output", path)
+        assert status == 0
+        assert document["output"] is None
+        assert not path.exists()
+        assert any("is not written: the verdict is" in words for words in document["warnings"])
+
+    def test_no_folder_for_it(self, data: Path, folder: Path, identify) -> None:
+        status, document = identify("--data", data, "--output", folder / "no" / "m.yaml")
+        assert status == 2
+        assert document["error"]["file"] == str(folder / "no")
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            (("--check", "x.csv", "--hold-out", "0.5"), "not allowed with"),
+            (("--check-refit", "base,tool"), "give them with --check"),
+            (("--check", "x.csv", "--seed", "1"), "--seed chooses what is held out"),
+            (("--check", "x.csv", "--check-refit", "geometry"), "only base and tool"),
+            (("--fit", "base,wrist"), "'wrist' is not one of base, tool, geometry"),
+            (("--fit", "base,base"), "names a part twice"),
+            (("--fit", ""), "is not one of"),
+            (("--method", "magic"), "invalid choice: 'magic'"),
+            (("--hold-out", "1"), "not a share between 0 and 1"),
+            (("--hold-out", "nan"), "not a share between 0 and 1"),
+            (("--seed", "-1"), "not a whole number from 0"),
+        ],
+    )
+    def test_options_without_sense(self, data: Path, identify, options, words) -> None:
+        status, document = identify("--data", data, *options)
+        assert status == 2
+        assert document["error"]["code"] == "BAD_INPUT"
+        assert words in document["error"]["message"]
+
+    def test_files(self, data: Path, folder: Path, identify) -> None:
+        for path, words in (
+            (folder / "none.csv", "no such table"),
+            (folder, "directory"),
+        ):
+            status, document = identify("--data", path)
+            assert status == 2
+            assert words in document["error"]["message"].lower()
+            assert document["error"]["file"] == str(path)
+        status, document = identify("--data", data, robot="no_such_robot")
+        assert status == 2
+        assert "ur10" in document["error"]["message"]
+
+    def test_robot_of_another_joint_count(self, data: Path, identify) -> None:
+        status, document = identify("--data", data, robot="p1r2p3")
+        assert status == 2
+        assert document["error"]["row"] == 1
+        assert document["error"]["column"].startswith("q")
+
+    def test_bad_cell_is_named(self, data: Path, identify) -> None:
+        path = edited(data, "y_mm", lambda cell: "nan" if cell.startswith("-") else cell)
+        status, document = identify("--data", path)
+        assert status == 2
+        assert document["error"]["column"] == "y_mm"
+        assert document["error"]["row"] >= 2
+        assert document["error"]["file"] == str(path)
+
+    @pytest.mark.parametrize(
+        ("spoil", "words"),
+        [
+            (lambda p: renamed(p, x_mm="x_m", y_mm="y_m", z_mm="z_m"), "1000 times too large"),
+            (lambda p: edited(p, "y_mm", lambda y: str(-float(y))), "left-handed"),
+            (lambda p: renamed(p, q2_deg="q3_deg", q3_deg="q2_deg"), "joints 2 and 3 are swapped"),
+            (lambda p: renamed(p, x_mm="y_mm", y_mm="x_mm"), "left-handed"),
+            (lambda p: edited(p, "q4_deg", lambda q: str(-float(q))), "joint 4 (joint_a4) counts"),
+            (
+                lambda p: renamed(p, **{f"q{i}_deg": f"q{i}_rad" for i in range(1, 7)}),
+                "degrees given as radians",
+            ),
+        ],
+    )
+    def test_mistakes_are_named(self, data: Path, identify, spoil, words) -> None:
+        path = spoil(data)
+        status, document = identify("--data", path)
+        assert status == 2
+        assert document["error"]["code"] == "BAD_INPUT"
+        assert words in document["error"]["message"]
+        assert document["error"]["file"] == str(path)
+
+    def test_check_data_in_another_unit(self, data: Path, folder: Path, identify) -> None:
+        check = renamed(
+            table(folder / "metres.csv", measured(50, 8)), x_mm="x_m", y_mm="y_m", z_mm="z_m"
+        )
+        for refit in ((), ("--check-refit", "base,tool")):
+            status, document = identify("--data", data, "--check", check, *refit)
+            assert status == 2
+            assert "1000 times too large" in document["error"]["message"]
+            assert document["error"]["file"] == str(check)
+
+    def test_check_data_that_were_used_to_solve(self, data: Path, folder: Path, identify) -> None:
+        both = measured(100).take(np.arange(10))
+        status, document = identify("--data", data, "--check", table(folder / "s.csv", both))
+        assert status == 2
+        assert "10 of 10 measurements are in" in document["error"]["message"]
+
+    def test_the_same_poses_measured_again_are_told(
+        self, data: Path, folder: Path, identify
+    ) -> None:
+        again = measured(100, 12, q=measured(100).q)
+        status, document = identify("--data", data, "--check", table(folder / "a.csv", again))
+        assert status == 0
+        assert any("100 of 100 check measurements are at poses" in w for w in document["warnings"])
+
+
+class TestTooLittle:
+    def test_too_few_rows(self, folder: Path, identify) -> None:
+        path = table(folder / "few.csv", measured(6))
+        status, document = identify("--data", path)
+        assert status == 3
+        assert document["error"]["code"] == "TOO_FEW_SAMPLES"
+
+    def test_one_row(self, folder: Path, identify) -> None:
+        status, document = identify("--data", table(folder / "row.csv", measured(1)))
+        assert (status, document["error"]["code"]) == (3, "TOO_FEW_SAMPLES")
+
+    def test_too_few_poses_to_judge_carry_their_figures(self, folder: Path, identify) -> None:
+        path = table(folder / "scarce.csv", measured(16))
+        status, document = identify("--data", path, "--hold-out", "0.2")
+        assert status == 3
+        assert document["error"]["code"] == document["verdict"]["code"] == "TOO_FEW_SAMPLES"
+        assert document["calibrated"]["held_out"]["n"] == 3
+
+    def test_all_rows_at_one_pose(self, folder: Path, identify) -> None:
+        q = np.tile(measured(1).q, (40, 1))
+        path = table(folder / "one.csv", measured(40, q=q))
+        status, document = identify("--data", path)
+        assert (status, document["error"]["code"]) == (3, "TOO_FEW_SAMPLES")
+        assert "1 distinct pose" in document["error"]["message"]
+        check = table(folder / "fine.csv", measured(40, 8))
+        status, document = identify("--data", path, "--check", check)
+        assert (status, document["error"]["code"]) == (3, "RANK_DEFICIENT")
+
+
+def _predicted(arm, base, ball, q):
+    from robocal_ros.core import frames
+
+    T = frames.transform_from_quat(np.array(base["xyz_mm"]) * 1e-3, np.array(base["quat_xyzw"]))
+    point = np.append(np.array(ball["xyz_mm"]) * 1e-3, 1.0)
+    return (T @ arm.fk(q) @ point)[:, :3]
