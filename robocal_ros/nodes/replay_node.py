@@ -1,11 +1,13 @@
 """Plays a bag into the graph with /clock, and reports what was not received (docs/replay.md)."""
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
@@ -20,12 +22,14 @@ from robocal_ros.nodes.parameters import Setting
 from robocal_ros.nodes.replay_topics import CLOCK, ReplayTopics, chosen_topics
 from robocal_ros.nodes.run import run
 from robocal_ros.storage.bags import BagMessage, BagReader
+from robocal_ros.storage.places import share_folders
 
 TICK_S = 0.002
 BATCH = 200
 STATUS_S = 1.0
 PATIENCE_S = 0.05  # a tick waits at most so long for acknowledgements
 EXIT_LOSS = 3
+DDS_PROFILE = "replay_dds.xml"
 
 WAITING, PLAYING, PAUSED, DONE, FAILED = "waiting", "playing", "paused", "done", "failed"
 
@@ -179,6 +183,7 @@ class ReplayNode(HouseNode):
         if self.settings["exit_at_end"]:
             topics = self._topics
             lost = state == FAILED or (topics is not None and topics.unacknowledged > 0)
+            self._status.wait_for_all_acked(Duration(seconds=1))
             raise SystemExit(EXIT_LOSS if lost else 0)
 
     # ---- services and status --------------------------------------------------------------------
@@ -232,6 +237,15 @@ class ReplayNode(HouseNode):
         return health
 
 
+def ask_for_acknowledgements() -> None:
+    """Make Fast DDS ask for them every few ms; by default a batch would take up to 3 s."""
+    for folder in share_folders("robocal_ros", "config", "config"):
+        if (folder / DDS_PROFILE).is_file():
+            os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(folder / DDS_PROFILE))
+            return
+
+
 def main() -> None:
     """Run the node."""
+    ask_for_acknowledgements()
     run(ReplayNode)

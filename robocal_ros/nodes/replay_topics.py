@@ -26,7 +26,7 @@ class Played:
     publisher: Any
     sent: int = 0
     unheard: int = 0
-    untracked: set[str] = field(default_factory=set)
+    untracked: dict[tuple[int, ...], str] = field(default_factory=dict)  # name by endpoint
 
 
 class ReplayTopics:
@@ -92,7 +92,7 @@ class ReplayTopics:
         for played in self.played.values():
             infos = self._node.get_subscriptions_info_by_topic(played.publisher.topic_name)
             played.untracked |= {
-                f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+                tuple(info.endpoint_gid): f"{info.node_namespace.rstrip('/')}/{info.node_name}"
                 for info in infos
                 if info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
             }
@@ -115,7 +115,9 @@ class ReplayTopics:
             "sent": {p.topic: p.sent for p in played},
             "unheard": [p.topic for p in played if not p.publisher.get_subscription_count()],
             "unacknowledged": self.unacknowledged,
-            "best_effort": {p.topic: sorted(p.untracked) for p in played if p.untracked},
+            "best_effort": {
+                p.topic: sorted(set(p.untracked.values())) for p in played if p.untracked
+            },
             "skipped": self.skipped,
         }
 

@@ -24,6 +24,9 @@ from rclpy.qos import QoSProfile
 from robocal_ros.nodes import qos
 
 ROOT = Path(__file__).parent.parent.parent
+# For the helper modules beside the tests.
+sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "test" / "sessions")]
+
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 # Domains whose ports lie below those that Linux hands out to any program.
 DOMAINS = range(1, 102)
@@ -88,6 +91,7 @@ class Graph:
 
     def __init__(self, domain: int, state: Path) -> None:
         self.domain = domain
+        self.state = state
         self.context = Context()
         rclpy.init(args=[], context=self.context, domain_id=domain)
         self.probe = Node("probe", context=self.context, start_parameter_services=False)

@@ -1,0 +1,123 @@
+"""The simulated shift as ROS messages, and a probe that drives the thermal node with it."""
+
+import json
+from collections.abc import Iterable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from robocal_msgs.msg import CalibrationQuality, KinematicModel, SessionEvent
+from robocal_msgs.srv import CaptureReference, Decide, Identify, ListCalibrations
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.samples import JointSample, PointSample
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.conversions import time_message
+from robocal_ros.nodes.thermal_node import EVENTS
+
+KEEP_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
+DEEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED_EVENTS = QoSProfile(
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+TOPICS = {"joint_states": JointState, "measured_point": PointStamped}
+LOSSLESS = {
+    f"qos_overrides./{topic}.subscription.{policy}": value
+    for topic in TOPICS
+    for policy, value in (("reliability", "reliable"), ("history", "keep_all"))
+}
+SERVICES = {
+    "capture_reference": CaptureReference,
+    "identify": Identify,
+    "accept": Decide,
+    "reject": Decide,
+    "rollback": Decide,
+    "list": ListCalibrations,
+}
+
+
+def message_of(sample: JointSample | PointSample) -> JointState | PointStamped:
+    if isinstance(sample, JointSample):
+        message = JointState(name=list(sample.names), position=sample.position)
+    else:
+        message = PointStamped()
+        message.header.frame_id = f"{sample.frame}/{sample.target}"
+        message.point.x, message.point.y, message.point.z = sample.position_m.tolist()
+    message.header.stamp = time_message(sample.stamp_ns)
+    return message
+
+
+class Cell:
+    """A thermal node as its own process, and everything it says."""
+
+    def __init__(self, graph: Any, serial: str = "s1", **parameters: Any) -> None:
+        self.graph = graph
+        self.serial = serial
+        self.parameters = {"serial": serial, "command_timeout_s": 0.3} | LOSSLESS | parameters
+        self.events = graph.collect(SessionEvent, "/thermal_node/session_events", EVENTS)
+        self.models = graph.collect(KinematicModel, "/thermal_node/model", qos.LATCHED)
+        self.candidates = graph.collect(KinematicModel, "/thermal_node/candidate", qos.LATCHED)
+        self.qualities = graph.collect(CalibrationQuality, "/thermal_node/quality", qos.LATCHED)
+        self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
+        probe = graph.probe
+        self.joints = probe.create_publisher(JointState, "/joint_states", DEEP)
+        self.points = probe.create_publisher(PointStamped, "/measured_point", DEEP)
+        self.poses = probe.create_publisher(PoseStamped, "/measured_pose", DEEP)
+        self.clients = {
+            name: probe.create_client(kind, f"/thermal_node/{name}")
+            for name, kind in SERVICES.items()
+        } | {
+            f"{name}_trigger": probe.create_client(Trigger, f"/thermal_node/{name}_trigger")
+            for name in SERVICES
+        }
+        self.sent = 0
+        self.process = self.start()
+
+    def start(self) -> Any:
+        """Start the executable and wait until it is all there."""
+        self.models.clear()
+        self.sent = 0
+        process = self.graph.start("thermal_node", self.parameters)
+        publishers = (self.joints, self.points, self.poses)
+        self.graph.spin_until(
+            lambda: (
+                self.models
+                and all(p.get_subscription_count() for p in publishers)
+                and all(c.service_is_ready() for c in self.clients.values())
+            ),
+            "the thermal node is there",
+        )
+        return process
+
+    def call(self, name: str, **fields: Any) -> Any:
+        client = self.clients[name]
+        future = client.call_async(client.srv_type.Request(**fields))
+        self.graph.spin_until(future.done, f"{name} answers")
+        return future.result()
+
+    def play(self, samples: Iterable[Any]) -> None:
+        """Publish as fast as it goes; nothing is lost, the node keeps all."""
+        for sample in samples:
+            publisher = self.joints if isinstance(sample, JointSample) else self.points
+            publisher.publish(message_of(sample))
+            self.sent += isinstance(sample, JointSample)
+        self.graph.spin_until(
+            lambda: self.value("joint_states received") == str(self.sent), "all joints taken"
+        )
+
+    def status(self) -> Any:
+        """The node's last diagnostic status, None before the first."""
+        mine = [s for a in self.diagnostics for s in a.status if s.name == "thermal_node"]
+        return mine[-1] if mine else None
+
+    def value(self, key: str) -> str:
+        status = self.status()
+        return "" if status is None else {v.key: v.value for v in status.values}.get(key, "")
+
+
+def outcomes(events: Iterable[SessionEvent]) -> list[tuple[str, dict[str, Any]]]:
+    return [(e.command, json.loads(e.outcome)) for e in events if e.command != "configure"]

@@ -1,0 +1,163 @@
+"""A bag through the replay node, over real DDS."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cell import KEEP_ALL
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.conversions import time_message
+from robocal_ros.nodes.replay_topics import chosen_topics
+from robocal_ros.storage.bags import BagWriter
+
+NS = 1_000_000_000
+START_NS = 100 * NS
+BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def write_bag(path: Path, count: int, period_ns: int) -> Path:
+    with BagWriter(path) as bag:
+        for i in range(count):
+            ns = START_NS + i * period_ns
+            joints = JointState(name=["a"], position=[float(i)])
+            joints.header.stamp = time_message(ns)
+            bag.write("/joint_states", "sensor_msgs/msg/JointState", joints, ns)
+            if i % 10 == 0:
+                bag.write("/note", "std_msgs/msg/String", {"data": str(i)}, ns)
+        event = {"command": "configure", "arguments": "{}", "outcome": "{}"}
+        bag.write("/n/session_events", "robocal_msgs/msg/SessionEvent", event, ns)
+        bag.write("/odd", "std_msgs/msg/String", {"data": "odd"}, ns)
+    return path
+
+
+class Listener:
+    """The replay node's status, and what the probe got of the bag."""
+
+    def __init__(self, graph: Any, profile: QoSProfile = KEEP_ALL) -> None:
+        self.graph = graph
+        self.joints = graph.collect(JointState, "/joint_states", profile)
+        self.notes = graph.collect(String, "/note", KEEP_ALL)
+        self.events = graph.collect(String, "/n/session_events", KEEP_ALL)
+        self.clock = graph.collect(Clock, "/clock", BEST_EFFORT)
+        self.reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+
+    @property
+    def status(self) -> dict[str, Any]:
+        return json.loads(self.reports[-1].data) if self.reports else {"state": ""}
+
+    def until(self, state: str) -> None:
+        self.graph.spin_until(lambda: self.status["state"] == state, f"state {state}")
+
+
+WAIT = {"wait_for_subscribers": "[/joint_states,/note]"}
+
+
+def test_everything_arrives_as_fast_as_it_is_acknowledged(graph, tmp_path):
+    count = 4000
+    bag = write_bag(tmp_path / "shift.mcap", count, 1_000_000)
+    listener = Listener(graph)
+    process = graph.start("replay_node", {"bag": bag, "rate": 0.0, "exit_at_end": True} | WAIT)
+    listener.until("done")
+    graph.spin_until(lambda: len(listener.joints) == count, "all joint states")
+    assert [m.position[0] for m in listener.joints] == list(range(count))
+    assert len(listener.notes) == count // 10
+    assert process.process.wait(10) == 0
+    status = listener.status
+    assert status["sent"]["/joint_states"] == count
+    assert status["unacknowledged"] == 0
+    assert status["best_effort"] == {}
+    assert "/n/session_events" in status["skipped"]
+    assert listener.events == []
+
+
+def test_recorded_time_goes_at_its_rate_and_is_the_clock(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 100, 10_000_000)  # one second
+    listener = Listener(graph)
+    graph.start("replay_node", {"bag": bag, "rate": 2.0} | WAIT)
+    listener.until("playing")
+    begin = graph.probe.get_clock().now().nanoseconds
+    listener.until("done")
+    took_s = (graph.probe.get_clock().now().nanoseconds - begin) * 1e-9
+    assert 0.35 < took_s < 2.0
+    times = [m.clock.sec * NS + m.clock.nanosec for m in listener.clock]
+    assert np.all(np.diff(times) >= 0)
+    assert times[0] >= START_NS
+    assert times[-1] == START_NS + 99 * 10_000_000
+    assert len(times) > 50  # between the messages too
+
+
+def test_a_best_effort_subscriber_is_named(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 100, 1_000_000)
+    listener = Listener(graph, BEST_EFFORT)
+    graph.start("replay_node", {"bag": bag, "rate": 0.0} | WAIT)
+    listener.until("done")
+    named = {"/joint_states": ["/probe"]}  # a name may come after its endpoint
+    graph.spin_until(lambda: listener.status["best_effort"] == named, "the subscriber's name")
+    assert "/odd" in listener.status["unheard"]
+
+
+def test_topics_are_chosen_and_renamed(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 10, 1_000_000)
+    listener = Listener(graph)
+    graph.start(
+        "replay_node",
+        {
+            "bag": bag,
+            "rate": 0.0,
+            "topics": "[/odd]",
+            "remap": "['/odd:=/note']",
+            "wait_for_subscribers": "[/note]",
+        },
+    )
+    listener.until("done")
+    graph.spin_until(lambda: listener.notes, "the renamed topic")
+    assert [m.data for m in listener.notes] == ["odd"]
+    assert listener.joints == []
+
+
+def test_it_pauses_and_goes_on(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 200, 10_000_000)
+    listener = Listener(graph)
+    graph.start("replay_node", {"bag": bag, "rate": 4.0, "start_paused": True} | WAIT)
+    listener.until("paused")
+    graph.spin_for(0.2)
+    assert listener.joints == []
+    assert graph.call(Trigger, "/replay_node/play").message == "playing"
+    graph.spin_until(lambda: len(listener.joints) > 20, "it plays")
+    assert graph.call(Trigger, "/replay_node/pause").message == "paused"
+    graph.spin_for(0.1)
+    count = len(listener.joints)
+    graph.spin_for(0.3)
+    assert len(listener.joints) == count < 200
+    graph.call(Trigger, "/replay_node/play")
+    listener.until("done")
+    graph.spin_until(lambda: len(listener.joints) == 200, "the rest")
+    refused = graph.call(Trigger, "/replay_node/play")
+    assert not refused.success
+    assert "done" in refused.message
+
+
+def test_a_bag_that_is_none_is_said(graph, tmp_path):
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"not a bag")
+    process = graph.start("replay_node", {"bag": broken})
+    graph.spin_until(lambda: "cannot configure" in process.output, "the fault is logged")
+    assert process.process.poll() is None
+    assert "broken.mcap" in process.output
+
+
+def test_wrong_choices_are_named():
+    recorded = {"/a": "std_msgs/msg/String"}
+    with pytest.raises(InputError, match=r"no topic /b; it has /a"):
+        chosen_topics(recorded, ["/b"], [])
+    with pytest.raises(InputError, match="recorded:=played"):
+        chosen_topics(recorded, [], ["/a=/b"])
