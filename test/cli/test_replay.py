@@ -1,0 +1,384 @@
+"""``robocal replay`` on bags: the live session's results, windows, --auto, and bad recordings."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from campaign import ROBOT, postures, true_arm
+from command import conforms, environment, robocal, robocal_json
+from recordings import (
+    EVENTS,
+    JOINTS,
+    NS,
+    POINT,
+    POSES,
+    START_NS,
+    TYPES,
+    plain_bag,
+    recorded_bag,
+    shift,
+    visit,
+    write_samples,
+)
+
+from robocal_ros.cli.main import main
+from robocal_ros.core.samples import JointSample
+from robocal_ros.storage.bag_writer import ros_time
+from robocal_ros.storage.bags import BagWriter, read_bag
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("bags")
+
+
+@pytest.fixture(scope="module")
+def visits():
+    return shift()
+
+
+@pytest.fixture(scope="module")
+def plain(folder: Path, visits) -> Path:
+    return plain_bag(folder / "plain.mcap", visits)
+
+
+@pytest.fixture(scope="module")
+def live(folder: Path, visits) -> tuple[Path, list[dict[str, Any]]]:
+    path = folder / "live.mcap"
+    return path, recorded_bag(path, folder / "live_state", visits)
+
+
+@pytest.fixture
+def replay(capsys: pytest.CaptureFixture[str]):
+    """Run the command in this process: exit status and its one document, checked."""
+
+    def run(*arguments: object) -> tuple[int, Any]:
+        status = main(["replay", *map(str, arguments), "--json"])
+        document = json.loads(capsys.readouterr().out)
+        conforms(document, "replay.json")
+        if status:
+            conforms(document, "error.json")
+        return status, document
+
+    return run
+
+
+def identified(candidate: dict[str, Any]) -> dict[str, Any]:
+    """The identification alone, without when and in which cycle."""
+    return {k: v for k, v in candidate.items() if k not in ("stamp", "stamp_ns", "cycle_id")}
+
+
+class TestRecordedSession:
+    def test_results_are_the_live_ones_bit_for_bit(self, live, replay) -> None:
+        path, documents = live
+        status, document = replay(path)
+        assert status == 0
+        assert document["recorded"] is True
+        assert document["differs"] == []
+        assert len(documents) == 2
+        assert [{k: v for k, v in c.items() if k != "stamp"} for c in document["candidates"]] == (
+            json.loads(json.dumps(documents))
+        )
+        assert [c["cycle_id"] for c in document["candidates"]] == ["one", "two"]
+        (accepted,) = document["accepted"]
+        assert accepted == accepted | {
+            "revision": 1, "candidate": 0, "by": "cell", "reason": "better"
+        }  # fmt: skip
+        assert document["final_model"]["revision"] == 1
+        names = [entry["command"] for entry in document["commands"]]
+        assert names == ["capture_reference", "identify", "accept", "identify"]
+        assert document["ignored"] == {}
+
+    def test_people_are_told_that_it_is_equal(self, live) -> None:
+        done = robocal("replay", live[0])
+        assert done.returncode == 0
+        assert "Every recorded result comes out equal, bit for bit" in done.stdout
+        assert "ACCEPT" in done.stdout
+        assert done.stderr == ""
+
+    def test_a_changed_sample_is_noticed(self, live, visits, folder: Path, replay) -> None:
+        """One measurement of the first warm cycle differs by a micrometre from what was live."""
+        path = folder / "changed.mcap"
+        with BagWriter(path) as bag:
+            for recorded in read_bag(live[0]):
+                message = recorded.message
+                stamp = recorded.log_time_ns
+                if recorded.topic == POINT and stamp > START_NS + (POSES + 4) * NS:
+                    message.point.x += 1e-6 if stamp < START_NS + (POSES + 5) * NS else 0.0
+                bag.write(recorded.topic, recorded.msgtype, message, stamp)
+        status, document = replay(path)
+        assert status == 0
+        assert any(words.startswith("identify") for words in document["differs"])
+
+    def test_other_robot_is_refused(self, live, replay) -> None:
+        status, document = replay(live[0], "--robot", "ur10")
+        assert status == 2
+        assert document["error"]["code"] == "WRONG_ROBOT"
+        assert "UR10" in document["error"]["message"]
+        status, document = replay(live[0], "--robot", ROBOT)
+        assert (status, document["differs"]) == (0, [])
+
+    def test_a_recording_that_begins_late_starts_from_what_was_in_force(
+        self, live, folder: Path, replay
+    ) -> None:
+        """Only what came after the acceptance, and the latched configuration of that time."""
+        late_ns = START_NS + 2 * (POSES + 4) * NS + NS // 7
+        path = folder / "late.mcap"
+        state = folder / "late_state"
+        _, whole = replay(live[0], "--state", state)
+        with CalibrationHistory.open("live", state_dir=state) as history:
+            model, reference = history.head().model, history.head("reference").model
+        with BagWriter(path) as bag:
+            for recorded in read_bag(live[0]):
+                message, stamp = recorded.message, recorded.log_time_ns
+                if recorded.topic == EVENTS and message.command == "configure":
+                    record = json.loads(message.arguments)
+                    record["arguments"] |= {"model": model, "reference": reference}
+                    message.arguments = json.dumps(record)
+                    bag.write(recorded.topic, recorded.msgtype, message, late_ns)
+                elif stamp >= late_ns:
+                    bag.write(recorded.topic, recorded.msgtype, message, stamp)
+        status, document = replay(path)
+        assert status == 0
+        assert document["differs"] == []
+        (candidate,) = document["candidates"]
+        assert candidate == whole["candidates"][1]
+
+    def test_kept_history(self, live, folder: Path, replay) -> None:
+        state = folder / "kept"
+        replay(live[0], "--state", state)
+        listed = robocal_json("history.list.json", "history", "list", "--state", state)
+        states = {entry["kind"]: entry["state"] for entry in listed["calibrations"][::-1][:2]}
+        assert states == {"reference": "in_force", "thermal": "in_force"}
+        times = [entry["stamp_ns"] for entry in listed["calibrations"]]
+        assert min(times) > START_NS
+
+    def test_windows_instead_of_the_recorded_commands(self, live, replay) -> None:
+        second = POSES + 4
+        status, document = replay(live[0], "--cold", "0:9", "--warm", f"{second - 1}:{second + 9}")
+        assert status == 0
+        assert document["recorded"] is False
+        assert len(document["candidates"]) == 1
+        assert document["accepted"] == []
+
+
+class TestWithoutEvents:
+    def test_the_options_are_told(self, plain: Path, replay) -> None:
+        status, document = replay(plain, "--robot", ROBOT)
+        assert status == 2
+        for option in ("--cold", "--warm", "--auto"):
+            assert option in document["error"]["message"]
+
+    def test_the_robot_must_be_named(self, plain: Path, replay) -> None:
+        status, document = replay(plain, "--auto")
+        assert status == 2
+        assert "--robot" in document["error"]["message"]
+
+    def test_auto_finds_the_cycles(self, plain: Path, replay) -> None:
+        status, document = replay(plain, "--robot", ROBOT, "--auto")
+        assert status == 0
+        names = [(entry["command"], entry["samples"]) for entry in document["commands"]]
+        assert names[:3] == [("capture_reference", 8), ("identify", 8), ("identify", 8)]
+        assert document["gaps"]["count"] >= 3
+        assert document["gaps"]["longest_s"] == pytest.approx(4.1, abs=0.01)
+        assert document["topics"] == {"joint_states": JOINTS, "measured_point": POINT}
+
+    def test_windows_give_the_same_as_auto(self, plain: Path, replay) -> None:
+        second, third = POSES + 4, 2 * (POSES + 4)
+        windows = ["--cold", "0:9"]
+        for start in (second, third):
+            windows += ["--warm", f"{start}:{start + 9}"]
+        _, told = replay(plain, "--robot", ROBOT, *windows)
+        _, found = replay(plain, "--robot", ROBOT, "--auto")
+        assert [identified(c) for c in told["candidates"]] == [
+            identified(c) for c in found["candidates"][:2]
+        ]
+
+    def test_drift_comes_back_in_mm(self, plain: Path, replay) -> None:
+        """20 K grew the links by about half a millimetre; the candidate leaves little of it."""
+        _, document = replay(plain, "--robot", ROBOT, "--auto")
+        first = document["candidates"][0]
+        assert first["verdict"]["code"] == "ACCEPT"
+        assert first["nominal"]["held_out"]["rms_mm"] > 0.4
+        assert first["calibrated"]["held_out"]["rms_mm"] < 0.2
+
+    def test_poses_that_do_not_recur_are_one_calibration(self, tmp_path: Path, replay) -> None:
+        arm = true_arm()
+        q = postures(arm, 60, 5)
+        path = plain_bag(tmp_path / "once.mcap", [list(visit(arm, q, START_NS, 3))])
+        status, document = replay(path, "--robot", ROBOT, "--auto")
+        assert status == 0
+        (candidate,) = document["candidates"]
+        assert candidate["verdict"]["accept"]
+        assert candidate["calibrated"]["held_out"]["n"] == 30
+
+
+class TestTopics:
+    def test_other_names(self, folder: Path, visits, replay) -> None:
+        path = plain_bag(
+            folder / "names.mcap", visits, joint_states="/arm/state", measured_point="/ball"
+        )
+        status, document = replay(path, "--robot", ROBOT, "--auto")
+        assert status == 2
+        assert "/arm/state" in document["error"]["message"]
+        topics = ("--topic", "joint_states:=/arm/state", "--topic", "measured_point:=/ball")
+        status, document = replay(path, "--robot", ROBOT, "--auto", *topics)
+        assert status == 0
+        assert document["candidates"]
+
+    @pytest.mark.parametrize(
+        ("topic", "words"),
+        [
+            ("joint_states:=/none", "no topic /none"),
+            ("joints:=/joint_states", "the inputs are joint_states"),
+            ("joint_states", "not of the form INPUT:=TOPIC"),
+            (":=/x", "not of the form INPUT:=TOPIC"),
+        ],
+    )
+    def test_wrong_names(self, plain: Path, replay, topic: str, words: str) -> None:
+        status, document = replay(plain, "--robot", ROBOT, "--auto", "--topic", topic)
+        assert status == 2
+        assert words in document["error"]["message"]
+
+    def test_uncorrected_joint_states_are_no_input(self, folder: Path, visits, replay) -> None:
+        path = folder / "corrected.mcap"
+        with BagWriter(path) as bag:
+            for sample in (sample for part in visits for sample in part):
+                write_samples(bag, [sample])
+                if isinstance(sample, JointSample):
+                    spoiled = JointSample(sample.stamp_ns + 1, sample.names, sample.position + 1e-3)
+                    write_samples(
+                        bag, [spoiled], joint_states="/joint_correction_node/joint_states"
+                    )
+        _, document = replay(path, "--robot", ROBOT, "--auto")
+        assert document["topics"]["joint_states"] == JOINTS
+        assert document["candidates"][0]["verdict"]["accept"]
+
+    def test_no_measurements(self, folder: Path, visits, replay) -> None:
+        path = plain_bag(
+            folder / "joints.mcap", [[s for s in visits[0] if isinstance(s, JointSample)]]
+        )
+        status, document = replay(path, "--robot", ROBOT, "--auto")
+        assert status == 2
+        assert "no measurement at standstill" in document["error"]["message"]
+        status, document = replay(path, "--robot", ROBOT, "--warm", "0:9")
+        assert status == 3
+        assert document["error"]["code"] == "TOO_FEW_SAMPLES"
+        assert document["candidates"] == []
+        assert any("measured_point" in words for words in document["warnings"])
+
+    def test_other_joint_names(self, plain: Path, replay) -> None:
+        status, document = replay(plain, "--robot", "ur10", "--auto")
+        assert status == 2
+        assert "shoulder_pan_joint" in document["error"]["message"]
+
+
+class TestDamage:
+    def test_a_recording_that_broke_off(self, live, folder: Path, replay) -> None:
+        whole = live[0].read_bytes()
+        path = folder / "broken.mcap"
+        path.write_bytes(whole[: int(0.9 * len(whole))])
+        status, document = replay(path)
+        assert status in (0, 2)  # 2: the break came before the first chunk's end
+        assert "Traceback" not in json.dumps(document)
+        if status == 0:
+            assert document["warnings"]
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [(b"", "empty"), (b"not a bag at all, but text", "not an MCAP"), (None, "no such bag")],
+    )
+    def test_no_bag(self, folder: Path, replay, content: bytes | None, words: str) -> None:
+        path = folder / "no.mcap"
+        path.unlink(missing_ok=True)
+        if content is not None:
+            path.write_bytes(content)
+        status, document = replay(path, "--auto", "--robot", ROBOT)
+        assert status == 2
+        assert words in document["error"]["message"]
+        assert document["error"]["file"] == str(path)
+
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            ('{"version": 99, "arguments": {}, "marks": {}}', "version 99"),
+            ("{}", "cannot be read"),
+            ("no json", "cannot be read"),
+        ],
+    )
+    def test_events_of_an_unknown_form(
+        self, folder: Path, visits, replay, arguments: str, words: str
+    ) -> None:
+        path = folder / "events.mcap"
+        with BagWriter(path) as bag:
+            event = {"stamp": ros_time(START_NS), "command": "identify", "arguments": arguments}
+            bag.write(EVENTS, TYPES[EVENTS], event, START_NS)
+            write_samples(bag, visits[0])
+        status, document = replay(path, "--robot", ROBOT)
+        assert status == 2
+        assert words in document["error"]["message"]
+
+    def test_a_cold_window_without_measurements(self, plain: Path, replay) -> None:
+        """No drift without its reference: the warm window must not pass for a calibration."""
+        status, document = replay(plain, "--robot", ROBOT, "--cold", "1000:1001", "--warm", "11:21")
+        assert status == 3
+        assert document["error"]["code"] == "TOO_FEW_SAMPLES"
+        assert document["verdict"]["accept"] is False
+
+
+class TestUsage:
+    @pytest.mark.parametrize(
+        ("options", "words"),
+        [
+            (("--auto", "--warm", "0:1"), "leave out --cold and --warm"),
+            (("--cold", "0:1"), "--cold alone identifies nothing"),
+            (("--warm", "5:1"), "no window T0:T1"),
+            (("--warm", "1"), "no window T0:T1"),
+            (("--warm", "nan:1"), "no window T0:T1"),
+        ],
+    )
+    def test_options_without_sense(self, plain: Path, replay, options, words: str) -> None:
+        status, document = replay(plain, "--robot", ROBOT, *options)
+        assert status == 2
+        assert words in document["error"]["message"]
+
+    def test_the_whole_command(self, plain: Path) -> None:
+        document = robocal_json("replay.json", "replay", plain, "--robot", ROBOT, "--auto")
+        assert len(document["candidates"]) >= 2
+
+
+def test_memory_does_not_grow_with_the_recording(folder: Path, visits) -> None:
+    """Twenty times the joint readings: the same memory to a few megabytes."""
+
+    def peak_mb(path: Path) -> float:
+        script = (
+            "import resource, sys; from robocal_ros.cli.main import main; "
+            "status = main(sys.argv[1:]); "
+            "print(status, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", script, "replay", str(path), "--robot", ROBOT, "--auto"],
+            capture_output=True, text=True, env=environment(), check=True, timeout=120,
+        )  # fmt: skip
+        status, kilobytes = done.stderr.split()[-2:]
+        assert status == "0"
+        return int(kilobytes) / 1024
+
+    def long_bag(path: Path, idle: int) -> Path:
+        rest = visits[2][0]
+        end_ns = visits[2][-1].stamp_ns
+        with BagWriter(path) as bag:
+            for part in visits[:3]:
+                write_samples(bag, part)
+            for i in range(idle):
+                stamp_ns = end_ns + (i + 1) * NS // 100
+                write_samples(bag, [JointSample(stamp_ns, rest.names, rest.position)])
+        return path
+
+    short = peak_mb(long_bag(folder / "short.mcap", 1_000))
+    long = peak_mb(long_bag(folder / "long.mcap", 20_000))
+    assert long < short + 20.0
