@@ -133,12 +133,17 @@ def replay(
     awaited = _submit_next(session, expected, ids)
     for recorded in messages:
         feed(session, recorded, topics)
-        while awaited is not None and (done := session.step(wall_ns=0)):
+        while awaited is not None and (done := session.step(wall_ns=_now(session))):
             awaited = _take(session, report, done, awaited, expected, ids)
     while awaited is not None:
-        done = session.step(wall_ns=0, force=True)
+        done = session.step(wall_ns=_now(session), force=True)
         awaited = _take(session, report, done, awaited, expected, ids)
     return report
+
+
+def _now(session: ThermalSession) -> int:
+    """Time of the data: what a replay's history has in place of the wall clock."""
+    return session.desk.newest_ns.get(JOINTS, 0)
 
 
 def _submit_next(
