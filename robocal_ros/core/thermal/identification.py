@@ -113,7 +113,7 @@ def identify_drift(
     current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
     before = np.linalg.norm(current.residual(data), axis=1)
     predicted = float(np.sqrt(model.mean()))
-    doubt = uninformative(result, summarise(before).rms_m, in_force)
+    doubt = _doubt(result, summarise(before).rms_m, in_force, prior)
     return JudgedIdentification(
         identification=result,
         nominal=summarise(reference.cell.residual(data)),
@@ -124,6 +124,21 @@ def identify_drift(
         workspace_rms_m=result.workspace_rms(result.estimate.covariance),
         verdict=judge(before, after, groups, doubt),
     )
+
+
+def _doubt(
+    result: Identification, current_rms_m: float, in_force: SerialArm, prior: Array | None
+) -> str:
+    """Say why the poses do not carry over to the workspace; empty when they do.
+
+    Poses that halve the prior's error throughout the workspace do, however small the change: the
+    model in force came from such poses too and is no better known elsewhere.
+    """
+    if prior is not None and result.estimate.converged:
+        left = result.workspace_rms(result.estimate.covariance)
+        if left <= 0.5 * result.workspace_rms(prior):
+            return ""
+    return uninformative(result, current_rms_m, in_force)
 
 
 def _identify(
