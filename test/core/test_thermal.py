@@ -26,7 +26,7 @@ def nominal() -> SerialArm:
 
 @pytest.fixture(scope="module")
 def cold(nominal: SerialArm) -> SerialArm:
-    """The robot as built: off its nominal model by tenths of a millimetre and hundredths of a deg."""
+    """The robot as built: off its nominal model by tenths of a mm and hundredths of a degree."""
     rng = np.random.default_rng(5)
     size = np.where(nominal.parameters.is_length, 3e-4, np.radians(0.01))
     return nominal.with_mdh(nominal.parameters.add(nominal.mdh, size * rng.normal(size=len(size))))
