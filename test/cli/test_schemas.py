@@ -1,0 +1,131 @@
+"""Every command, as a process of its own: its document follows its schema, well or ill."""
+
+from pathlib import Path
+
+import pytest
+from campaign import ROBOT, measured, table
+from command import SCHEMAS, conforms, robocal, robocal_json
+from recordings import plain_bag, recorded_bag, shift
+
+from robocal_ros.cli.main import COMMANDS
+
+UR_NOMINAL = """[DH]
+a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
+d = [0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996]
+alpha = [1.570796327, 0, 0, 1.570796327, -1.570796327, 0]
+q_home_offset = [0, -1.570796327, 0, -1.570796327, 0, 0]
+joint_direction = [1, 1, -1, 1, 1, 1]
+"""
+UR_DELTAS = """[mounting]
+delta_theta = [ 0.0, -0.0005, 0.0007, 0.0002, 0, 0]
+delta_a = [ 0.0001, 0.0003, -0.0001, 0.0002, 0, 0]
+delta_d = [ 0.0002, 0.0, 0.0, 0.0004, -0.0001, 0]
+delta_alpha = [ 0.0003, 0.0005, 0.0008, 0.0002, 0.0018, 0]
+"""
+# Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
+CASES = {
+    "fk": (
+        "fk.json",
+        ["fk", "--robot", ROBOT, "--joints-deg", "0,-90,90,0,0,0"],
+        ["fk", "--robot", ROBOT, "--joints-deg", "0,-90"],
+        (2, "BAD_INPUT"),
+    ),
+    "identify": (
+        "identify.json",
+        ["identify", "--robot", ROBOT, "--data", "data.csv"],
+        ["identify", "--robot", ROBOT, "--data", "few.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "identify refuses": (
+        "identify.json",
+        ["identify", "--robot", ROBOT, "--data", "data.csv", "--fit", "base,tool"],
+        ["identify", "--robot", "p1r2p3", "--data", "data.csv"],
+        (2, "BAD_INPUT"),
+    ),
+    "replay": (
+        "replay.json",
+        ["replay", "plain.mcap", "--robot", ROBOT, "--auto"],
+        ["replay", "plain.mcap", "--robot", ROBOT, "--warm", "500:501"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "replay recorded": (
+        "replay.json",
+        ["replay", "live.mcap"],
+        ["replay", "live.mcap", "--robot", "ur10"],
+        (2, "WRONG_ROBOT"),
+    ),
+    "history list": (
+        "history.list.json",
+        ["history", "list", "--state", "state"],
+        ["history", "list", "--state", "nowhere"],
+        (2, "BAD_INPUT"),
+    ),
+    "history show": (
+        "history.show.json",
+        ["history", "show", "2", "--state", "state"],
+        ["history", "show", "99", "--state", "state"],
+        (2, "BAD_INPUT"),
+    ),
+    "history accept": (
+        "history.decision.json",
+        ["history", "rollback", "--to", "nominal", "--state", "state"],
+        ["history", "accept", "2", "--state", "state"],
+        (3, "CONFLICT"),
+    ),
+    "import-ur": (
+        "import-ur.json",
+        ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
+        ["import-ur", "--calibration", "n.conf", "--nominal", "n.conf", "--output", "no.yaml"],
+        (2, "BAD_INPUT"),
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("commands")
+    table(folder / "data.csv", measured(60))
+    table(folder / "few.csv", measured(3))
+    visits = shift()
+    plain_bag(folder / "plain.mcap", visits)
+    recorded_bag(folder / "live.mcap", folder / "state", visits)
+    (folder / "n.conf").write_text(UR_NOMINAL)
+    (folder / "c.conf").write_text(UR_DELTAS)
+    return folder
+
+
+def test_every_command_and_schema_has_a_case() -> None:
+    assert {name.split()[0] for name in CASES} == set(COMMANDS)
+    assert {case[0] for case in CASES.values()} == set(SCHEMAS) - {"common.json", "error.json"}
+
+
+def placed(folder: Path, arguments: list[str]) -> list[str]:
+    """Names of files become paths in the folder."""
+    files = (".csv", ".mcap", ".conf", ".yaml")
+    return [
+        str(folder / word) if word.endswith(files) or word in ("state", "nowhere") else word
+        for word in arguments
+    ]
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_a_command_that_succeeds(folder: Path, name: str) -> None:
+    schema, good, _, _ = CASES[name]
+    document = robocal_json(schema, *placed(folder, good))
+    assert "error" not in document
+
+
+@pytest.mark.parametrize("name", list(CASES))
+def test_a_command_that_fails(folder: Path, name: str) -> None:
+    schema, _, bad, (status, code) = CASES[name]
+    document = robocal_json("error.json", *placed(folder, bad), status=status)
+    assert document["error"]["code"] == document["verdict"]["code"] == code
+    if "if" in SCHEMAS[schema]:
+        conforms(document, schema)
+
+
+def test_without_json_a_failure_leaves_stdout_empty(folder: Path) -> None:
+    done = robocal(*placed(folder, CASES["identify"][2]))
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert "[TOO_FEW_SAMPLES]" in done.stderr
