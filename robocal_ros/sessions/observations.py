@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 JOINTS = "joint_states"
 POINT = "measured_point"
 POSE = "measured_pose"
+JUMPS = "clock_jumps"
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
 MOST_KEPT = 20000  # observations that no command has used
@@ -53,6 +54,7 @@ class ObservationDesk:
     frame : the measuring frame; None until the first observation that is used gives it.
     newest_ns : newest stamp of each topic.
     used_ns : observations up to this stamp were used.
+    jumps : how often the clock jumped back.
     """
 
     joint_names: tuple[str, ...]
@@ -61,6 +63,7 @@ class ObservationDesk:
     stream: JointStream = field(init=False)
     newest_ns: dict[str, int] = field(default_factory=dict)
     used_ns: int = -1
+    jumps: int = 0
     received: Counter[str] = field(default_factory=Counter)
     ignored: dict[str, Counter[str]] = field(default_factory=dict)
     _complete_ns: int | None = None
@@ -74,6 +77,11 @@ class ObservationDesk:
     def from_ns(self) -> int:
         """Stamp from which observations are complete and not yet used."""
         return max(self.used_ns + 1, self._complete_ns or 0)
+
+    @property
+    def marks(self) -> dict[str, int]:
+        """How far the samples have come: newest stamp of each topic, and jumps of the clock."""
+        return self.newest_ns | {JUMPS: self.jumps}
 
     def ignore(self, topic: str, reason: str, count: int = 1) -> None:
         """Count samples that are not used; numbers in the reason do not tell reasons apart."""
@@ -107,6 +115,7 @@ class ObservationDesk:
             self._observed.clear()
             self._pending.clear()
             self.newest_ns.clear()
+            self.jumps += 1
             self.used_ns = -1
         self._complete_ns = first_ns + int(self.rule.before_s * 1e9)
 

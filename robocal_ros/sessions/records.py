@@ -86,7 +86,7 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
             "prior": session.prior.tolist(),
         },
         session.desk.newest_ns.get(JOINTS, 0),
-        {},
+        session.desk.marks,
     )
 
 

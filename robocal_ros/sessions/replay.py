@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from robocal_ros.core.thermal.identification import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import JOINTS, POINT, POSE, Observation
+from robocal_ros.sessions.observations import JOINTS, JUMPS, POINT, POSE, Observation
 from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.thermal import ThermalSession
 
@@ -74,7 +74,18 @@ def read_events(
             configured = configured if found else command
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
-    return configured, found
+    before = _jumps(configured)
+    return configured, [(_counted_from(before, command), outcome) for command, outcome in found]
+
+
+def _jumps(command: Command | None) -> int:
+    return 0 if command is None or command.marks is None else command.marks.get(JUMPS, 0)
+
+
+def _counted_from(before: int, command: Command) -> Command:
+    """The command with the clock's jumps counted from those before the recording."""
+    marks = {**(command.marks or {}), JUMPS: max(_jumps(command) - before, 0)}
+    return replace(command, marks=marks)
 
 
 def input_topics(topics: Iterable[str], configured: Command | None = None) -> dict[str, str]:

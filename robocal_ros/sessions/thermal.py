@@ -32,6 +32,7 @@ from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE, InForce
 from robocal_ros.sessions.observations import (
     JOINTS,
+    JUMPS,
     Observation,
     ObservationDesk,
     as_measurements,
@@ -156,7 +157,7 @@ class ThermalSession:
 
     def _marked(self, command: Command) -> Command:
         """Return the command with the bounds of its samples, for the record."""
-        marks, arguments = dict(self.desk.newest_ns), dict(command.arguments)
+        marks, arguments = self.desk.marks, dict(command.arguments)
         if command.name in (events.IDENTIFY, events.CAPTURE_REFERENCE):
             arguments.setdefault("from_ns", self.desk.from_ns)
         return replace(command, marks=marks, arguments=arguments)
@@ -164,7 +165,10 @@ class ThermalSession:
     def _ready(self, command: Command) -> bool:
         newest = self.desk.newest_ns
         if command.marks is not None:
-            return all(newest.get(topic, -1) >= stamp for topic, stamp in command.marks.items())
+            marks = dict(command.marks)
+            jumps = marks.pop(JUMPS, 0)
+            reached = all(newest.get(topic, -1) >= stamp for topic, stamp in marks.items())
+            return self.desk.jumps > jumps or (self.desk.jumps == jumps and reached)
         if command.name not in (events.IDENTIFY, events.CAPTURE_REFERENCE):
             return True
         wanted = (command.stamp_ns or 0) + int(self.config.lateness_s * 1e9)
@@ -319,7 +323,7 @@ class ThermalSession:
         return [self._outside(decision) for decision in self._current.look()]
 
     def _outside(self, decision: Decision) -> Outcome:
-        chosen, marks = decision.calibration_id or 0, dict(self.desk.newest_ns)
+        chosen, marks = decision.calibration_id or 0, self.desk.marks
         arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
         command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
         message = f"revision {decision.head_after}: decided outside this node"

@@ -1,11 +1,11 @@
 """The thermal session: what it proposes, and that only stamps and commands decide it."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from history_content import content
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shift import Shift, built, of_kind, postures, warmed
@@ -63,26 +63,6 @@ def run(session: ThermalSession, samples, todo: Sequence[Command]) -> list[Outco
         session.add(sample)
         outcomes += session.advance(wall_ns=7)
     return outcomes + session.advance(wall_ns=7, force=True)
-
-
-def content(history: CalibrationHistory) -> str:
-    """Everything that must be equal: all but ids of the file and wall-clock times."""
-    entries = [
-        {
-            "kind": entry.kind,
-            "based_on": entry.based_on,
-            "cycle": entry.cycle_id,
-            "stamp": entry.stamp_ns,
-            "verdict": [entry.code.name, entry.reason, entry.candidate_rms_mm],
-            "state": entry.state.value,
-            "document": history.document(entry.id),
-            "model": history.model(entry.id),
-            "inputs": {k: v.tolist() for k, v in history.inputs(entry.id).items()},
-        }
-        for entry in history.list()
-    ]
-    decisions = [[d.kind, d.action.value, d.by, d.head_after] for d in history.decisions()]
-    return json.dumps([entries, decisions], sort_keys=True)
 
 
 def test_a_warm_robot_is_found_warm(nominal, visits, tmp_path):
