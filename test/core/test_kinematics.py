@@ -153,6 +153,22 @@ def test_parameter_jacobian_is_the_derivative(case):
         np.testing.assert_allclose(J[:, k], twist(before, after) / (2.0 * h), rtol=0.0, atol=2e-9)
 
 
+@pytest.mark.parametrize("size", [1e-8, 1.0, 10.0, 1e4, 1e6, 1e9])
+def test_sines_are_right_to_two_ulp(size):
+    """Also beyond 1e6 rad, where libm takes over, and at the multiples of a quarter turn."""
+    flat = SerialArm(
+        "flat", ("j",), np.zeros((1, 5)), np.ones(1), np.zeros(1, dtype=bool), np.full(1, -np.inf),
+        np.full(1, np.inf),
+    )  # fmt: skip
+    angle = np.random.default_rng(6).uniform(-size, size, 5000)
+    quarters = np.arange(-40, 41) * (np.pi / 2.0)
+    for q in (angle, quarters, np.nextafter(quarters, 100.0), np.array([0.0, -0.0])):
+        T = flat.fk(q[:, None])
+        np.testing.assert_array_max_ulp(T[:, 1, 0], np.sin(q), maxulp=2)
+        np.testing.assert_array_max_ulp(T[:, 0, 0], np.cos(q), maxulp=2)
+    assert np.isnan(flat.fk([np.nan])).any()
+
+
 # ---- Shapes and frames ---------------------------------------------------------------------------
 
 

@@ -10,8 +10,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from robocal_ros.core.kinematics.sines import LARGEST_ANGLE, cos_sin, reduced_cos_sin
+
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_BLOCK = 256  # poses whose sines are formed at once
 
 
 def pack_links(mdh: Array, sign: Array, prismatic: NDArray[np.bool_]) -> Array:
@@ -21,6 +25,29 @@ def pack_links(mdh: Array, sign: Array, prismatic: NDArray[np.bool_]) -> Array:
     return np.ascontiguousarray(
         np.stack((d, theta, a, *trig, sign, prismatic.astype(np.float64)), axis=1)
     )
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _theta(links: Array, i: int, q: float) -> float:
+    return float(links[i, 1] if links[i, 8] > 0.5 else links[i, 1] + links[i, 7] * q)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn_block(q: Array, first: int, last: int, links: Array, turns: Array) -> None:
+    """Rows cos, sin of ``turns`` (3, block * n): of each theta of poses ``first`` to ``last``."""
+    n = links.shape[0]
+    count = (last - first) * n
+    angle, cosine, sine = turns[0], turns[1], turns[2]
+    for k in range(last - first):
+        for i in range(n):
+            angle[k * n + i] = _theta(links, i, q[first + k, i])
+    largest = 0.0
+    for j in range(count):
+        largest = max(largest, abs(angle[j]))
+        cosine[j], sine[j] = reduced_cos_sin(angle[j])
+    if largest > LARGEST_ANGLE:
+        for j in range(count):
+            cosine[j], sine[j] = cos_sin(angle[j])
 
 
 # Frames are carried as twelve numbers: LLVM keeps them in registers, which arrays would prevent.
@@ -41,15 +68,13 @@ def _root(T: Array) -> Frame:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _link(links: Array, i: int, q: float, frame: Frame) -> Frame:
-    """One link but for beta: Trans(z, d) Rot(z, theta) Trans(x, a) Rot(x, alpha)."""
+def _link(links: Array, i: int, q: float, c: float, s: float, frame: Frame) -> Frame:
+    """One link but for beta: Trans(z, d) Rot(z, theta) Trans(x, a) Rot(x, alpha).
+
+    ``c``, ``s``: cosine and sine of theta.
+    """
     x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
-    d, theta = links[i, 0], links[i, 1]
-    if links[i, 8] > 0.5:
-        d += links[i, 7] * q
-    else:
-        theta += links[i, 7] * q
-    c, s = np.cos(theta), np.sin(theta)
+    d = links[i, 0] + links[i, 7] * q if links[i, 8] > 0.5 else links[i, 0]
     # fmt: off
     x0, x1, x2, y0, y1, y2 = (
         c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2,
@@ -88,6 +113,19 @@ def _store(frame: Frame, T: Array) -> None:
     T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _keep_axis(frame: Frame, frames: Array, i: int) -> None:
+    frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = frame[6], frame[7], frame[8]
+    frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = frame[9], frame[10], frame[11]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _keep_link(frame: Frame, frames: Array, i: int) -> None:
+    frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = frame[0], frame[1], frame[2]
+    frames[i, 3, 0], frames[i, 3, 1], frames[i, 3, 2] = frame[9], frame[10], frame[11]
+    frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = frame[3], frame[4], frame[5]
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> None:
     """Forward kinematics that keeps each joint's axes.
@@ -97,12 +135,10 @@ def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> 
     """
     frame = _root(T_root)
     for i in range(links.shape[0]):
-        frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = frame[6], frame[7], frame[8]
-        frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = frame[9], frame[10], frame[11]
-        frame = _link(links, i, q[i], frame)
-        frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = frame[0], frame[1], frame[2]
-        frames[i, 3, 0], frames[i, 3, 1], frames[i, 3, 2] = frame[9], frame[10], frame[11]
-        frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = frame[3], frame[4], frame[5]
+        _keep_axis(frame, frames, i)
+        c, s = cos_sin(_theta(links, i, q[i]))
+        frame = _link(links, i, q[i], c, s, frame)
+        _keep_link(frame, frames, i)
         frame = _bend(links, i, frame)
     _store(frame, T_out)
 
@@ -110,36 +146,54 @@ def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fk_batch(q: Array, links: Array, T_root: Array, T_out: Array) -> None:
     """Flange poses (m, 4, 4) of joint vectors (m, n)."""
-    for k in range(q.shape[0]):
-        frame = _root(T_root)
-        for i in range(links.shape[0]):
-            frame = _bend(links, i, _link(links, i, q[k, i], frame))
-        _store(frame, T_out[k])
+    n = links.shape[0]
+    turns = np.empty((3, _BLOCK * n))
+    for first in range(0, q.shape[0], _BLOCK):
+        last = min(first + _BLOCK, q.shape[0])
+        _turn_block(q, first, last, links, turns)
+        for k in range(first, last):
+            frame = _root(T_root)
+            for i in range(n):
+                j = (k - first) * n + i
+                frame = _link(links, i, q[k, i], turns[1, j], turns[2, j], frame)
+                frame = _bend(links, i, frame)
+            _store(frame, T_out[k])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def jacobian_batch(q: Array, links: Array, T_root: Array, J: Array) -> None:
     """Geometric Jacobians (m, 6, n) of joint vectors (m, n): [v; w] of the flange in base."""
     n = links.shape[0]
-    axes = np.empty((n, 6))
-    for k in range(q.shape[0]):
-        frame = _root(T_root)
-        for i in range(n):
-            for r in range(6):
-                axes[i, r] = frame[6 + r]
-            frame = _bend(links, i, _link(links, i, q[k, i], frame))
-        p0, p1, p2 = frame[9], frame[10], frame[11]
-        for i in range(n):
-            s = links[i, 7]
-            a0, a1, a2 = s * axes[i, 0], s * axes[i, 1], s * axes[i, 2]
-            if links[i, 8] > 0.5:
-                J[k, 0, i], J[k, 1, i], J[k, 2, i] = a0, a1, a2
-                J[k, 3, i], J[k, 4, i], J[k, 5, i] = 0.0, 0.0, 0.0
-            else:
-                r0, r1, r2 = p0 - axes[i, 3], p1 - axes[i, 4], p2 - axes[i, 5]
-                J[k, 0, i], J[k, 1, i] = a1 * r2 - a2 * r1, a2 * r0 - a0 * r2
-                J[k, 2, i] = a0 * r1 - a1 * r0
-                J[k, 3, i], J[k, 4, i], J[k, 5, i] = a0, a1, a2
+    turns, axes = np.empty((3, _BLOCK * n)), np.empty((n, 6))
+    for first in range(0, q.shape[0], _BLOCK):
+        last = min(first + _BLOCK, q.shape[0])
+        _turn_block(q, first, last, links, turns)
+        for k in range(first, last):
+            frame = _root(T_root)
+            for i in range(n):
+                axes[i, 0], axes[i, 1], axes[i, 2] = frame[6], frame[7], frame[8]
+                axes[i, 3], axes[i, 4], axes[i, 5] = frame[9], frame[10], frame[11]
+                j = (k - first) * n + i
+                frame = _link(links, i, q[k, i], turns[1, j], turns[2, j], frame)
+                frame = _bend(links, i, frame)
+            _joint_columns(links, axes, frame[9], frame[10], frame[11], J, k)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _joint_columns(
+    links: Array, axes: Array, p0: float, p1: float, p2: float, J: Array, k: int
+) -> None:
+    for i in range(links.shape[0]):
+        s = links[i, 7]
+        a0, a1, a2 = s * axes[i, 0], s * axes[i, 1], s * axes[i, 2]
+        if links[i, 8] > 0.5:
+            J[k, 0, i], J[k, 1, i], J[k, 2, i] = a0, a1, a2
+            J[k, 3, i], J[k, 4, i], J[k, 5, i] = 0.0, 0.0, 0.0
+        else:
+            r0, r1, r2 = p0 - axes[i, 3], p1 - axes[i, 4], p2 - axes[i, 5]
+            J[k, 0, i], J[k, 1, i] = a1 * r2 - a2 * r1, a2 * r0 - a0 * r2
+            J[k, 2, i] = a0 * r1 - a1 * r0
+            J[k, 3, i], J[k, 4, i], J[k, 5, i] = a0, a1, a2
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -161,6 +215,54 @@ def _turn(
 def _slide(f: Array, i: int, axis: int, J: Array, k: int, c: int) -> None:
     """Column ``c`` of ``J[k]``, zeroed before: translation along an axis."""
     J[k, 0, c], J[k, 1, c], J[k, 2, c] = f[i, axis, 0], f[i, axis, 1], f[i, axis, 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _carry(T: Array, tools: Array, t: int, T_out: Array, k: int) -> None:
+    """``T_out[k]`` = T tools[t]."""
+    for r in range(3):
+        for c in range(4):
+            value = T[r, 3] if c == 3 else 0.0
+            for j in range(3):
+                value += T[r, j] * tools[t, j, c]
+            T_out[k, r, c] = value
+    T_out[k, 3, 0], T_out[k, 3, 1], T_out[k, 3, 2], T_out[k, 3, 3] = 0.0, 0.0, 0.0, 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _model_columns(slot: Index, frames: Array, T: Array, J: Array, k: int) -> None:
+    p0, p1, p2 = T[k, 0, 3], T[k, 1, 3], T[k, 2, 3]
+    for i in range(slot.shape[0]):
+        if slot[i, 0] >= 0:
+            _slide(frames, i, 0, J, k, slot[i, 0])
+        if slot[i, 1] >= 0:
+            _turn(frames, i, 0, 1, p0, p1, p2, J, k, slot[i, 1])
+        if slot[i, 2] >= 0:
+            _slide(frames, i, 2, J, k, slot[i, 2])
+        if slot[i, 3] >= 0:
+            _turn(frames, i, 2, 3, p0, p1, p2, J, k, slot[i, 3])
+        if slot[i, 4] >= 0:
+            _turn(frames, i, 4, 3, p0, p1, p2, J, k, slot[i, 4])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _base_columns(T_root: Array, b: int, T: Array, J: Array, k: int) -> None:
+    r0, r1, r2 = T[k, 0, 3] - T_root[0, 3], T[k, 1, 3] - T_root[1, 3], T[k, 2, 3] - T_root[2, 3]
+    J[k, 0, b], J[k, 1, b + 1], J[k, 2, b + 2] = 1.0, 1.0, 1.0
+    J[k, 1, b + 3], J[k, 2, b + 3] = -r2, r1
+    J[k, 0, b + 4], J[k, 2, b + 4] = r2, -r0
+    J[k, 0, b + 5], J[k, 1, b + 5] = -r1, r0
+    if J.shape[1] == 6:
+        J[k, 3, b + 3], J[k, 4, b + 4], J[k, 5, b + 5] = 1.0, 1.0, 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _tool_columns(T_flange: Array, t: int, J: Array, k: int) -> None:
+    for r in range(3):
+        for c in range(3):
+            J[k, r, t + c] = T_flange[r, c]
+            if J.shape[1] == 6:
+                J[k, 3 + r, t + 3 + c] = T_flange[r, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -185,46 +287,23 @@ def parameter_batch(
     T_frame_target; ``J`` (m, 3 or 6, k), zeroed by the caller, is its twist [v; w] at the target.
     """
     n = links.shape[0]
-    rows = J.shape[1]
-    frames = np.empty((n, 5, 3))
+    frames, turns = np.empty((n, 5, 3)), np.empty((3, _BLOCK * n))
     T_flange = np.empty((4, 4))
-    root = T_root[:3, 3].copy()
-    for k in range(q.shape[0]):
-        walk(q[k], links, T_root, frames, T_flange)
-        tool = tools[target[k]]
-        for r in range(3):
-            for c in range(4):
-                value = T_flange[r, 3] if c == 3 else 0.0
-                for j in range(3):
-                    value += T_flange[r, j] * tool[j, c]
-                T_out[k, r, c] = value
-        T_out[k, 3, 0], T_out[k, 3, 1], T_out[k, 3, 2], T_out[k, 3, 3] = 0.0, 0.0, 0.0, 1.0
-        p0, p1, p2 = T_out[k, 0, 3], T_out[k, 1, 3], T_out[k, 2, 3]
-        for i in range(n):
-            if slot[i, 0] >= 0:
-                _slide(frames, i, 0, J, k, slot[i, 0])
-            if slot[i, 1] >= 0:
-                _turn(frames, i, 0, 1, p0, p1, p2, J, k, slot[i, 1])
-            if slot[i, 2] >= 0:
-                _slide(frames, i, 2, J, k, slot[i, 2])
-            if slot[i, 3] >= 0:
-                _turn(frames, i, 2, 3, p0, p1, p2, J, k, slot[i, 3])
-            if slot[i, 4] >= 0:
-                _turn(frames, i, 4, 3, p0, p1, p2, J, k, slot[i, 4])
-        if base_column >= 0:
-            Jk = J[k]
-            r0, r1, r2 = p0 - root[0], p1 - root[1], p2 - root[2]
-            b = base_column
-            Jk[0, b], Jk[1, b + 1], Jk[2, b + 2] = 1.0, 1.0, 1.0
-            Jk[1, b + 3], Jk[2, b + 3] = -r2, r1
-            Jk[0, b + 4], Jk[2, b + 4] = r2, -r0
-            Jk[0, b + 5], Jk[1, b + 5] = -r1, r0
-            if rows == 6:
-                Jk[3, b + 3], Jk[4, b + 4], Jk[5, b + 5] = 1.0, 1.0, 1.0
-        t = tool_column[target[k]]
-        if t >= 0:
-            for r in range(3):
-                for c in range(3):
-                    J[k, r, t + c] = T_flange[r, c]
-                    if rows == 6:
-                        J[k, 3 + r, t + 3 + c] = T_flange[r, c]
+    for first in range(0, q.shape[0], _BLOCK):
+        last = min(first + _BLOCK, q.shape[0])
+        _turn_block(q, first, last, links, turns)
+        for k in range(first, last):
+            frame = _root(T_root)
+            for i in range(n):
+                _keep_axis(frame, frames, i)
+                j = (k - first) * n + i
+                frame = _link(links, i, q[k, i], turns[1, j], turns[2, j], frame)
+                _keep_link(frame, frames, i)
+                frame = _bend(links, i, frame)
+            _store(frame, T_flange)
+            _carry(T_flange, tools, target[k], T_out, k)
+            _model_columns(slot, frames, T_out, J, k)
+            if base_column >= 0:
+                _base_columns(T_root, base_column, T_out, J, k)
+            if tool_column[target[k]] >= 0:
+                _tool_columns(T_flange, tool_column[target[k]], J, k)
