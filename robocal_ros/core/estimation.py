@@ -97,7 +97,7 @@ def solve(
     TooFewSamplesError
         Without a prior, fewer equations than unknowns.
     RankDeficientError
-        Without a prior, when the data leave a direction undetermined.
+        When the data, and the prior where there is one, leave a direction undetermined.
     ValueError
         When the residuals at the start are not finite.
     """
@@ -120,20 +120,28 @@ def solve(
         keep = descent.inliers(run, keep)
     for _ in range(10):
         if flat and not np.all(keep):
-            _require_full_rank(observability(run.jacobian[keep].reshape(-1, k)), problem.names)
+            _require_full_rank(observability(_rows(run.jacobian, keep)), problem.names)
         run = descent.run(run, keep)
         update = descent.inliers(run, keep) if robust else keep
         if np.array_equal(update, keep):
             break
         keep = update
-    seen = observability(run.jacobian[keep].reshape(-1, k))
+    seen = observability(_rows(run.jacobian, keep))
     if flat:
         _require_full_rank(seen, problem.names)
     scale = descent.plain_scale(run.residual, keep)
+    covariance = descent.posterior(run, keep, scale)
+    if not np.all(np.diag(covariance) > 0.0):
+        words = [describe(column, problem.names) for column in seen.null.T]
+        raise RankDeficientError(
+            f"the data determine {seen.rank} of {k} unknowns, and the prior not the rest: measure "
+            "at more and different poses",
+            words,
+        )
     return Estimate(
         state=run.state,
         names=problem.names,
-        covariance=descent.posterior(run, keep, scale),
+        covariance=covariance,
         scale=scale,
         residual=run.residual,
         rejected=~keep,
@@ -271,6 +279,12 @@ class _Descent(Generic[S]):
         )
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep
+
+
+def _rows(jacobian: Array, keep: NDArray[np.bool_]) -> Array:
+    """Rows (N, k) of the samples to keep, copied only when some are left out."""
+    used = jacobian if np.all(keep) else jacobian[keep]
+    return used.reshape(-1, jacobian.shape[2])
 
 
 def _lengths(rows: Array) -> Array:

@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 QUATERNION_TOLERANCE = 1e-3
 LARGEST_STAMP_S = 9_000_000_000
+LARGEST = 1e9  # in any unit: beyond it squares lose what is left of a measurement
+SMALLEST_SIGMA_MM = 1e-9
 DIGITS = ".12g"  # 1e-9 mm in a metre, and no trailing noise of binary fractions
 
 
@@ -164,6 +166,11 @@ def _numbers(table: _Table) -> Array:
         name = table.layout.numeric[bad[0, 1]]
         text = table.column(name)[bad[0, 0]]
         table.fail(f"'{text.strip()}' is not a finite number", int(bad[0, 0]), name)
+    bad = np.argwhere(np.abs(numbers) > LARGEST)
+    if len(bad):
+        name = table.layout.numeric[bad[0, 1]]
+        text = table.column(name)[bad[0, 0]]
+        table.fail(f"{text.strip()} is no measurement", int(bad[0, 0]), name)
     return numbers
 
 
@@ -231,7 +238,7 @@ def _samples(table: _Table) -> tuple[str, ...]:
 
 
 def _sigma(table: _Table, sigma_mm: Array) -> Array:
-    bad = np.flatnonzero(sigma_mm <= 0.0)
+    bad = np.flatnonzero(sigma_mm < SMALLEST_SIGMA_MM)
     if len(bad):
         index = int(bad[0])
         table.fail(f"{sigma_mm[index]:g} is no standard deviation", index, "sigma_mm")

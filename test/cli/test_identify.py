@@ -359,6 +359,32 @@ class TestTooLittle:
         assert (status, document["error"]["code"]) == (3, "RANK_DEFICIENT")
 
 
+def test_no_table_crashes_it(data: Path, folder: Path, identify) -> None:
+    """Sixty spoilt tables: each ends with a verdict; ``identify`` checks status and schema."""
+    rng = np.random.default_rng(0)
+    both = measured(30, 2, targets=("ball", "peg"))
+    source = table(folder / "both.csv", with_rotations(both, true_arm()))
+    header, *rows = [line.split(",") for line in source.read_text().splitlines()]
+    values = ["1e300", "1e-300", "0", "1e8", "-1e6", "5e-324", "720", "1", "-0"]
+    codes = set()
+    for number in range(60):
+        spoilt = [row.copy() for row in rows]
+        for _ in range(rng.integers(1, 4)):
+            column = int(rng.integers(2, len(header)))
+            first = int(rng.integers(len(rows)))
+            for row in spoilt[first : first + 1] if rng.random() < 0.3 else spoilt:
+                row[column] = values[number % len(values)]
+        few = int(rng.choice([1, 3, 8, 13, 30, 30, 30]))
+        path = folder / "spoilt.csv"
+        path.write_text("\n".join(",".join(row) for row in [header, *spoilt[:few]]) + "\n")
+        fit = ("base,tool,geometry", "geometry", "tool,geometry", "base,tool")[number % 4]
+        method = ("map", "lsq")[number % 2]
+        status, document = identify("--data", path, "--fit", fit, "--method", method)
+        assert status in (0, 2, 3)
+        codes.add(document["verdict"]["code"])
+    assert {"BAD_INPUT", "TOO_FEW_SAMPLES", "RANK_DEFICIENT"} <= codes
+
+
 def _predicted(arm, base, ball, q):
     from robocal_ros.core import frames
 

@@ -234,7 +234,8 @@ def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> t
     J = layout.jacobian(cell, np.tile(q, (len(cell.targets), 1)), target)[1]
     J = J.reshape(-1, len(layout.names))
     order = [*range(count, J.shape[1]), *range(count)]
-    J = J[:, order] / np.linalg.norm(J[:, order], axis=0)
+    length = np.linalg.norm(J[:, order], axis=0)
+    J = J[:, order] / np.where(length > 0.0, length, 1.0)
     dependent = np.abs(np.diag(np.linalg.qr(J, mode="r"))) < 1e-9
     return tuple(layout.names[i] for i, d in zip(order, dependent, strict=True) if d)
 
