@@ -1,0 +1,108 @@
+"""From the start of each executable to the first answer of its services.
+
+Needs rclpy, which the other benchmarks' venv has not: ``start_times`` runs this file in the venv
+of the nodes, as ``tools/with_ros python bench/startup.py`` does.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from bench.tables import Goal, Table
+
+ROOT = Path(__file__).parents[1]
+EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
+NODES = ("thermal_node", "joint_correction_node", "replay_node")
+PROMISED_S = 1.5
+ROUNDS = 7
+GIVE_UP_S = 20.0
+BARE = "import rclpy; rclpy.init(); n = rclpy.create_node('bare'); rclpy.spin(n)"
+
+
+def start_times() -> Table:
+    """Seconds to the first answer, with no parameter file and compiled kernels in the cache."""
+    table = Table(
+        "startup",
+        "Start of the executables: first service answered, s",
+        ("executable", "median", "longest", "promised"),
+        f"{ROUNDS} starts each; in the first row a node of rclpy alone.",
+    )
+    done = subprocess.run(
+        [ROOT / "tools" / "with_ros", "python", "-m", "bench.startup"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    for name, times in json.loads(done.stdout).items():
+        middle = statistics.median(times)
+        table.add(name, middle, max(times), Goal(middle, PROMISED_S))
+    return table
+
+
+def measure() -> dict[str, list[float]]:
+    """Start times by executable, taking turns."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["ROBOCAL_STATE"] = folder
+        bag = _bag(Path(folder))
+        commands = {"bare rclpy node": [sys.executable, "-c", BARE]}
+        for name in NODES:
+            given = ["--ros-args", "-p", f"bag:={bag}"] if name == "replay_node" else []
+            commands[name] = [str(EXECUTABLES / name), *given]
+        found: dict[str, list[float]] = {name: [] for name in commands}
+        for _ in range(ROUNDS):
+            for name, command in commands.items():
+                found[name].append(_first_answer(name, command))
+    return found
+
+
+def _first_answer(name: str, command: list[str]) -> float:
+    """Start it, ask for its state until it is active (the bare node: for its parameters)."""
+    import rclpy
+    from lifecycle_msgs.msg import State
+    from lifecycle_msgs.srv import GetState
+    from rcl_interfaces.srv import ListParameters
+
+    bare = name not in NODES
+    kind, service = (
+        (ListParameters, "/bare/list_parameters") if bare else (GetState, f"/{name}/get_state")
+    )
+    rclpy.init()
+    node = rclpy.create_node("stopwatch", start_parameter_services=False)
+    client = node.create_client(kind, service)
+    begin = time.monotonic()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        while time.monotonic() < begin + GIVE_UP_S:
+            rclpy.spin_once(node, timeout_sec=0.005)
+            if not client.service_is_ready():
+                continue
+            future = client.call_async(kind.Request())
+            rclpy.spin_until_future_complete(node, future, timeout_sec=GIVE_UP_S)
+            answer = future.result()
+            if bare or answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
+                return time.monotonic() - begin
+        raise TimeoutError(f"{name} did not answer within {GIVE_UP_S} s")
+    finally:
+        process.terminate()
+        process.wait(GIVE_UP_S)
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def _bag(folder: Path) -> Path:
+    from robocal_ros.storage.bags import BagWriter
+
+    path = folder / "one.mcap"
+    with BagWriter(path) as bag:
+        bag.write("/note", "std_msgs/msg/String", {"data": "one"}, 1)
+    return path
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure()))

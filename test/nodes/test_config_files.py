@@ -1,0 +1,31 @@
+"""The parameter files show every parameter with its default, and a node starts with them."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from lifecycle_msgs.srv import GetState
+
+from robocal_ros.nodes.base import AUTOSTART, SERIAL
+from robocal_ros.nodes.replay_node import ReplayNode
+from robocal_ros.nodes.thermal_node import ThermalNode
+
+CONFIG = Path(__file__).parents[2] / "config"
+NODES = (ThermalNode, ReplayNode)
+
+
+@pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)
+def test_the_file_shows_every_parameter_with_its_default(node):
+    content = yaml.safe_load((CONFIG / f"{node.NAME}.yaml").read_text())
+    given = content[f"/**/{node.NAME}"]["ros__parameters"]
+    assert given == {s.name: s.default for s in (AUTOSTART, SERIAL, *node.SETTINGS)}
+
+
+def test_a_node_takes_the_file(graph, tmp_path):
+    content = (CONFIG / "thermal_node.yaml").read_text()
+    file = tmp_path / "mine.yaml"
+    file.write_text(content.replace('serial: ""', "serial: R7"))
+    process = graph.start("thermal_node", None, None, "--ros-args", "--params-file", str(file))
+    state = graph.call(GetState, "/thermal_node/get_state")
+    assert state.current_state.label == "active", process.output
+    graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
