@@ -2,8 +2,10 @@
 
 import csv
 import io
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -65,7 +67,6 @@ class DriftReport:
     held : (c, m, 3) with the correction that was in force just before the cycle: at its oldest.
     parameter_names : names with unit, ``d1_mm``.
     drift, sigma : (c, k) drift of the model in force and its standard deviation, in those units.
-    before_name : what ``before`` is called.
     """
 
     title: str
@@ -83,8 +84,8 @@ class DriftReport:
         """The summary: one line without correction, two with it."""
         return [
             ("without correction", figures_of(self.before)),
-            ("with correction, fresh", figures_of(self.after)),
-            ("with correction, at its oldest", figures_of(self.held)),
+            ("with correction, after each cycle", figures_of(self.after)),
+            ("with correction, before each cycle", figures_of(self.held)),
         ]
 
     def document(self) -> dict[str, Any]:
@@ -138,6 +139,52 @@ class DriftReport:
                 start = [decided.cycle, f"{self.hours[i]:.3f}", pose + 1]
                 writer.writerow([*start, *(f"{value:.4f}" for value in values)])
         return stream.getvalue()
+
+
+def read_report(document: Path, table: Path) -> DriftReport:
+    """Read a report back from its JSON and its CSV (errors to 0.1 \u00b5m)."""
+    found = json.loads(document.read_text(encoding="utf-8"))
+    cycles = found["cycles"]
+    with table.open(newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+
+    def errors(kind: str) -> Array:
+        values = [[float(row[f"{kind}_{axis}_mm"]) for axis in "xyz"] for row in rows]
+        return np.array(values).reshape(len(cycles), -1, 3) * 1e-3
+
+    names = list(cycles[0]["drift"])
+    return DriftReport(
+        title=found["title"],
+        origin=Origin(
+            simulated=found["simulated"],
+            data=found["data"],
+            robot=found["robot"],
+            serial=found["serial"],
+            model_hash=found["model_hash"],
+            commit=found["software"],
+            created=found["created"],
+        ),
+        hours=np.array([cycle["hours"] for cycle in cycles]),
+        decisions=[_decided(cycle) for cycle in cycles],
+        before=errors("before"),
+        after=errors("after"),
+        held=errors("oldest"),
+        parameter_names=names,
+        drift=np.array([[cycle["drift"][name] for name in names] for cycle in cycles]),
+        sigma=np.array([[cycle["sigma"][name] for name in names] for cycle in cycles]),
+    )
+
+
+def _decided(cycle: dict[str, Any]) -> Decided:
+    verdict = cycle["verdict"]
+    return Decided(
+        cycle["cycle"],
+        verdict["code"],
+        verdict["reason"],
+        cycle["revision"],
+        cycle["rejected"],
+        cycle["predicted_rms_mm"],
+    )
 
 
 def figures_of(error: Array) -> dict[str, float]:

@@ -7,6 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
 from robocal_ros.report.drift import TOLERANCE_MM, DriftReport
@@ -44,6 +45,7 @@ STYLE: Any = {  # matplotlib types its keys one by one
     "svg.fonttype": "path",
 }
 SHOWN_PARAMETERS = 8
+GREEK = {"theta": "\u03b8", "alpha": "\u03b1", "beta": "\u03b2"}
 
 
 def distances_mm(error: Array) -> Array:
@@ -56,13 +58,14 @@ def drift_over_time(report: DriftReport) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.6), layout="constrained")
         axes = figure.add_subplot()
-        hours = report.hours
-        _band(axes, hours, distances_mm(report.before), BEFORE, "without correction")
-        held, after = distances_mm(report.held), distances_mm(report.after)
-        # one saw-tooth: the correction ages until the next cycle renews it
-        x = np.repeat(hours, 2)
-        y = np.column_stack([held, after]).reshape(len(hours), 2, -1).reshape(2 * len(hours), -1)
-        _band(axes, x, y, AFTER, "with correction")
+        hours, poses = report.hours, report.before.shape[1]
+        cold = np.zeros((1, poses))  # the error counts from the cold robot
+        before = np.vstack([cold, distances_mm(report.before)])
+        _band(axes, np.append(0.0, hours), before, BEFORE, "without correction")
+        # a saw-tooth: the correction ages until a cycle renews it
+        both = np.stack([distances_mm(report.held), distances_mm(report.after)], axis=1)
+        x = np.append(0.0, np.repeat(hours, 2))
+        _band(axes, x, np.vstack([cold, both.reshape(-1, poses)]), AFTER, "with correction")
         for hour, decided in zip(hours, report.decisions, strict=True):
             if decided.code == "ACCEPT":
                 axes.plot(hour, 0.0, marker="^", color=AFTER, ms=5, clip_on=False, zorder=5)
@@ -73,6 +76,7 @@ def drift_over_time(report: DriftReport) -> Figure:
             ylim=(0.0, None),
             xlim=(0.0, float(hours[-1]) * 1.001),
         )
+        axes.yaxis.set_major_locator(MultipleLocator(TOLERANCE_MM))
         axes.set_title(_title("Tool error over the shift: mean, and 5 to 95 % of poses", report))
     return figure
 
@@ -112,6 +116,7 @@ def error_by_pose(report: DriftReport) -> Figure:
             ylim=(0.0, None),
             xlim=(0.0, len(order) + 1.0),
         )
+        axes.yaxis.set_major_locator(MultipleLocator(TOLERANCE_MM))
         axes.legend(loc="upper left", ncols=2, handletextpad=0.2)
         axes.grid(visible=False, axis="x")
         axes.set_title(_title("Each check pose: mean and range over the shift", report))
@@ -132,11 +137,17 @@ def parameter_drift(report: DriftReport) -> Figure:
             axes.step(report.hours, value, where="post", color=AFTER, lw=1.6)
             axes.axhline(0.0, color=FAINT, lw=0.8)
             name, _, unit = report.parameter_names[k].rpartition("_")
-            axes.set_title(f"{name}, {unit}")
+            axes.set_title(f"{_symbol(name)}, {unit}")
         for axes in grid[len(chosen) :]:
             axes.set_visible(False)
         figure.supxlabel("hours of production", fontsize=9, color=INK)
     return figure
+
+
+def _symbol(name: str) -> str:
+    for word, letter in GREEK.items():
+        name = name.replace(word, letter)
+    return name
 
 
 def _title(words: str, report: DriftReport) -> str:

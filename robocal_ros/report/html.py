@@ -95,8 +95,8 @@ def _errors(report: DriftReport) -> str:
     ]
     note = (
         '<p class="faint">mm at the tool, against where the cold robot put it. No check pose was '
-        "measured or used to solve. Fresh: right after each cycle. At its oldest: just before the "
-        "next one.</p>"
+        "measured or used to solve. Before a cycle the model in force is at its oldest; after it, "
+        "renewed where the verdict accepts.</p>"
     )
     return _table(head, rows, good=1) + note
 
