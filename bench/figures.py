@@ -1,0 +1,114 @@
+"""Figures of the README: ``tools/with_ros python bench/figures.py`` after ``make demo``.
+
+- ``ur10_campaigns.png``: real measurements (see ``ur10_campaigns``), mean error at poses that were
+  held out;
+- ``demo_shift.png``: the simulated shift of the demo, from its report in ``out/``.
+"""
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from bench.ur10_campaigns import SERIES, halves, load_campaign
+from robocal_ros.core.identification import identify_and_judge
+from robocal_ros.report.drift import read_report
+from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE, drift_over_time, png
+from robocal_ros.storage.robots import load_robot
+
+ROOT = Path(__file__).resolve().parent.parent
+IMAGES = ROOT / "docs" / "images"
+NAMES = {
+    "A": "A  grid, July 2020",
+    "B": "B  joint configurations, 2020",
+    "C": "C  random poses, 2020",
+    "D": "D  ISO cubes, March 2021",
+}
+
+
+def campaign_errors() -> dict[str, dict[str, float]]:
+    """Held-out mean errors, mm: nominal, calibrated on the other half, and with A's model."""
+    arm = load_robot("ur10")
+    found: dict[str, dict[str, float]] = {}
+    first = halves(load_campaign("A"))[0]
+    for series in SERIES:
+        data = load_campaign(series)
+        train, check = halves(data)
+        judged = identify_and_judge(arm, train, check)
+        found[series] = {
+            "nominal": judged.nominal.mean_m * 1e3,
+            "calibrated": judged.candidate.mean_m * 1e3,
+            "n": judged.candidate.n,
+        }
+        if series != "A":
+            later = identify_and_judge(arm, first, data, check_refit=("base", "tool"))
+            found[series]["old"] = later.candidate.mean_m * 1e3
+    return found
+
+
+def campaign_figure(found: Mapping[str, Mapping[str, float]]) -> Figure:
+    """A dumbbell for each campaign."""
+    with mpl.rc_context(STYLE | {"font.size": 10}):
+        figure = Figure(figsize=(8.0, 3.3), layout="constrained")
+        axes = figure.add_subplot()
+        for row, (series, errors) in enumerate(found.items()):
+            y = len(found) - row
+            before, after = errors["nominal"], errors["calibrated"]
+            axes.plot([after, before], [y, y], color="#d5dce0", lw=6, solid_capstyle="round")
+            axes.plot(before, y, "o", color=BEFORE, ms=11)
+            axes.plot(after, y, "o", color=AFTER, ms=11)
+            axes.annotate(f"{before:.2f}", (before, y), xytext=(12, -4), **_TEXT, color=BEFORE)
+            axes.annotate(
+                f"{after:.2f}", (after, y), xytext=(-12, -4), **_TEXT, color=AFTER, ha="right"
+            )
+            if "old" in errors:
+                axes.plot(errors["old"], y, "o", mfc="white", mec=AFTER, mew=1.6, ms=7)
+            axes.text(-0.015, y + 0.1, NAMES[series], ha="right", va="center")
+            axes.text(
+                -0.015, y - 0.22, f"{errors['n']:,} held-out poses".replace(",", "\u2009"),
+                ha="right", va="center", color=FAINT, fontsize=8,
+            )  # fmt: skip
+        _legend(axes)
+        axes.set(xlim=(0.0, 1.15), ylim=(0.4, len(found) + 0.75), yticks=[])
+        axes.set_xlabel("mean position error at held-out poses, mm")
+        axes.grid(visible=False, axis="y")
+        axes.spines["left"].set_visible(False)
+        figure.suptitle(
+            "A real UR10, measured by a laser tracker", x=0.012, ha="left", fontweight="bold",
+            fontsize=11.5,
+        )  # fmt: skip
+    return figure
+
+
+_TEXT: dict[str, Any] = {"textcoords": "offset points", "fontweight": "bold"}
+
+
+def _legend(axes: Any) -> None:
+    handles = [
+        axes.plot([], [], "o", color=AFTER, ms=9, label="calibrated on the other half")[0],
+        axes.plot([], [], "o", mfc="white", mec=AFTER, mew=1.6, ms=7,
+                  label="with the model of July 2020")[0],
+        axes.plot([], [], "o", color=BEFORE, ms=9, label="nominal model")[0],
+    ]  # fmt: skip
+    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 1.13), ncols=3,
+                columnspacing=1.4, handletextpad=0.1, fontsize=9)  # fmt: skip
+
+
+def main() -> None:
+    """Write the images."""
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    found = campaign_errors()
+    print(json.dumps(found, indent=1))
+    (IMAGES / "ur10_campaigns.png").write_bytes(png(campaign_figure(found)))
+    report = read_report(ROOT / "out" / "report.json", ROOT / "out" / "errors.csv")
+    (IMAGES / "demo_shift.png").write_bytes(png(drift_over_time(report)))
+
+
+if __name__ == "__main__":
+    main()
