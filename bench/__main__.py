@@ -1,0 +1,93 @@
+"""Make every table, print it, and keep it in docs/figures: ``python -m bench``."""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: the comparison is per thread
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from bench.tables import Table, show
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT = ROOT / "docs" / "figures"
+
+
+def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
+    from bench import monte_carlo, real_data, speed
+
+    return {
+        "real_data": real_data.tables,
+        "monte_carlo": monte_carlo.tables,
+        "speed": speed.tables,
+    }
+
+
+def _commit() -> str:
+    """The commit, with a mark when files differ from it."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    changed = git("status", "--porcelain", "--", "robocal_ros", "bench", "config")
+    return (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
+
+
+def _about(seconds: float) -> dict[str, str]:
+    import numpy
+    import scipy
+
+    return {
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        "machine": platform.machine(),
+        "duration_s": f"{seconds:.0f}",
+    }
+
+
+def _write(tables: Sequence[Table], about: dict[str, str]) -> None:
+    OUT.mkdir(parents=True, exist_ok=True)
+    document = {"about": about, "tables": [table.document() for table in tables]}
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    (OUT / "bench_core.json").write_text(text + "\n")
+    words = ", ".join(f"{name} {value}" for name, value in about.items())
+    body = "\n".join(table.markdown() for table in tables)
+    (OUT / "bench_core.md").write_text(f"Made by `make bench`: {words}.\n\n{body}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the chosen parts (all of them, which also writes the files); 1 when a goal is missed."""
+    parts = _parts()
+    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+    parser.add_argument("part", nargs="*", choices=[*parts, []], help=f"of {', '.join(parts)}")
+    chosen = parser.parse_args(arguments).part
+    tables: list[Table] = []
+    start = time.monotonic()
+    for name, make in parts.items():
+        if chosen and name not in chosen:
+            continue
+        made = make()
+        show(made)
+        tables += made
+    if not chosen:
+        _write(tables, _about(time.monotonic() - start))
+        print(f"written: {OUT / 'bench_core.json'}, {OUT / 'bench_core.md'}")
+    missed = [table.title for table in tables if not table.met]
+    for title in missed:
+        print(f"goal missed: {title}", file=sys.stderr)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,123 @@
+"""Real measurements: what a calibrated model is worth, at poses that it was not made from."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from bench.tables import Goal, Table
+from bench.ur10_campaigns import data_folder, halves, load_campaign
+from robocal_ros.core.assessment import ErrorSummary, summarise
+from robocal_ros.core.identification import JudgedIdentification, identify_and_judge
+from robocal_ros.core.kinematics.universal_robots import factory_arm, nominal_arm, parse_settings
+from robocal_ros.storage.robots import load_robot
+
+LARGEST_MEAN_MM = {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365}
+LARGEST_LATER_MEAN_MM = {"B": 0.455, "C": 0.52, "D": 0.40}
+LARGEST_UR5E_MEAN_MM, LARGEST_UR5E_MAX_MM = 0.0445, 0.081
+WHEN = {"A": "July 2020, grid", "B": "Nov. 2020", "C": "Nov. 2020, random", "D": "March 2021"}
+
+
+@lru_cache
+def own_half(series: str) -> JudgedIdentification:
+    """Identify from half of a campaign, judge on the other half."""
+    train, check = halves(load_campaign(series))
+    return identify_and_judge(load_robot("ur10"), train, check)
+
+
+@lru_cache
+def model_of_a(series: str) -> JudgedIdentification:
+    """The model of A's training half on another campaign: only base and tool refitted there."""
+    train, _ = halves(load_campaign("A"))
+    check = load_campaign(series)
+    return identify_and_judge(load_robot("ur10"), train, check, check_refit=("base", "tool"))
+
+
+@lru_cache
+def ur5e_errors() -> dict[str, ErrorSummary]:
+    """Distances from the controller's own poses, of the nominal and the factory's model."""
+    folder = data_folder().parent / "ur5e_factory"
+    nominal, delta = (
+        parse_settings((folder / name).read_text(), name)
+        for name in ("urcontrol.conf.UR5", "calibration.conf")
+    )
+    table = np.loadtxt(folder / "joint-eef-data.csv", delimiter=",", skiprows=1)
+    arms = {
+        "nominal": nominal_arm(nominal, "UR5e"),
+        "factory calibration, imported": factory_arm(nominal, delta, "UR5e"),
+    }
+    return {
+        name: summarise(arm.fk(np.radians(table[:, :6]))[:, :3, 3] - table[:, 6:9] * 1e-3)
+        for name, arm in arms.items()
+    }
+
+
+def _millimetres(errors: ErrorSummary) -> tuple[float, float, float, float]:
+    return errors.mean_m * 1e3, errors.rms_m * 1e3, errors.p95_m * 1e3, errors.max_m * 1e3
+
+
+def campaigns_table() -> Table:
+    """The four campaigns, each on its own held-out half."""
+    table = Table(
+        "ur10_campaigns",
+        "UR10 with laser tracker and T-Mac: errors of the T-Mac's origin at held-out poses, mm",
+        ("campaign", "poses", "model", "mean", "goal", "rms", "95 %", "max", "predicted rms"),
+        "Half of each campaign's poses identify base, T-Mac and geometry, the other half judges; "
+        "visits of one pose stay on one side. Nominal: base and T-Mac fitted to the same half. "
+        "Predicted: from the covariance and the residual noise.",
+    )
+    for series in "ABCD":
+        judged = own_half(series)
+        name = f"{series} ({WHEN[series]})"
+        nominal, after = _millimetres(judged.nominal), _millimetres(judged.candidate)
+        table.add(name, judged.nominal.n, "nominal", nominal[0], None, *nominal[1:], None)
+        goal = Goal(after[0], LARGEST_MEAN_MM[series])
+        predicted = judged.predicted_total_rms_m * 1e3
+        table.add("", judged.candidate.n, "calibrated", after[0], goal, *after[1:], predicted)
+    return table
+
+
+def later_table() -> Table:
+    """The model of campaign A months later."""
+    table = Table(
+        "ur10_later",
+        "The UR10's model of July 2020 in later campaigns: only base and T-Mac refitted, mm",
+        ("campaign", "poses", "nominal mean", "mean", "goal", "rms", "95 %", "max", "verdict"),
+        "The tracker stood elsewhere and the T-Mac was mounted anew, so those are fitted to the "
+        "later data, for both models; the geometry is A's.",
+    )
+    for series in "BCD":
+        judged = model_of_a(series)
+        after = _millimetres(judged.candidate)
+        table.add(
+            f"{series} ({WHEN[series]})", judged.candidate.n, judged.nominal.mean_m * 1e3,
+            after[0], Goal(after[0], LARGEST_LATER_MEAN_MM[series]), *after[1:],
+            judged.verdict.code.name,
+        )  # fmt: skip
+    return table
+
+
+def ur5e_table() -> Table:
+    """The factory calibration of a UR5e."""
+    table = Table(
+        "ur5e_factory",
+        "UR5e: distance from the poses of its own controller, 18 poses, mm",
+        ("model", "mean", "goal", "rms", "95 %", "max", "goal "),
+        "The controller's poses are rounded to 0.01 mm and 0.01 deg.",
+    )
+    for name, errors in ur5e_errors().items():
+        mean, rms, p95, largest = _millimetres(errors)
+        factory = name != "nominal"
+        table.add(
+            name, mean, Goal(mean, LARGEST_UR5E_MEAN_MM) if factory else None, rms, p95, largest,
+            Goal(largest, LARGEST_UR5E_MAX_MM) if factory else None,
+        )  # fmt: skip
+    return table
+
+
+def tables() -> Sequence[Table]:
+    """All tables of this module; none where the measurements are not here."""
+    if not data_folder().is_dir():
+        print(f"no real measurements at {data_folder()} (set ROBOCAL_DATA): their tables left out")
+        return []
+    return [campaigns_table(), later_table(), ur5e_table()]
