@@ -1,0 +1,143 @@
+"""Correction of the arm's drift and of the tool's change, each within its own bounds.
+
+First the drifted arm is put where the reference arm was, with the taught tool; then the new tool
+where the taught one is. Together this is the correction from (reference arm, taught tool) to
+(actual arm, new tool), but a bent tool's larger bounds do not loosen the arm's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.joint_correction import rates
+from robocal_ros.core.joint_correction.correction import (
+    CorrectionResult,
+    JointCorrection,
+    path_rates,
+)
+
+Array = NDArray[np.float64]
+
+# The inverse near a singularity is refined until it is exact to this (rad, m), or so often.
+EXACT = 1e-12
+MOST_REFINEMENTS = 30
+
+
+@dataclass(frozen=True)
+class StagedResult:
+    """Corrected joints (m, n), and the two corrections; ``tool`` is None for the taught tool."""
+
+    q: Array
+    arm: CorrectionResult
+    tool: CorrectionResult | None
+
+    @property
+    def whole(self) -> NDArray[np.bool_]:
+        """(m,) True where all of the correction was made."""
+        share = self.arm.share if self.tool is None else self.arm.share * self.tool.share
+        return np.asarray(share == 1.0)
+
+    @property
+    def remaining_m(self) -> Array:
+        """(m,) position error that remains at the tool, at most."""
+        rest = 0.0 if self.tool is None else self.tool.position_error_m
+        return np.asarray(self.arm.position_error_m + rest)
+
+
+class StagedCorrection:
+    """Correction from a reference model to one between two others.
+
+    Parameters
+    ----------
+    reference, start, end : packed models, see `pack_model`; blend s goes from start to end. The
+        taught tool is the reference's.
+    arm_largest, tool_largest : (n,) largest joint shift of each stage, rad (prismatic: m).
+    """
+
+    def __init__(
+        self, reference: Array, start: Array, end: Array, arm_largest: Array, tool_largest: Array
+    ) -> None:
+        taught = reference[-1]
+        bare = [model.copy() for model in (start, end)]
+        for model in bare:
+            model[-1] = taught
+        self.n = len(reference) - 2
+        self._arm = JointCorrection(np.stack([reference, reference, *bare]), arm_largest)
+        self._whole = JointCorrection(
+            np.stack([reference, reference, start, end]), arm_largest + tool_largest
+        )
+        self._tool: JointCorrection | None = None
+        if not (np.array_equal(start[-1], taught) and np.array_equal(end[-1], taught)):
+            self._tool = JointCorrection(np.stack([*bare, start, end]), tool_largest)
+
+    def correct(self, q: Array, s: Array) -> StagedResult:
+        """Correct joints (m, n) at blends (m,)."""
+        arm = self._arm.correct(q, s)
+        if self._tool is None:
+            return StagedResult(arm.q, arm, None)
+        tool = self._tool.correct(arm.q, s)
+        return StagedResult(tool.q, arm, tool)
+
+    def uncorrect(self, corrected: Array, s: Array) -> Array:
+        """Taught joints (m, n) of corrected ones: the inverse of `correct`.
+
+        Exact where the whole correction is made; near a singularity refined until it is, or
+        until it is as near as it gets.
+        """
+        q = corrected if self._tool is None else self._tool.inverse().correct(corrected, s).q
+        q = self._arm.inverse().correct(q, s).q
+        best = np.full(len(q), np.inf)
+        answer = q
+        for _ in range(MOST_REFINEMENTS):
+            ahead = self.correct(q, s)
+            miss = corrected - ahead.q
+            size = np.max(np.abs(miss), axis=1)
+            answer = np.where((size < best)[:, None], q, answer)
+            best = np.minimum(best, size)
+            if np.all(best < EXACT):
+                break
+            q = q + miss
+        return answer
+
+    def rates(
+        self,
+        q: Array,
+        velocity: Array,
+        acceleration: Array,
+        s: Array,
+        s_rate: Array,
+        result: StagedResult,
+    ) -> tuple[Array, Array]:
+        """Velocities and accelerations (m, n) of the corrected joints.
+
+        ``result`` is that of `correct` at ``q`` and ``s``; ``s_rate`` (m,) in 1/s. Analytic
+        where all of the correction is made by a settled model, else by central differences
+        along the path.
+        """
+        out_v, out_a = np.empty_like(q), np.empty_like(q)
+        models = self._whole.models
+        rates.rates_batch(q, velocity, acceleration, result.q, models, s, out_v, out_a)
+        plain = result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1)
+        rough = ~plain if self.n == 6 else np.ones(len(q), dtype=np.bool_)
+        if np.any(rough):
+
+            def corrected(p: Array, t: float) -> Array:
+                return self.correct(p, np.clip(s[rough] + s_rate[rough] * t, 0.0, 1.0)).q
+
+            out_v[rough], out_a[rough] = path_rates(
+                corrected, q[rough], velocity[rough], acceleration[rough]
+            )
+        return out_v, out_a
+
+    def taught_velocity(self, q: Array, corrected: Array, velocity: Array) -> Array:
+        """Velocities (m, n) of taught joints ``q`` while the corrected ones move at ``velocity``.
+
+        At the end of the blend. Where a singularity is near they are the corrected joints' own.
+        """
+        out, unused, zero = np.empty_like(q), np.empty_like(q), np.zeros_like(q)
+        models = self._whole.models[[2, 3, 0, 1]]
+        ones = np.ones(len(q))
+        rates.rates_batch(corrected, velocity, zero, q, models, ones, out, unused)
+        plain = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
+        return np.where(plain[:, None], out, velocity)

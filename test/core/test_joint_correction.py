@@ -1,0 +1,336 @@
+"""The correction reaches the taught pose, can be undone, and never leaves its bounds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocal_ros.core import frames
+from robocal_ros.core.joint_correction import JointCorrection, blend_models, pack_model
+from robocal_ros.core.joint_correction.staged import StagedCorrection
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.storage.robots import load_robot
+
+TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
+NM = 1e-9
+HOME = np.array([0.0, -1.2, 1.2, 0.0, 1.2, 0.0])  # of the KR 150, far from singular
+
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
+
+
+def robot(name: str) -> SerialArm:
+    return replace(load_robot(name), T_flange_tool=TOOL)
+
+
+def drifted(arm: SerialArm, rng: np.random.Generator, size_m: float) -> SerialArm:
+    """Random drift of all parameters that moves the flange by at most ``size_m``."""
+    chosen = arm.parameters
+    change = rng.standard_normal(len(chosen)) * np.where(chosen.is_length, 3e-4, 2e-4)
+    q = rng.uniform(-1.5, 1.5, (100, arm.n))
+
+    def scaled(scale: float) -> SerialArm:
+        mdh = arm.mdh.copy()
+        for (joint, column), x in zip(chosen.index, change, strict=True):
+            mdh[joint, column] += scale * x
+        return arm.with_mdh(mdh)
+
+    moved = np.linalg.norm((scaled(1.0).fk(q) - arm.fk(q))[:, :3, 3], axis=1).max()
+    return scaled(size_m / moved)
+
+
+def bent(arm: SerialArm, rng: np.random.Generator, shift_m: float, turn_deg: float) -> SerialArm:
+    """Another tool, shifted and turned by so much in a random direction."""
+    direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    change = frames.transform(frames.exp_rotation(axis * np.radians(turn_deg)), direction * shift_m)
+    return replace(arm, T_flange_tool=arm.T_flange_tool @ change)
+
+
+def tool_jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    J = arm.jacobian(q)
+    lever = (arm.fk(q)[..., :3, :3] @ arm.T_flange_tool[:3, 3])[..., None]
+    J[..., :3, :] += np.cross(J[..., 3:, :], lever, axis=-2)
+    return J
+
+
+def pose_error(arm: SerialArm, q: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
+    T = arm.fk(q) @ arm.T_flange_tool
+    turn = frames.log_rotation(goal[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2))
+    return (
+        float(np.linalg.norm((T - goal)[..., :3, 3], axis=-1).max()),
+        float(np.linalg.norm(turn, axis=-1).max()),
+    )
+
+
+def well_conditioned(arm: SerialArm, rng: np.random.Generator, m: int) -> np.ndarray:
+    q = rng.uniform(-2.0, 2.0, (m, arm.n))
+    return q[np.linalg.cond(tool_jacobian(arm, q)) < 1e3]
+
+
+@pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
+@pytest.mark.parametrize(
+    ("drift_m", "shift_m", "turn_deg", "most"),
+    [(1e-3, 0.0, 0.0, 3), (1e-3, 2e-3, 0.5, 3), (1e-3, 20e-3, 7.0, 5)],
+)
+def test_reaches_the_taught_pose(
+    name: str, drift_m: float, shift_m: float, turn_deg: float, most: int
+) -> None:
+    rng = np.random.default_rng(1)
+    reference = robot(name)
+    actual = bent(drifted(reference, rng, drift_m), rng, shift_m, turn_deg)
+    q = well_conditioned(actual, rng, 2000)
+    result = JointCorrection.between(reference, actual).correct(q)
+    whole = result.share == 1.0
+    goal = reference.fk(q) @ TOOL
+    position, rotation = pose_error(actual, result.q[whole], goal[whole])
+    assert position < NM
+    assert rotation < NM
+    assert result.position_error_m[whole].max() < NM
+    assert result.rotation_error_rad[whole].max() < NM
+    # A pose from which the goal lies beyond the reach, or too many radians away, has no solution.
+    assert np.mean(whole) > (0.92 if turn_deg < 1.0 else 0.6)
+    assert np.mean(result.iterations[whole] <= most) > 0.99
+    assert np.allclose(result.joint_shift, result.q - q)
+    apart = (actual.fk(q) @ actual.T_flange_tool - goal)[:, :3, 3]
+    assert np.allclose(result.tcp_shift_m, np.linalg.norm(apart, axis=1), rtol=0.0, atol=1e-14)
+
+
+def test_a_batch_gives_the_bits_of_single_points() -> None:
+    rng = np.random.default_rng(2)
+    reference = robot("kr150_r3100")
+    correction = JointCorrection.between(reference, drifted(reference, rng, 1e-3))
+    q = rng.uniform(-2.0, 2.0, (50, 6))
+    batch = correction.correct(q)
+    single = np.array([correction.point(row)[:6].copy() for row in q])
+    assert np.array_equal(batch.q, single)
+    one = correction.correct(q[3])
+    assert np.array_equal(one.q, single[3])
+    assert one.iterations == batch.iterations[3]
+
+
+def test_nothing_to_correct_gives_the_same_joints() -> None:
+    arm = robot("ur10")
+    q = np.random.default_rng(3).uniform(-2.0, 2.0, (100, 6))
+    result = JointCorrection.between(arm, arm).correct(q)
+    assert np.array_equal(result.q, q)
+    assert result.iterations.max() == 0
+    assert result.tcp_shift_m.max() < 1e-14
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6))
+def test_there_and_back_is_exact(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    reference = robot("kr150_r3100")
+    actual = bent(drifted(reference, rng, 1e-3), rng, 2e-3, 0.5)
+    correction = JointCorrection.between(reference, actual)
+    there = correction.correct(well_conditioned(reference, rng, 20))
+    back = correction.inverse().correct(there.q)
+    whole = (there.share == 1.0) & (back.share == 1.0)
+    assert np.sum(whole) > 10
+    taught = there.q - there.joint_shift
+    assert np.abs(back.q - taught)[whole].max() < 1e-12
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.floats(1e-5, 0.02), st.floats(1e-4, 0.5))
+def test_bounds_hold_at_and_around_singularities(seed: int, size: float, largest: float) -> None:
+    rng = np.random.default_rng(seed)
+    reference = robot("kr150_r3100")
+    actual = drifted(reference, rng, size)
+    q = rng.uniform(-2.0, 2.0, (200, 6))
+    q[:100, 4] = rng.choice([0.0, 1e-9, 1e-5, 1e-3, 1e-2], 100)  # wrist stretched
+    q[50:150, 2] = np.arctan2(-41.0, 1400.0) + rng.choice([0.0, 1e-8, 1e-3], 100)  # arm stretched
+    result = JointCorrection.between(reference, actual, largest).correct(q)
+    assert np.all(np.isfinite(result.q))
+    # The bound steers the first step; the solution bends a little beyond it at the most.
+    assert np.abs(result.joint_shift).max() <= 1.6 * largest
+    assert np.all(result.position_error_m <= result.tcp_shift_m + 1e-9)
+    assert np.all(result.rotation_error_rad <= result.tcp_rotation_rad + 1e-9)
+    expected = 1.0 - result.share[result.converged]
+    assert np.allclose(
+        result.position_error_m[result.converged],
+        expected * result.tcp_shift_m[result.converged],
+        rtol=1e-6,
+        atol=1e-9,
+    )
+
+
+def test_the_shift_is_continuous_through_a_wrist_singularity() -> None:
+    rng = np.random.default_rng(4)
+    reference = robot("kr150_r3100")
+    actual = drifted(reference, rng, 0.3e-3)
+    bound = np.radians(0.3)
+    q = np.tile([0.3, -1.2, 1.1, 0.4, 0.0, 0.5], (40_001, 1))
+    q[:, 4] = np.linspace(-0.1, 0.1, len(q))
+    result = JointCorrection.between(reference, actual, bound).correct(q)
+    assert np.all(result.converged)
+    assert result.share.min() < 0.1
+    shift = result.joint_shift
+    assert np.abs(shift).max() < 1.25 * bound
+    # The steps are 5 µrad of joint 5; a jump would be of the order of the bound.
+    assert np.abs(np.diff(shift, axis=0)).max() < 0.02 * bound
+
+
+def test_rates_follow_the_path() -> None:
+    rng = np.random.default_rng(5)
+    reference = robot("kr150_r3100")
+    actual = bent(drifted(reference, rng, 1e-3), rng, 2e-3, 0.5)
+    correction = JointCorrection.between(reference, actual)
+    q = HOME + rng.uniform(-0.5, 0.5, (300, 6))
+    qd, qdd = rng.uniform(-2.0, 2.0, (2, 300, 6))
+    v, a = correction.rates(q, qd, qdd)
+    h = 1e-4
+    before, after = (
+        correction.correct(q + qd * t + 0.5 * qdd * t * t).joint_shift for t in (-h, h)
+    )
+    assert np.abs(v - qd).max() > 1e-4
+    assert np.allclose(v, qd + (after - before) / (2 * h), rtol=0.0, atol=2e-7)
+    h = 3e-3
+    before, here, after = (
+        correction.correct(q + qd * t + 0.5 * qdd * t * t).joint_shift for t in (-h, 0.0, h)
+    )
+    shift_a = (after - 2 * here + before) / h**2
+    assert np.allclose(a, qdd + shift_a, rtol=0.0, atol=1e-3 * np.abs(shift_a).max())
+
+
+def test_rates_are_those_of_the_tool() -> None:
+    """The twist of the tool at the corrected joints is that of the reference tool, to 1e-9."""
+    rng = np.random.default_rng(6)
+    reference = robot("ur10")
+    actual = drifted(reference, rng, 1e-3)
+    correction = JointCorrection.between(reference, actual)
+    q = well_conditioned(reference, rng, 200)
+    qd = rng.uniform(-1.0, 1.0, q.shape)
+    result = correction.correct(q)
+    v, _ = correction.rates(q, qd, np.zeros_like(q))
+    wanted = (tool_jacobian(reference, q) @ qd[..., None])[..., 0]
+    found = (tool_jacobian(actual, result.q) @ v[..., None])[..., 0]
+    whole = result.share == 1.0
+    assert np.abs(found - wanted)[whole].max() < 1e-9
+
+
+def test_an_arm_at_rest_stays_at_rest() -> None:
+    reference = robot("kr150_r3100")
+    actual = drifted(reference, np.random.default_rng(7), 1e-3)
+    zero = np.zeros((1, 6))
+    v, a = JointCorrection.between(reference, actual).rates(
+        [[0.1, -1.5, 1.4, 0.2, 0.9, 0.3]], *[zero] * 2
+    )
+    assert np.all(v == 0.0)
+    assert np.all(a == 0.0)
+
+
+def test_rates_with_a_sliding_joint_match_differences() -> None:
+    rng = np.random.default_rng(8)
+    reference = load_robot("p1r2p3")
+    actual = drifted(reference, rng, 1e-3)
+    correction = JointCorrection.between(reference, actual)
+    q = rng.uniform(0.1, 0.4, (20, 3))
+    qd = rng.uniform(-0.5, 0.5, (20, 3))
+    v, _ = correction.rates(q, qd, np.zeros_like(q))
+    h = 1e-4
+    numeric = (correction.correct(q + h * qd).q - correction.correct(q - h * qd).q) / (2 * h)
+    assert np.allclose(v, numeric, rtol=0.0, atol=1e-6)
+
+
+def test_an_arm_of_three_joints_gets_as_near_as_it_can() -> None:
+    rng = np.random.default_rng(9)
+    reference = load_robot("p1r2p3")
+    actual = drifted(reference, rng, 1e-3)
+    q = rng.uniform(0.1, 0.4, (20, 3))
+    result = JointCorrection.between(reference, actual).correct(q)
+    assert np.all(result.converged)
+    before = np.hypot(result.tcp_shift_m, result.tcp_rotation_rad)
+    after = np.hypot(result.position_error_m, result.rotation_error_rad)
+    assert np.all(after < before)
+    nearby = result.q + rng.uniform(-1e-4, 1e-4, q.shape)
+    for row, moved, least in zip(q, nearby, after, strict=True):
+        assert np.hypot(*pose_error(actual, moved, reference.fk(row))) >= least - 1e-9
+
+
+def seven_joints() -> SerialArm:
+    alpha = np.radians([-90, 90, 90, -90, -90, 90, 0])
+    mdh = np.zeros((7, 5))
+    mdh[:, 0] = [0.34, 0.0, 0.4, 0.0, 0.4, 0.0, 0.126]
+    mdh[:, 3] = alpha
+    names = tuple(f"joint_{i}" for i in range(7))
+    limit = np.full(7, np.inf)
+    return SerialArm("seven", names, mdh, np.ones(7), np.zeros(7, dtype=np.bool_), -limit, limit)
+
+
+def test_a_redundant_arm_reaches_the_pose_with_a_small_shift() -> None:
+    rng = np.random.default_rng(10)
+    reference = seven_joints()
+    mdh = reference.mdh + rng.standard_normal((7, 5)) * 2e-4
+    actual = reference.with_mdh(mdh)
+    q = rng.uniform(0.3, 1.2, (50, 7))
+    result = JointCorrection.between(reference, actual).correct(q)
+    assert np.all(result.converged)
+    position, rotation = pose_error(actual, result.q, reference.fk(q))
+    assert position < NM
+    assert rotation < NM
+    assert np.abs(result.joint_shift).max() < 0.02
+
+
+def test_models_blend_from_one_to_the_other() -> None:
+    rng = np.random.default_rng(11)
+    reference = robot("kr150_r3100")
+    actual = bent(drifted(reference, rng, 1e-3), rng, 5e-3, 2.0)
+    start, end = pack_model(reference), pack_model(actual)
+    assert np.array_equal(blend_models(start, end, 0.0), start)
+    assert np.array_equal(blend_models(start, end, 1.0), end)
+    q = np.array([0.3, -1.2, 1.1, 0.4, 0.8, 0.5])
+    correction = JointCorrection(np.stack([start, start, start, end]))
+    s = np.linspace(0.0, 1.0, 101)
+    shift = correction.correct(np.tile(q, (101, 1)), s).joint_shift
+    assert np.all(shift[0] == 0.0)
+    half = JointCorrection(np.stack([start, start, *[blend_models(start, end, 0.5)] * 2]))
+    assert np.allclose(half.correct(q).joint_shift, shift[50], rtol=0.0, atol=1e-14)
+    # nearly linear: no step is more than a few per cent beside the mean one
+    steps = np.diff(shift, axis=0)
+    assert np.abs(steps - steps.mean(axis=0)).max() < 0.05 * np.abs(steps).max()
+
+
+def test_stages_together_are_the_whole_correction_and_undo_it() -> None:
+    rng = np.random.default_rng(12)
+    reference = robot("kr150_r3100")
+    actual = bent(drifted(reference, rng, 0.5e-3), rng, 5e-3, 1.0)
+    start, end = pack_model(reference), pack_model(actual)
+    stage = StagedCorrection(start, start, end, np.full(6, 0.1), np.full(6, 0.5))
+    q = HOME + rng.uniform(-0.5, 0.5, (100, 6))
+    ones = np.ones(100)
+    result = stage.correct(q, ones)
+    assert np.all(result.whole)
+    direct = JointCorrection.between(reference, actual).correct(q)
+    assert np.abs(result.q - direct.q).max() < 1e-12
+    assert np.abs(stage.uncorrect(result.q, ones) - q).max() < 1e-12
+    assert result.tool is not None
+    assert result.tool.tcp_shift_m == pytest.approx(np.full(100, 5e-3), rel=1e-6)
+
+
+def test_undoing_is_exact_where_only_a_share_was_corrected() -> None:
+    rng = np.random.default_rng(13)
+    reference = robot("kr150_r3100")
+    actual = drifted(reference, rng, 0.1e-3)
+    start, end = pack_model(reference), pack_model(actual)
+    bound = np.full(6, np.radians(0.3))
+    stage = StagedCorrection(start, start, end, bound, bound)
+    q = np.tile([0.3, -1.2, 1.1, 0.4, 0.0, 0.5], (201, 1))
+    q[:, 4] = np.linspace(-0.05, 0.05, 201)
+    ones = np.ones(201)
+    result = stage.correct(q, ones)
+    assert not np.all(result.whole)
+    assert np.abs(stage.uncorrect(result.q, ones) - q).max() < 1e-9
+
+
+def test_wrong_shapes_are_a_callers_mistake() -> None:
+    arm = robot("ur10")
+    with pytest.raises(ValueError, match="different joints"):
+        JointCorrection.between(arm, load_robot("p1r2p3"))
+    with pytest.raises(ValueError, match="positive"):
+        JointCorrection.between(arm, arm, 0.0)
+    with pytest.raises(ValueError, match="models have shape"):
+        JointCorrection(np.zeros((2, 8, 9)))
