@@ -1,0 +1,98 @@
+"""The model that commands are corrected with: one at every instant, never a step.
+
+Models are packed (see ``core.joint_correction.pack_model``) and compared by identity: a settled
+blend *is* the model that is wanted.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.joint_correction import blend_models
+from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
+
+Array = NDArray[np.float64]
+
+# A controller's quintic between two points moves at most this much faster than their mean rate.
+SPLINE_PEAK = 1.875
+MOST_TRIES = 6
+
+
+@dataclass(frozen=True)
+class Commanded:
+    """The model in the commands that were last put out, as a function of time.
+
+    Attributes
+    ----------
+    start, end : packed models; a constant one has both the same.
+    begin_s : start of the trajectory on the session's clock.
+    times_s, s : (m,) blend along the trajectory; constant before and after.
+    """
+
+    start: Array
+    end: Array
+    begin_s: float = 0.0
+    times_s: Array | None = None
+    s: Array | None = None
+
+    def at(self, now_s: float) -> Array:
+        """The packed model at an instant."""
+        if self.start is self.end or self.times_s is None or self.s is None:
+            return self.end
+        s = float(np.interp(now_s - self.begin_s, self.times_s, self.s))
+        if s <= 0.0:
+            return self.start
+        return self.end if s >= 1.0 else blend_models(self.start, self.end, s)
+
+
+def step_towards(
+    stage: StagedCorrection, q: Array, rates: Array, dt_s: float
+) -> tuple[float, StagedResult]:
+    """How far a stream may blend within ``dt_s``, and the corrected point (1, n) there.
+
+    No joint's correction at ``q`` (1, n) changes by more than ``rates`` (n,) times ``dt_s``.
+    """
+    allowed = rates * dt_s
+    here = stage.correct(q, np.zeros(1))
+    s = 1.0
+    for _ in range(MOST_TRIES):
+        there = stage.correct(q, np.array([s]))
+        change = np.abs(there.q - here.q)[0]
+        if np.all(change <= allowed):
+            return s, there
+        with np.errstate(divide="ignore"):
+            s *= 0.98 * float(np.min(np.where(change > 0.0, allowed / change, 1.0)))
+    return 0.0, here
+
+
+def blend_along(
+    stage: StagedCorrection, q: Array, times_s: Array, elapsed_s: float, rates: Array
+) -> Array:
+    """Blend (m,) at the points of a trajectory ``q`` (m, n), never faster than ``rates`` (n,).
+
+    It begins at s = 0 when ``elapsed_s`` of the trajectory have passed (0 for one that begins
+    now) and runs along the time from start.
+    """
+    m = len(q)
+    whole = np.abs(stage.correct(q, np.ones(m)).q - stage.correct(q, np.zeros(m)).q)
+    with np.errstate(divide="ignore"):
+        slowest = np.min(rates / SPLINE_PEAK / whole, axis=1)  # of s, 1/s
+    before = np.concatenate([slowest[:1], slowest[:-1]])
+    time = np.maximum(times_s, elapsed_s)
+    dt = np.diff(time, prepend=max(elapsed_s, 0.0))
+    with np.errstate(invalid="ignore"):
+        ds = np.where(dt > 0.0, dt * np.minimum(slowest, before), 0.0)
+    return np.asarray(np.minimum(np.cumsum(ds), 1.0))
+
+
+def blend_rates(times_s: Array, s: Array) -> Array:
+    """Rate of s (m,) at the points, 1/s: the slower of both sides, at rest at both ends.
+
+    So a trajectory that ends at rest still does.
+    """
+    rate = np.zeros(len(s))
+    if len(s) > 2:
+        slope = np.diff(s) / np.diff(times_s)
+        rate[1:-1] = np.minimum(slope[:-1], slope[1:])
+    return rate

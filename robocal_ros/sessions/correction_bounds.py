@@ -1,0 +1,122 @@
+"""Bounds of the joint correction, and what is checked against them."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.joint_correction.staged import StagedResult
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.correction_inputs import Reason, RefusedError
+
+Array = NDArray[np.float64]
+
+# What floating point adds to a value that lies on its bound.
+ROUNDING = 1e-9
+# Near a singularity less is corrected from this share of the bound on, which the first Newton
+# step is held against: the solution may bend a little beyond its first step.
+FADES_FROM = 0.8
+
+
+@dataclass(frozen=True)
+class ShiftBounds:
+    """Largest correction: at the tool (m, rad) and of one joint (rad; prismatic: ``tcp_m``)."""
+
+    tcp_m: float
+    tcp_rad: float
+    joint_rad: float
+
+    def of_joints(self, arm: SerialArm) -> Array:
+        """(n,) largest shift of each joint."""
+        return np.where(arm.prismatic, self.tcp_m, self.joint_rad)
+
+
+def _degrees(value: float) -> float:
+    return float(np.radians(value))
+
+
+@dataclass(frozen=True)
+class CorrectionConfig:
+    """Settings of a correction session.
+
+    Attributes
+    ----------
+    thermal, tool : bounds of the arm's drift and of the tool's change.
+    blend_rad_s, blend_m_s : fastest change of a joint's correction (prismatic: m/s).
+    longest_step_s : a pause in a stream advances the blend by no more than this.
+    flange_frame : parent of an acceptable tool frame.
+    """
+
+    thermal: ShiftBounds = field(
+        default_factory=lambda: ShiftBounds(1e-3, _degrees(0.1), _degrees(0.3))
+    )
+    tool: ShiftBounds = field(
+        default_factory=lambda: ShiftBounds(10e-3, _degrees(3.0), _degrees(5.0))
+    )
+    blend_rad_s: float = field(default_factory=lambda: _degrees(0.5))
+    blend_m_s: float = 1e-3
+    longest_step_s: float = 0.02
+    flange_frame: str = "tool0"
+
+    def blend_rates(self, arm: SerialArm) -> Array:
+        """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""
+        return np.where(arm.prismatic, self.blend_m_s, self.blend_rad_s)
+
+
+def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialArm) -> None:
+    """Refuse a correction that is beyond its bounds; names the first point that is.
+
+    Near a singularity the arm's drift may be corrected in part: what remains is less than the
+    bound at the tool. A tool's change is corrected in full or not at all.
+    """
+    drift = result.arm
+    bound = config.thermal
+    _require(
+        (drift.tcp_shift_m <= bound.tcp_m + ROUNDING)
+        & (drift.tcp_rotation_rad <= bound.tcp_rad + ROUNDING),
+        Reason.TCP_BOUND,
+        f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
+        f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "
+        f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
+    )
+    _require_joints(drift.joint_shift, bound.of_joints(arm), arm)
+    if result.tool is not None:
+        detail = "a singularity is too near to make up for the tool's change"
+        _require(result.tool.share == 1.0, Reason.JOINT_BOUND, detail)
+        _require_joints(result.tool.joint_shift, config.tool.of_joints(arm), arm)
+
+
+def require_solved(result: StagedResult) -> None:
+    """Refuse a point that has no solution near by."""
+    solved = result.arm.converged
+    if result.tool is not None:
+        solved = solved & result.tool.converged
+    _require(solved, Reason.NOT_SOLVED, "the pose is at the edge of the reach")
+
+
+def require_limits(q: Array, arm: SerialArm) -> None:
+    """Refuse joints (m, n) beyond the arm's limits."""
+    outside = (q < arm.lower - ROUNDING) | (q > arm.upper + ROUNDING)
+    if np.any(outside):
+        point, joint = np.argwhere(outside)[0]
+        raise RefusedError(
+            Reason.JOINT_LIMIT,
+            f"{arm.joint_names[joint]} would be at {q[point, joint]:.6f}, allowed "
+            f"{arm.lower[joint]:.6f} to {arm.upper[joint]:.6f} (point {point + 1})",
+        )
+
+
+def _require(fine: NDArray[np.bool_], reason: Reason, detail: str) -> None:
+    if not np.all(fine):
+        raise RefusedError(reason, f"{detail} (point {int(np.argmin(fine)) + 1})")
+
+
+def _require_joints(shift: Array, largest: Array, arm: SerialArm) -> None:
+    over = np.abs(shift) > largest + ROUNDING
+    if np.any(over):
+        point, joint = np.argwhere(over)[0]
+        raise RefusedError(
+            Reason.JOINT_BOUND,
+            f"{arm.joint_names[joint]} by {shift[point, joint]:.6f}, allowed "
+            f"{largest[joint]:.6f} (point {point + 1})",
+        )

@@ -1,0 +1,143 @@
+"""Which models and tools the correction takes over."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.joint_correction import JointCorrection
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.correction_bounds import ROUNDING, CorrectionConfig
+from robocal_ros.sessions.correction_inputs import (
+    OfferedModel,
+    OfferedTool,
+    Reason,
+    RefusedError,
+)
+
+Array = NDArray[np.float64]
+
+
+class CorrectionGate:
+    """Judges offered models and tools, and keeps the last good ones.
+
+    Attributes
+    ----------
+    revision : of the model taken over, None before the first.
+    """
+
+    def __init__(
+        self, nominal: SerialArm, reference: SerialArm, serial: str, config: CorrectionConfig
+    ) -> None:
+        if nominal.joint_names != reference.joint_names or np.any(
+            (nominal.sign != reference.sign) | (nominal.prismatic != reference.prismatic)
+        ):
+            raise ValueError("nominal and reference model have different joints")
+        self._nominal = nominal
+        self._reference = reference
+        self._serial = serial
+        self._config = config
+        self._model: OfferedModel | None = None
+        self._tool: Array | None = None
+        self.revision: int | None = None
+
+    @property
+    def new_tool(self) -> bool:
+        """Whether a tool other than the taught one is in use."""
+        return self._tool is not None
+
+    @property
+    def actual(self) -> SerialArm | None:
+        """The actual arm with its tool; None before a model or a tool was taken over."""
+        if self._model is None and self._tool is None:
+            return None
+        arm = self._arm_of(self._model) if self._model is not None else self._reference
+        return arm if self._tool is None else replace(arm, T_flange_tool=self._tool)
+
+    def take_model(self, model: OfferedModel, taught: Array) -> None:
+        """Take over a model; ``taught`` (n,) is where the robot is, NaN when not known.
+
+        Raises
+        ------
+        RefusedError
+            When it is not accepted, made for another robot, older than the one in use, or would
+            move the tool beyond the bounds where the robot is.
+        """
+        if not model.accepted:
+            raise RefusedError(Reason.NOT_ACCEPTED, f"revision {model.revision}")
+        self._require_robot(model)
+        if self.revision is not None and model.revision < self.revision:
+            detail = f"revision {model.revision} after {self.revision}"
+            raise RefusedError(Reason.OLD_REVISION, detail)
+        if self._model is not None and model.revision == self.revision:
+            same = np.array_equal(model.mdh, self._model.mdh) and np.array_equal(
+                model.T_base_root, self._model.T_base_root
+            )
+            if not same:
+                detail = f"revision {model.revision} comes with other numbers than before"
+                raise RefusedError(Reason.OLD_REVISION, detail)
+            return
+        if np.all(np.isfinite(taught)):
+            self._require_small(self._arm_of(model), taught)
+        self._model, self.revision = model, model.revision
+
+    def _require_robot(self, model: OfferedModel) -> None:
+        expected = {
+            "robot": (model.robot, self._nominal.name),
+            "serial": (model.serial, self._serial),
+            "nominal model's hash": (model.model_hash, self._nominal.model_hash),
+            "joints": (model.joint_names, self._nominal.joint_names),
+        }
+        for what, (found, own) in expected.items():
+            if found != own:
+                raise RefusedError(Reason.WRONG_ROBOT, f"{what} {found}, this is {own}")
+
+    def _arm_of(self, model: OfferedModel) -> SerialArm:
+        """The offered arm; the nominal one says that no drift is known: then the reference."""
+        nominal = self._nominal
+        # The root travels as a quaternion: equal up to rounding.
+        if np.array_equal(model.mdh, nominal.mdh) and np.allclose(
+            model.T_base_root, nominal.T_base_root, rtol=0.0, atol=1e-12
+        ):
+            return self._reference
+        return replace(self._reference, mdh=model.mdh, T_base_root=model.T_base_root)
+
+    def _require_small(self, arm: SerialArm, taught: Array) -> None:
+        shift = JointCorrection.between(self._reference, arm).correct(taught)
+        bound = self._config.thermal
+        if (
+            shift.tcp_shift_m > bound.tcp_m + ROUNDING
+            or shift.tcp_rotation_rad > bound.tcp_rad + ROUNDING
+        ):
+            raise RefusedError(
+                Reason.TCP_BOUND,
+                f"{shift.tcp_shift_m * 1e3:.3f} mm and {np.degrees(shift.tcp_rotation_rad):.3f} "
+                f"deg where the robot is, allowed {bound.tcp_m * 1e3:g} mm and "
+                f"{np.degrees(bound.tcp_rad):g} deg",
+            )
+
+    def take_tool(self, tool: OfferedTool) -> None:
+        """Take over a tool frame.
+
+        Raises
+        ------
+        RefusedError
+            When its parent is not the flange, or it is too far from the taught tool.
+        """
+        if tool.parent != self._config.flange_frame:
+            detail = f"parent '{tool.parent}', expected '{self._config.flange_frame}'"
+            raise RefusedError(Reason.BAD_TOOL, detail)
+        taught = self._reference.T_flange_tool
+        shift = float(np.linalg.norm(tool.T_flange_tool[:3, 3] - taught[:3, 3]))
+        turn = float(
+            np.linalg.norm(frames.log_rotation(tool.T_flange_tool[:3, :3] @ taught[:3, :3].T))
+        )
+        bound = self._config.tool
+        if shift > bound.tcp_m + ROUNDING or turn > bound.tcp_rad + ROUNDING:
+            raise RefusedError(
+                Reason.TOOL_BOUND,
+                f"{shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg from the taught tool, "
+                f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
+            )
+        self._tool = tool.T_flange_tool

@@ -1,0 +1,659 @@
+"""The correction session: off until asked, never a jump, never beyond its bounds, never NaN."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocal_ros.core import frames
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.correction import CorrectionSession
+from robocal_ros.sessions.correction_bounds import CorrectionConfig
+from robocal_ros.sessions.correction_inputs import (
+    CORRECTED,
+    TAUGHT,
+    JointCommand,
+    OfferedModel,
+    OfferedTool,
+    Reason,
+    RefusedError,
+    TrajectoryCommand,
+    joint_command,
+    trajectory_command,
+)
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = replace(
+    load_robot("kr150_r3100"),
+    T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2]),
+)
+NAMES = NOMINAL.joint_names
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+RATE = np.radians(0.5)
+DT = 0.002
+ROUNDING = 1e-12
+NOT_STRAIGHT = 2e-5  # rad, of up to 5 deg of correction blended between two points
+
+
+def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:
+    """A drift of about 0.12 mm times ``size`` at the tool."""
+    rng = np.random.default_rng(seed)
+    chosen = NOMINAL.parameters
+    change = rng.standard_normal(len(chosen)) * np.where(chosen.is_length, 8e-5, 4e-5)
+    mdh = NOMINAL.mdh.copy()
+    for (joint, column), x in zip(chosen.index, change, strict=True):
+        mdh[joint, column] += size * x
+    return NOMINAL.with_mdh(mdh)
+
+
+def offer(arm: SerialArm, revision: int = 1, **changes: Any) -> OfferedModel:
+    model = OfferedModel(
+        robot=NOMINAL.name,
+        serial="s1",
+        model_hash=NOMINAL.model_hash,
+        revision=revision,
+        accepted=True,
+        joint_names=NAMES,
+        mdh=arm.mdh,
+    )
+    return replace(model, **changes)
+
+
+def bent_tool(shift_m: float = 2e-3, turn_deg: float = 0.5) -> OfferedTool:
+    change = frames.transform(frames.exp_rotation([0, np.radians(turn_deg), 0]), [shift_m, 0, 0])
+    return OfferedTool("tool0", NOMINAL.T_flange_tool @ change)
+
+
+class Robot:
+    """A session, and the time in which it is used."""
+
+    def __init__(self, **config: Any) -> None:
+        self.session = CorrectionSession(NOMINAL, NOMINAL, "s1", CorrectionConfig(**config))
+        self.now = 100.0
+
+    def stream(self, q: np.ndarray = HOME, dt: float = DT, **fields: Any) -> np.ndarray:
+        self.now += dt
+        return self.session.target(JointCommand(NAMES, np.array(q), **fields), self.now).position
+
+    def settle(self) -> np.ndarray:
+        out = self.stream()
+        for _ in range(5000):
+            out = self.stream()
+            if self.session.status().settled:
+                return out
+        pytest.fail("the blend does not end")
+
+    def read(self, q: np.ndarray, **fields: Any) -> JointCommand:
+        return self.session.reading(JointCommand(NAMES, np.array(q), **fields), self.now)
+
+
+def pose(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    return arm.fk(q) @ arm.T_flange_tool
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm((a - b)[..., :3, 3], axis=-1).max())
+
+
+def refused(reason: Reason, act: Any, *arguments: Any, **fields: Any) -> str:
+    with pytest.raises(RefusedError) as caught:
+        act(*arguments, **fields)
+    assert caught.value.reason is reason
+    return str(caught.value)
+
+
+@pytest.fixture
+def robot() -> Robot:
+    return Robot()
+
+
+@pytest.fixture
+def warm() -> Robot:
+    """Enabled, with a drifted model, settled."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.session.enable(True)
+    robot.settle()
+    return robot
+
+
+# ---- off, on, off --------------------------------------------------------------------------------
+
+
+def test_off_until_enabled(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted()))
+    robot.session.offer_tool(bent_tool())
+    for _ in range(100):
+        assert np.array_equal(robot.stream(), HOME)
+    points = np.stack([HOME, HOME + 0.1])
+    command = TrajectoryCommand(NAMES, points, np.array([0.0, 5.0]))
+    assert robot.session.trajectory(command, robot.now) is command
+    assert np.array_equal(robot.read(HOME).position, HOME)
+    status = robot.session.status()
+    assert not status.enabled
+    assert not status.active
+    assert status.revision == 1
+
+
+def test_enabled_without_a_model_changes_nothing(robot: Robot) -> None:
+    robot.session.enable(True)
+    assert np.array_equal(robot.stream(), HOME)
+
+
+def test_reaches_the_taught_pose_and_goes_back(robot: Robot) -> None:
+    actual = drifted()
+    robot.session.offer_model(offer(actual))
+    robot.session.enable(True)
+    q = robot.settle()
+    goal = pose(NOMINAL, HOME)
+    assert distance(pose(actual, HOME), goal) > 1e-4
+    assert distance(pose(actual, q), goal) < 1e-9
+    assert np.allclose(robot.read(q).position, HOME, rtol=0.0, atol=1e-12)
+    robot.session.enable(False)
+    assert np.array_equal(robot.settle(), HOME)
+    assert not robot.session.status().active
+
+
+def test_reaches_it_with_a_new_tool_too(warm: Robot) -> None:
+    tool = bent_tool()
+    warm.session.offer_tool(tool)
+    q = warm.settle()
+    actual = replace(drifted(), T_flange_tool=tool.T_flange_tool)
+    assert distance(pose(actual, q), pose(NOMINAL, HOME)) < 1e-9
+    assert np.allclose(warm.read(q).position, HOME, rtol=0.0, atol=1e-12)
+
+
+def test_the_reference_is_what_the_program_was_taught_with() -> None:
+    cold = drifted(20.0, seed=5)  # millimetres from the nominal model
+    warm_arm = cold.with_mdh(cold.mdh + drifted().mdh - NOMINAL.mdh)
+    robot = Robot()
+    robot.session = CorrectionSession(NOMINAL, cold, "s1")
+    robot.session.offer_model(offer(warm_arm))
+    robot.session.enable(True)
+    q = robot.settle()
+    assert distance(pose(warm_arm, q), pose(cold, HOME)) < 1e-9
+    # back to the nominal model: no drift is known, so nothing is corrected
+    robot.session.offer_model(offer(NOMINAL, revision=2))
+    assert np.array_equal(robot.settle(), HOME)
+
+
+def test_the_blend_moves_no_joint_faster_than_its_bound(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.offer_tool(bent_tool())
+    robot.session.enable(True)
+    outputs = [robot.stream()]
+    while not robot.session.status().settled:
+        outputs.append(robot.stream())
+    speed = np.abs(np.diff(outputs, axis=0)).max(axis=1) / DT
+    assert speed.max() <= RATE + ROUNDING / DT
+    assert np.median(speed) > 0.9 * RATE
+
+
+def test_a_pause_does_not_let_the_blend_jump(robot: Robot) -> None:
+    robot.stream()
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    assert np.abs(robot.stream(dt=100.0) - HOME).max() <= RATE * 0.02 + ROUNDING
+
+
+# ---- continuity for any sequence of events -------------------------------------------------------
+
+EVENTS = st.lists(
+    st.tuples(
+        st.sampled_from(
+            ["on", "off", "model", "nominal", "tool", "taught tool", "stop", "nothing"]
+        ),
+        st.integers(0, 5),
+        st.integers(1, 60),
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+def happen(robot: Robot, what: str, seed: int, revision: int) -> None:
+    session = robot.session
+    if what in ("on", "off"):
+        session.enable(what == "on")
+    elif what == "model":
+        session.offer_model(offer(drifted(0.4 * seed, seed), revision))
+    elif what == "nominal":
+        session.offer_model(offer(NOMINAL, revision))
+    elif what == "tool":
+        session.offer_tool(bent_tool(1e-3 * seed, 0.3 * seed))
+    elif what == "taught tool":
+        session.offer_tool(bent_tool(0.0, 0.0))
+    elif what == "stop":
+        empty = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
+        assert session.trajectory(empty, robot.now) is empty
+
+
+@settings(max_examples=25, deadline=None)
+@given(EVENTS)
+def test_no_sequence_of_events_makes_a_stream_jump(events: list[tuple[str, int, int]]) -> None:
+    """At a standing target every step is a blend's; readings give the taught joints throughout."""
+    robot = Robot(thermal=CorrectionConfig().tool)
+    last = robot.stream()
+    for revision, (what, seed, count) in enumerate(events, start=1):
+        happen(robot, what, seed, revision)
+        for _ in range(count):
+            q = robot.stream()
+            assert np.all(np.isfinite(q))
+            assert np.abs(q - last).max() <= RATE * DT + ROUNDING
+            assert np.allclose(robot.read(q).position, HOME, rtol=0.0, atol=1e-11)
+            last = q
+
+
+@settings(max_examples=25, deadline=None)
+@given(EVENTS, st.floats(0.05, 2.0))
+def test_a_moving_stream_steps_no_more_than_its_motion_and_the_blend(
+    events: list[tuple[str, int, int]], speed: float
+) -> None:
+    robot = Robot(thermal=CorrectionConfig().tool)
+    t, shift = 0.0, np.zeros(6)
+    for revision, (what, seed, count) in enumerate(events, start=1):
+        happen(robot, what, seed, revision)
+        for _ in range(count):
+            t += DT
+            q = HOME + 0.3 * np.sin(speed * t)
+            now = robot.stream(q) - q
+            # By the motion, a correction of some mrad changes by some mrad per rad moved.
+            by_motion = 0.3 * speed * DT * 0.15
+            assert np.abs(now - shift).max() <= RATE * DT + by_motion
+            shift = now
+
+
+@settings(max_examples=25, deadline=None)
+@given(EVENTS, st.integers(2, 30), st.floats(0.2, 4.0))
+def test_trajectories_start_where_the_last_command_was_and_never_jump(
+    events: list[tuple[str, int, int]], m: int, duration: float
+) -> None:
+    """A resting trajectory: whatever is sent when, the shift along time is continuous."""
+    robot = Robot(thermal=CorrectionConfig().tool)
+    times = np.linspace(0.0, duration, m)
+    points = np.tile(HOME, (m, 1))
+    last = np.zeros(6)
+    for revision, (what, seed, count) in enumerate(events, start=1):
+        happen(robot, what, seed, revision)
+        command = TrajectoryCommand(NAMES, points, times, np.zeros((m, 6)), np.zeros((m, 6)))
+        out = robot.session.trajectory(command, robot.now)
+        assert np.array_equal(out.time_from_start_s, times)
+        assert np.abs(out.position[0] - HOME - last).max() <= NOT_STRAIGHT
+        steps = np.abs(np.diff(out.position, axis=0)).max(axis=1)
+        assert np.all(steps <= RATE * np.diff(times) + ROUNDING)
+        assert out.velocity is not None
+        assert np.all(out.velocity[[0, -1]] == 0.0)
+        assert np.abs(out.velocity).max() <= RATE + 1e-9
+        # the next one comes somewhere under way; between points the shift is not quite straight
+        robot.now += duration * count / 60.0
+        here = np.array(
+            [np.interp(duration * count / 60.0, times, column) for column in out.position.T]
+        )
+        assert np.allclose(robot.read(here).position, HOME, rtol=0.0, atol=NOT_STRAIGHT)
+        last = here - HOME
+
+
+# ---- trajectories --------------------------------------------------------------------------------
+
+
+def swing(m: int = 201, duration: float = 2.0) -> TrajectoryCommand:
+    """A move from rest to rest with its true rates."""
+    t = np.linspace(0.0, duration, m)
+    w = np.pi / duration
+    reach = np.array([0.4, -0.2, 0.3, -0.4, 0.3, 0.5])
+    shape = [0.5 * (1 - np.cos(w * t)), 0.5 * w * np.sin(w * t), 0.5 * w * w * np.cos(w * t)]
+    q, v, a = (x[:, None] * reach for x in shape)
+    return TrajectoryCommand(NAMES, HOME + q, t, v, a)
+
+
+def test_a_trajectory_is_corrected_as_a_whole(warm: Robot) -> None:
+    command = swing()
+    out = warm.session.trajectory(command, warm.now)
+    assert distance(pose(drifted(), out.position), pose(NOMINAL, command.position)) < 1e-9
+    assert np.array_equal(out.time_from_start_s, command.time_from_start_s)
+    assert out.mark == CORRECTED
+    h = 0.01
+    v = (out.position[2:] - out.position[:-2]) / (2 * h)
+    assert out.velocity is not None
+    assert out.acceleration is not None
+    assert np.allclose(out.velocity[1:-1], v, rtol=0.0, atol=1e-4)
+    a = (out.position[2:] - 2 * out.position[1:-1] + out.position[:-2]) / h**2
+    assert np.allclose(out.acceleration[1:-1], a, rtol=0.0, atol=1e-3)
+    assert np.all(out.velocity[[0, -1]] == pytest.approx(0.0, abs=1e-12))
+
+
+def test_velocities_follow_the_positions_while_a_blend_is_under_way(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    command = swing()
+    out = robot.session.trajectory(command, robot.now)
+    assert out.velocity is not None
+    v = (out.position[2:] - out.position[:-2]) / 0.02
+    slow = np.abs(out.velocity[1:-1] - v).max(axis=1)
+    # where the blend starts and ends its rate has a corner
+    assert np.median(slow) < 1e-4
+    assert slow.max() < RATE
+
+
+def test_readings_follow_a_blend_along_the_trajectory(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    command = swing()
+    out = robot.session.trajectory(command, robot.now)
+    for i in (0, 20, 60, 200):
+        state = JointCommand(NAMES, out.position[i])
+        taught = robot.session.reading(state, robot.now + command.time_from_start_s[i])
+        assert np.allclose(taught.position, command.position[i], rtol=0.0, atol=1e-9)
+        assert taught.mark == TAUGHT
+
+
+def test_a_trajectory_that_is_under_way_already_starts_without_a_jump(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    command = swing()
+    out = robot.session.trajectory(command, robot.now, starts_in_s=-0.5)
+    shift = np.abs(out.position - command.position).max(axis=1)
+    assert np.all(shift[:51] == 0.0)
+    assert shift[60] > 1e-5
+
+
+def test_a_later_trajectory_begins_when_it_says(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    command = swing()
+    out = robot.session.trajectory(command, robot.now, starts_in_s=3.0)
+    assert np.array_equal(robot.read(HOME).position, HOME)
+    taught = robot.session.reading(JointCommand(NAMES, out.position[-1]), robot.now + 5.0)
+    assert np.allclose(taught.position, command.position[-1], rtol=0.0, atol=1e-9)
+
+
+def test_a_stop_passes_at_once_and_as_it_came(warm: Robot) -> None:
+    stop = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
+    before = warm.stream()
+    assert warm.session.trajectory(stop, warm.now) is stop
+    assert np.array_equal(warm.stream(), before)
+    nameless = TrajectoryCommand((), np.empty((0, 0)), np.empty(0), mark=CORRECTED)
+    assert warm.session.trajectory(nameless, -1.0) is nameless
+
+
+def test_ten_thousand_points_at_once(warm: Robot) -> None:
+    command = swing(m=10_000)
+    out = warm.session.trajectory(command, warm.now)
+    assert distance(pose(drifted(), out.position), pose(NOMINAL, command.position)) < 1e-9
+
+
+# ---- joints by name ------------------------------------------------------------------------------
+
+
+def test_joints_are_matched_by_name(warm: Robot) -> None:
+    straight = warm.stream()
+    order = [3, 0, 5, 1, 4, 2]
+    names = tuple(NAMES[i] for i in order)
+    warm.now += DT
+    out = warm.session.target(JointCommand(names, HOME[order]), warm.now)
+    assert out.names == names
+    assert np.array_equal(out.position, straight[order])
+
+
+def test_a_part_of_the_joints_is_completed_from_the_readings(warm: Robot) -> None:
+    straight = warm.stream()
+    part = JointCommand(NAMES[2:4], HOME[2:4])
+    refused(Reason.MISSING_JOINT, warm.session.target, part, warm.now)
+    warm.read(straight)
+    assert np.allclose(warm.session.target(part, warm.now).position, straight[2:4], atol=1e-12)
+
+
+def test_joints_of_others_pass_in_readings_but_not_in_targets(warm: Robot) -> None:
+    q = warm.stream()
+    names = ("gripper", *NAMES, "track")
+    values = np.array([0.04, *q, 1.5])
+    out = warm.session.reading(JointCommand(names, values, velocity=0.1 * np.ones(8)), warm.now)
+    assert out.names == names
+    assert np.allclose(out.position[1:-1], HOME, rtol=0.0, atol=1e-12)
+    assert out.position[[0, -1]].tolist() == [0.04, 1.5]
+    assert out.velocity is not None
+    assert out.velocity[[0, -1]].tolist() == [0.1, 0.1]
+    said = refused(Reason.UNKNOWN_JOINT, warm.session.target, JointCommand(names, values), warm.now)
+    assert "gripper" in said
+    alone = JointCommand(("gripper",), np.array([0.02]))
+    assert warm.session.reading(alone, warm.now).position.tolist() == [0.02]
+
+
+def test_readings_of_velocity_are_un_corrected(warm: Robot) -> None:
+    h = 1e-4
+    speed = np.array([0.2, -0.1, 0.3, 0.1, -0.2, 0.5])
+    before, here, after = (warm.stream(HOME + speed * t) for t in (-h, 0.0, h))
+    state = warm.read(here, velocity=(after - before) / (2 * h))
+    assert state.velocity is not None
+    assert np.allclose(state.velocity, speed, rtol=0.0, atol=1e-6)
+
+
+def test_until_all_joints_were_read_nothing_is_un_corrected(warm: Robot) -> None:
+    part = JointCommand(NAMES[:3], HOME[:3])
+    assert "joint_a4" in refused(Reason.MISSING_JOINT, warm.session.reading, part, warm.now)
+
+
+# ---- what is refused -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite(warm: Robot, bad: float) -> None:
+    q = HOME.copy()
+    q[3] = bad
+    session, now = warm.session, warm.now
+    assert "joint_a4" in refused(Reason.NOT_FINITE, session.target, JointCommand(NAMES, q), now)
+    fast = JointCommand(NAMES, HOME, velocity=q)
+    refused(Reason.NOT_FINITE, session.target, fast, now)
+    refused(Reason.NOT_FINITE, session.reading, JointCommand(NAMES, q), now)
+    refused(Reason.NOT_FINITE, session.reading, fast, now)
+    points, times = np.stack([HOME, q]), np.array([0.0, 1.0])
+    trajectory = TrajectoryCommand(NAMES, points, times)
+    assert "point 2" in refused(Reason.NOT_FINITE, session.trajectory, trajectory, now)
+    still = np.stack([HOME, HOME])
+    for rates in ({"velocity": points}, {"velocity": still, "acceleration": points}):
+        trajectory = TrajectoryCommand(NAMES, still, times, **rates)
+        refused(Reason.NOT_FINITE, session.trajectory, trajectory, now)
+    assert session.status().refused[Reason.NOT_FINITE] == 7
+    assert np.all(np.isfinite(warm.stream()))
+
+
+def test_doubled_and_misfitting_joints(warm: Robot) -> None:
+    session, now = warm.session, warm.now
+    doubled = (NAMES[0], *NAMES[:5])
+    refused(Reason.DOUBLED_JOINT, session.target, JointCommand(doubled, HOME), now)
+    refused(Reason.DOUBLED_JOINT, session.reading, JointCommand(doubled, HOME), now)
+    refused(Reason.WRONG_SIZE, session.target, JointCommand(NAMES, HOME[:5]), now)
+    refused(Reason.WRONG_SIZE, session.reading, JointCommand(NAMES, HOME[:5]), now)
+    refused(Reason.UNKNOWN_JOINT, session.target, JointCommand((), np.empty(0)), now)
+
+
+def test_time_that_goes_backwards(warm: Robot) -> None:
+    session = warm.session
+    warm.stream(stamp_ns=2_000_000_000)
+    refused(Reason.TIME_BACKWARDS, warm.stream, stamp_ns=1_999_000_000)
+    refused(Reason.TIME_BACKWARDS, warm.stream, dt=-1.0)
+    refused(Reason.TIME_BACKWARDS, warm.stream, dt=np.nan)
+    warm.now = 1e6
+    command = replace(swing(m=3), time_from_start_s=np.array([0.0, 1.0, 1.0]))
+    refused(Reason.TIME_BACKWARDS, session.trajectory, command, warm.now)
+    command = replace(command, time_from_start_s=np.array([-0.1, 1.0, 2.0]))
+    refused(Reason.TIME_BACKWARDS, session.trajectory, command, warm.now)
+    # after a look by the operator any source time will do
+    session.enable(True)
+    warm.stream(stamp_ns=5)
+
+
+def test_readings_of_a_clock_that_was_set_back_are_taken(warm: Robot) -> None:
+    q = warm.stream()
+    warm.read(q, stamp_ns=10_000_000_000)
+    refused(Reason.TIME_BACKWARDS, warm.read, q, stamp_ns=9_900_000_000)
+    warm.read(q, stamp_ns=1_000_000_000)
+
+
+def test_own_output_that_comes_back(warm: Robot) -> None:
+    session, now = warm.session, warm.now
+    out = warm.stream()
+    marked = JointCommand(NAMES, HOME, mark=CORRECTED)
+    refused(Reason.OWN_OUTPUT, session.target, marked, warm.now)
+    refused(Reason.OWN_OUTPUT, session.trajectory, replace(swing(), mark=CORRECTED), warm.now)
+    for mark in (CORRECTED, TAUGHT):
+        refused(Reason.OWN_OUTPUT, session.reading, replace(marked, mark=mark), warm.now)
+    # also where the mark was lost on the way
+    refused(Reason.OWN_OUTPUT, warm.stream, out)
+    # the same target again is no loop
+    assert np.array_equal(warm.stream(), out)
+    assert now < warm.now
+
+
+def test_joint_limits_hold_after_the_correction(warm: Robot) -> None:
+    q = HOME.copy()
+    q[1] = NOMINAL.upper[1]
+    # One side of the limit or the other: the correction decides, and never passes it.
+    shift = (warm.stream() - HOME)[1]
+    q[1] = NOMINAL.upper[1] - 0.5 * shift if shift > 0 else NOMINAL.lower[1] - 0.5 * shift
+    said = refused(Reason.JOINT_LIMIT, warm.stream, q)
+    assert "joint_a2" in said
+    trajectory = TrajectoryCommand(NAMES, np.stack([HOME, q]), np.array([0.0, 1.0]))
+    assert "point 2" in refused(Reason.JOINT_LIMIT, warm.session.trajectory, trajectory, warm.now)
+
+
+def test_limits_hold_when_off_too(robot: Robot) -> None:
+    q = HOME.copy()
+    q[4] = 3.0
+    refused(Reason.JOINT_LIMIT, robot.stream, q)
+
+
+def test_a_drift_beyond_its_bound_is_not_taken_over(robot: Robot) -> None:
+    robot.read(HOME)
+    said = refused(Reason.TCP_BOUND, robot.session.offer_model, offer(drifted(12.0)))
+    assert "mm" in said
+    robot.session.enable(True)
+    assert np.array_equal(robot.stream(), HOME)
+
+
+def test_where_the_bound_is_reached_the_blend_waits(robot: Robot) -> None:
+    """Without readings the model is judged only when commands come."""
+    robot.session.offer_model(offer(drifted(12.0)))
+    robot.session.enable(True)
+    outputs = [robot.stream() for _ in range(1500)]
+    status = robot.session.status()
+    assert status.held > 0
+    assert not status.settled
+    assert status.tcp_shift_m <= 1e-3
+    assert np.array_equal(outputs[-1], outputs[-2])
+    # disabling leads back without any refusal
+    robot.session.enable(False)
+    assert np.array_equal(robot.settle(), HOME)
+    # a trajectory is refused as a whole
+    robot.session.enable(True)
+    long = TrajectoryCommand(NAMES, np.tile(HOME, (2, 1)), np.array([0.0, 60.0]))
+    refused(Reason.TCP_BOUND, robot.session.trajectory, long, robot.now)
+
+
+def test_a_tool_beyond_its_bound_is_not_taken_over(robot: Robot) -> None:
+    refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(11e-3, 0.0))
+    refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(0.0, 3.1))
+    robot.session.offer_tool(bent_tool(10e-3, 3.0))
+    wrong = replace(bent_tool(), parent="flange")
+    refused(Reason.BAD_TOOL, robot.session.offer_tool, wrong)
+
+
+def test_near_a_singularity_a_drift_is_corrected_in_part_and_a_tool_not_at_all(
+    warm: Robot,
+) -> None:
+    q = HOME.copy()
+    for q[4] in np.linspace(0.9, 0.0, 500):
+        out = warm.stream(q)
+        assert np.abs(out - q).max() <= np.radians(0.3)
+    assert warm.session.status().reduced > 0
+    q[4] = 0.1
+    last = warm.stream(q)
+    warm.session.offer_tool(bent_tool(2e-3, 2.0))
+    for _ in range(6000):
+        out = warm.stream(q)
+        assert np.abs(out - last).max() <= RATE * DT + ROUNDING
+        last = out
+    status = warm.session.status()
+    assert status.held > 0
+    assert not status.settled
+    # settled elsewhere, it is refused there
+    warm.settle()
+    refused(Reason.JOINT_BOUND, warm.stream, q)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"accepted": False}, Reason.NOT_ACCEPTED),
+        ({"robot": "UR10"}, Reason.WRONG_ROBOT),
+        ({"serial": "s2"}, Reason.WRONG_ROBOT),
+        ({"model_hash": "0123456789abcdef"}, Reason.WRONG_ROBOT),
+        ({"joint_names": NAMES[::-1]}, Reason.WRONG_ROBOT),
+    ],
+)
+def test_models_of_others_are_not_taken_over(
+    robot: Robot, change: dict[str, Any], reason: Reason
+) -> None:
+    refused(reason, robot.session.offer_model, offer(drifted(), **change))
+    robot.session.enable(True)
+    assert np.array_equal(robot.stream(), HOME)
+    assert robot.session.status().revision is None
+
+
+def test_revisions_only_grow(warm: Robot) -> None:
+    warm.session.offer_model(offer(drifted(), 1))  # the same again, from a restarted node
+    refused(Reason.OLD_REVISION, warm.session.offer_model, offer(drifted(0.5), 1))
+    warm.session.offer_model(offer(drifted(0.5), 3))
+    refused(Reason.OLD_REVISION, warm.session.offer_model, offer(drifted(), 2))
+    assert warm.session.status().revision == 3
+
+
+# ---- from messages -------------------------------------------------------------------------------
+
+
+def header(frame: str = "") -> SimpleNamespace:
+    return SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=500), frame_id=frame)
+
+
+def test_targets_are_built_from_messages() -> None:
+    message = SimpleNamespace(
+        header=header("x"), name=["a", "b"], position=[1.0, 2.0], velocity=[], effort=[]
+    )
+    command = joint_command(message)
+    assert command.names == ("a", "b")
+    assert command.velocity is None
+    assert (command.stamp_ns, command.mark) == (1_000_000_500, "x")
+    message.velocity = [1.0]
+    refused(Reason.WRONG_SIZE, joint_command, message)
+    message.position = []
+    refused(Reason.NO_POSITION, joint_command, message)
+
+
+def point(t: float, q: list[float], v: list[float], a: list[float]) -> SimpleNamespace:
+    duration = SimpleNamespace(sec=int(t), nanosec=round(t % 1 * 1e9))
+    return SimpleNamespace(
+        time_from_start=duration, positions=q, velocities=v, accelerations=a, effort=[]
+    )
+
+
+def test_trajectories_are_built_from_messages() -> None:
+    points = [point(0.0, [1.0, 2.0], [0.0, 0.0], []), point(1.5, [3.0, 4.0], [0.0, 1.0], [])]
+    message = SimpleNamespace(header=header(), joint_names=["a", "b"], points=points)
+    command = trajectory_command(message)
+    assert command.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert command.time_from_start_s.tolist() == [0.0, 1.5]
+    assert command.acceleration is None
+    assert len(trajectory_command(SimpleNamespace(**vars(message) | {"points": []}))) == 0
+    points[1].velocities = []
+    refused(Reason.WRONG_SIZE, trajectory_command, message)
+    points[0].velocities, points[0].accelerations = [], [0.0, 0.0]
+    points[1].accelerations = [0.0, 0.0]
+    refused(Reason.WRONG_SIZE, trajectory_command, message)
+    points[1].positions = [1.0]
+    refused(Reason.WRONG_SIZE, trajectory_command, message)
+    points[0].positions = points[1].positions = []
+    refused(Reason.NO_POSITION, trajectory_command, message)
