@@ -43,7 +43,8 @@ class Origin:
 class Decided:
     """What was decided after a cycle and why.
 
-    ``predicted_mm`` is the model's predicted rms error over the working volume, None when unknown.
+    ``predicted_mm`` is the rms error at the check poses expected from the covariance of the model
+    in force, None when unknown.
     """
 
     cycle: str

@@ -115,9 +115,8 @@ def _decisions(report: DriftReport) -> str:
              predicted, f"{achieved:.3f}", why]
         )  # fmt: skip
     note = (
-        '<p class="faint">Predicted: rms error of the candidate over the working volume from its '
-        "covariance, mm; achieved: rms at the check poses with the model in force after the "
-        "decision, mm.</p>"
+        '<p class="faint">Predicted: rms error at the check poses, expected from the covariance of '
+        "the model in force; achieved: rms there; both in mm, after the decision.</p>"
     )
     return _table(head, rows, words=(2, 6)) + note
 
