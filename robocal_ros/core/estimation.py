@@ -126,11 +126,12 @@ def solve(
         if np.array_equal(update, keep):
             break
         keep = update
-    seen = observability(_rows(run.jacobian, keep))
+    information = _information(run.jacobian, keep)
+    seen = observability(_rows(run.jacobian, keep), information)
     if flat:
         _require_full_rank(seen, problem.names)
     scale = descent.plain_scale(run.residual, keep)
-    covariance = descent.posterior(run, keep, scale)
+    covariance = descent.posterior(information, scale)
     if not np.all(np.diag(covariance) > 0.0):
         words = [describe(column, problem.names) for column in seen.null.T]
         raise RankDeficientError(
@@ -197,12 +198,14 @@ class _Descent(Generic[S]):
             while True:
                 step = _damped_step(normal, gradient, damping)
                 trial = self.problem.retract(state, step)
+                if small := float(step @ normal @ step) < tolerance**2 * k:
+                    state, residual = trial, residual + jacobian @ step  # exact enough so near
+                    break
                 new_residual, new_jacobian = self.problem.linearise(trial)
-                small = float(step @ normal @ step) < tolerance**2 * k
-                if small or self._cost(trial, new_residual, keep, scale, huber) <= cost:
+                if self._cost(trial, new_residual, keep, scale, huber) <= cost:
+                    state, residual, jacobian = trial, new_residual, new_jacobian
                     break
                 damping = max(10.0 * damping, 1e-4)
-            state, residual, jacobian = trial, new_residual, new_jacobian
             damping /= 10.0
         return _Run(state, residual, jacobian, iterations, small)
 
@@ -257,9 +260,9 @@ class _Descent(Generic[S]):
         away = self.problem.deviation(state)
         return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
 
-    def posterior(self, run: _Run[S], keep: NDArray[np.bool_], scale: float) -> Array:
-        """Covariance (k, k) of the unknowns."""
-        information = _information(run.jacobian, keep) / scale**2 + self.prior
+    def posterior(self, normal: Array, scale: float) -> Array:
+        """Covariance (k, k) of the unknowns from the data's normal matrix."""
+        information = normal / scale**2 + self.prior
         unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         inverse = np.linalg.inv(information * np.outer(unit, unit))
         return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
@@ -269,7 +272,7 @@ class _Descent(Generic[S]):
         m, c, _ = run.jacobian.shape
         scale = self.robust_scale(run.residual, keep)
         J = run.jacobian
-        JC = (J.reshape(m * c, -1) @ self.posterior(run, keep, scale)).reshape(J.shape)
+        JC = (J.reshape(m * c, -1) @ self.posterior(_information(J, keep), scale)).reshape(J.shape)
         spread = JC @ np.swapaxes(J, 1, 2)
         sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread

@@ -27,11 +27,15 @@ class Observability:
     null: Array
 
 
-def observability(jacobian: Array) -> Observability:
-    """Rank, condition and null space of a Jacobian (N, k)."""
-    length = np.sqrt(np.einsum("nk,nk->k", jacobian, jacobian))
+def observability(jacobian: Array, normal: Array | None = None) -> Observability:
+    """Rank, condition and null space of a Jacobian (N, k).
+
+    ``normal`` (k, k): its normal matrix J^T J, if it is known.
+    """
+    information = jacobian.T @ jacobian if normal is None else normal
+    length = np.sqrt(np.diag(information))
     scale = np.where(length > 0.0, length, 1.0)
-    squared = np.linalg.eigvalsh((jacobian.T @ jacobian) / np.outer(scale, scale))
+    squared = np.linalg.eigvalsh(information / np.outer(scale, scale))
     if squared[0] > _CLEAR * squared[-1]:
         condition = float(np.sqrt(squared[-1] / squared[0]))
         return Observability(len(scale), condition, np.empty((len(scale), 0)))
