@@ -16,11 +16,10 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from bench.ur10_campaigns import SERIES, halves, load_campaign
-from robocal_ros.core.identification import identify_and_judge
+from bench.real_data import model_of_a, own_half
+from bench.ur10_campaigns import SERIES
 from robocal_ros.report.drift import read_report
 from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE, drift_over_time, png
-from robocal_ros.storage.robots import load_robot
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -34,21 +33,16 @@ NAMES = {
 
 def campaign_errors() -> dict[str, dict[str, float]]:
     """Held-out mean errors, mm: nominal, calibrated on the other half, and with A's model."""
-    arm = load_robot("ur10")
     found: dict[str, dict[str, float]] = {}
-    first = halves(load_campaign("A"))[0]
     for series in SERIES:
-        data = load_campaign(series)
-        train, check = halves(data)
-        judged = identify_and_judge(arm, train, check)
+        judged = own_half(series)
         found[series] = {
             "nominal": judged.nominal.mean_m * 1e3,
             "calibrated": judged.candidate.mean_m * 1e3,
             "n": judged.candidate.n,
         }
         if series != "A":
-            later = identify_and_judge(arm, first, data, check_refit=("base", "tool"))
-            found[series]["old"] = later.candidate.mean_m * 1e3
+            found[series]["old"] = model_of_a(series).candidate.mean_m * 1e3
     return found
 
 
