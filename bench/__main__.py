@@ -21,12 +21,19 @@ OUT = ROOT / "docs" / "figures"
 
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
-    from bench import monte_carlo, real_data, speed
+    from bench import monte_carlo, real_data, speed, startup
+
+    def start() -> Sequence[Table]:
+        if startup.EXECUTABLES.is_dir():
+            return [startup.start_times()]
+        print("no nodes in install/ (run `make setup`): their start is left out")
+        return []
 
     return {
         "real_data": real_data.tables,
         "monte_carlo": monte_carlo.tables,
         "speed": speed.tables,
+        "startup": start,
     }
 
 
