@@ -70,12 +70,15 @@ def replay_bag(request: Request, watch: Watch) -> Document:
             raise InputError(_NO_COMMANDS, file=str(request.bag))
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
+            kept = _GOES_ON.format(history.path) if history.list(1) else ""
             session = _session(recording, arm, history)
             commands = _commands(request, recording, arm, history, watch)
             samples = watch("replaying", recording)
             report = replay(session, samples, commands, recording.inputs)
             used = commands is recording.commands
-            return _document(report, session, recording) | {"recorded": used}
+            document = _document(report, session, recording) | {"recorded": used}
+            document["warnings"] += [kept] if kept else []
+            return document
 
 
 _NO_COMMANDS = (
@@ -83,6 +86,8 @@ _NO_COMMANDS = (
     "(repeat it for more cycles; --cold T0:T1 for a cold reference), in seconds from the first "
     "joint reading, or let --auto find the cycles"
 )
+
+_GOES_ON = "{} already holds calibrations: the replay went on from there"
 
 
 @contextmanager

@@ -170,6 +170,9 @@ class TestRecordedSession:
             entry[name] for entry in listed["calibrations"] for name in ("stamp_ns", "created_ns")
         ]
         assert min(times) > START_NS  # data time, not today's
+        _, again = replay(live[0], "--state", state)
+        assert again["differs"]
+        assert any("went on from there" in words for words in again["warnings"])
 
     def test_windows_instead_of_the_recorded_commands(self, live, replay) -> None:
         second = POSES + 4

@@ -12,7 +12,7 @@ from robocal_ros.core.samples import Measurements
 Array = NDArray[np.float64]
 
 _SMALLEST_SPREAD = 1e-6  # of the largest singular value: below it a direction is not seen
-_ADVICE = "turn the flange about a second axis between the samples"
+_ADVICE = "turn the flange about a second axis between the samples, or give base or target as known"
 
 
 def linear_start(
