@@ -1,0 +1,87 @@
+"""Real measurements of a UR10 over eight months: what the model is worth at unseen poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.ur10_campaigns import halves, load_campaign
+from robocal_ros.core.assessment import pose_groups
+from robocal_ros.core.codes import Code
+from robocal_ros.core.identification import identify_and_judge
+from robocal_ros.storage.robots import load_robot
+
+pytestmark = pytest.mark.data
+
+LARGEST_MEAN_MM = {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365}
+LARGEST_LATER_MEAN_MM = {"B": 0.455, "C": 0.52, "D": 0.40}
+POSES = {"A": 11911, "B": 1495, "C": 2773, "D": 632}
+NOMINAL_MEAN_MM = {"A": 0.753, "B": 1.027, "C": 0.900, "D": 0.719}  # as its README measured
+
+
+@pytest.fixture(scope="module")
+def campaigns(data_dir):
+    return {series: load_campaign(series, data_dir / "ur10_tmac") for series in POSES}
+
+
+@pytest.fixture(scope="module")
+def halved(campaigns):
+    return {series: halves(data) for series, data in campaigns.items()}
+
+
+def test_halves_share_no_pose(campaigns, halved):
+    for series, (train, check) in halved.items():
+        assert len(train) + len(check) == len(campaigns[series]) == POSES[series]
+        groups = pose_groups(np.vstack([train.q, check.q]))
+        assert not set(groups[: len(train)]) & set(groups[len(train) :])
+
+
+@pytest.mark.parametrize("series", POSES)
+def test_half_of_a_campaign_calibrates_the_other(halved, series):
+    """Errors in mm, and the error that is predicted comes true within 15 %."""
+    result = identify_and_judge(load_robot("ur10"), *halved[series])
+    assert result.candidate.mean_m * 1e3 <= LARGEST_MEAN_MM[series]
+    assert result.nominal.mean_m * 1e3 == pytest.approx(NOMINAL_MEAN_MM[series], abs=0.02)
+    assert result.verdict.code is Code.ACCEPT
+    assert result.predicted_total_rms_m == pytest.approx(result.candidate.rms_m, rel=0.15)
+    assert result.identification.estimate.converged
+    assert len(result.identification.rejected) < 0.01 * POSES[series]
+
+
+@pytest.mark.parametrize("series", LARGEST_LATER_MEAN_MM)
+def test_the_model_of_july_holds_for_months(campaigns, halved, series):
+    result = identify_and_judge(
+        load_robot("ur10"), halved["A"][0], campaigns[series], check_refit=("base", "tool")
+    )
+    assert result.candidate.mean_m * 1e3 <= LARGEST_LATER_MEAN_MM[series]
+    assert result.candidate.mean_m < 0.65 * result.nominal.mean_m
+    assert result.verdict.code is Code.ACCEPT
+
+
+def test_least_squares_agrees_where_the_data_are_many(halved):
+    """With thousands of poses the prior has nothing left to say (but for the gauge)."""
+    by_prior, plain = (
+        identify_and_judge(load_robot("ur10"), *halved["C"], method=method)
+        for method in ("map", "lsq")
+    )
+    assert plain.candidate.mean_m == pytest.approx(by_prior.candidate.mean_m, abs=2e-6)
+    assert plain.identification.estimate.observability.rank == 30
+    assert len(plain.identification.held) == 6
+
+
+def test_the_model_in_force_is_not_replaced_without_gain(halved):
+    """The model of one half of C, in force: the other half's fit is hardly better there."""
+    train, check = halved["C"]
+    arm = load_robot("ur10")
+    first = identify_and_judge(arm, train, check)
+    again = identify_and_judge(arm, train, check, in_force=first.identification.cell.arm)
+    assert not again.verdict.accept
+    assert again.current.mean_m == pytest.approx(first.candidate.mean_m, abs=5e-6)
+
+
+def test_a_mirrored_tracker_frame_is_refused(halved):
+    def mirrored(data):
+        return replace(data, position=data.position * [1.0, 1.0, -1.0], rotation=None)
+
+    result = identify_and_judge(load_robot("ur10"), *(mirrored(half) for half in halved["D"]))
+    assert result.verdict.code is Code.RESIDUAL_TOO_LARGE
