@@ -72,6 +72,7 @@ class Demo:
             folder,
             "joint_correction_node",
             {"kinematic_model": "/thermal_node/model"},
+            taught_tool=f"[{', '.join(map(str, kr150.TOOL))}, 0.0, 0.0, 0.0, 1.0]",
             **common,
         )
         controller.start(
