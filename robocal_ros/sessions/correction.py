@@ -5,7 +5,9 @@ of model and tool parameters that moves no joint faster than a bound. What it ca
 correct is refused with a reason, counted, and nothing is put out for it: `RefusedError`.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +37,7 @@ from robocal_ros.sessions.correction_joints import JointBook, require_finite
 from robocal_ros.sessions.corrector import Corrected, Corrector
 
 Array = NDArray[np.float64]
+Answer = TypeVar("Answer")
 
 
 class CorrectionSession:
@@ -200,6 +203,10 @@ class CorrectionSession:
             speed = self._joints.spread(velocity[None, place], index)
             velocity[place] = stage.taught_velocity(taught, measured[None], speed)[0, index]
         return replace(passed, position=position, velocity=velocity)
+
+    def counted(self, act: Callable[[], Answer]) -> Answer:
+        """Do something for this session; a refusal is counted with its own."""
+        return self._guard.counted(act)
 
     def status(self) -> CorrectionStatus:
         """What the session does."""

@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import JointCorrection, blend_models, pack_model
+from robocal_ros.core.joint_correction import (
+    JointCorrection,
+    blend_models,
+    pack_model,
+    rates,
+    solution,
+)
 from robocal_ros.core.joint_correction.staged import StagedCorrection
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.storage.robots import load_robot
@@ -324,6 +330,22 @@ def test_undoing_is_exact_where_only_a_share_was_corrected() -> None:
     result = stage.correct(q, ones)
     assert not np.all(result.whole)
     assert np.abs(stage.uncorrect(result.q, ones) - q).max() < 1e-9
+
+
+def test_kernels_are_compiled_for_one_type_of_array_only() -> None:
+    """Another type would be compiled while the robot moves, and hold it up for seconds."""
+    reference = robot("kr150_r3100")
+    models = np.stack([pack_model(reference)] * 4)
+    q = np.tile(HOME, (6, 2))[::2, ::2]
+    for array in (models, q):
+        array.flags.writeable = False
+    correction = JointCorrection(models, np.broadcast_to(0.1, (6,)))
+    correction.correct(q)
+    correction.correct(q[0].tolist(), 0.5)
+    correction.rates(q, q, q)
+    correction.inverse().correct(q[:1], np.ones(1))
+    assert len(solution.correct_batch.signatures) == 1
+    assert len(rates.rates_batch.signatures) == 1
 
 
 def test_wrong_shapes_are_a_callers_mistake() -> None:

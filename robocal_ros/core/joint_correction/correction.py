@@ -43,6 +43,14 @@ def pack_model(arm: SerialArm) -> Array:
     return packed
 
 
+def _plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+    """The one array type that the kernels are compiled for: contiguous and writable."""
+    array = np.asarray(values, dtype=np.float64)
+    if shape is not None:
+        array = np.broadcast_to(array, shape)
+    return np.require(array, requirements=["C", "W"])
+
+
 def blend_models(start: Array, end: Array, s: float) -> Array:
     """Packed model between two: ``start`` at s = 0, ``end`` at 1, exactly.
 
@@ -91,11 +99,11 @@ class JointCorrection:
     """
 
     def __init__(self, models: Array, largest: ArrayLike = LARGEST_SHIFT) -> None:
-        self.models = np.ascontiguousarray(models, dtype=np.float64)
+        self.models = _plain(models)
         self.n = self.models.shape[1] - 2
         if self.models.shape != (4, self.n + 2, 9):
             raise ValueError(f"models have shape {self.models.shape}, expected (4, n + 2, 9)")
-        self.largest = np.ascontiguousarray(np.broadcast_to(largest, (self.n,)), dtype=np.float64)
+        self.largest = _plain(largest, (self.n,))
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
         self._work = np.empty(solution.work_size(self.n))
@@ -126,12 +134,12 @@ class JointCorrection:
         A point's result does not depend on its neighbours: a batch gives a single point's bits.
         """
         joints = np.asarray(q, dtype=np.float64)
-        points = np.ascontiguousarray(joints.reshape(-1, self.n))
+        points = _plain(joints.reshape(-1, self.n))
         out = np.empty((len(points), self.n + solution.REPORT))
-        blends = np.ascontiguousarray(np.broadcast_to(s, (len(points),)), dtype=np.float64)
+        blends = _plain(s, (len(points),))
         solution.correct_batch(points, self.models, blends, self.largest, self._work, out)
         lead = joints.shape[:-1]
-        corrected, report = out[:, : self.n], out[:, self.n :].T.reshape(-1, *lead)
+        corrected, report = _plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
         return CorrectionResult(
             q=corrected.reshape(joints.shape),
             position_error_m=report[solution.POSITION_ERROR],
@@ -160,11 +168,8 @@ class JointCorrection:
         only a share is corrected, and arms of fewer or more than six joints, are differentiated
         numerically along the path (relative error about 1e-6).
         """
-        points, qd, qdd = (
-            np.ascontiguousarray(np.atleast_2d(np.asarray(x, dtype=np.float64)))
-            for x in (q, velocity, acceleration)
-        )
-        blends = np.ascontiguousarray(np.broadcast_to(s, (len(points),)), dtype=np.float64)
+        points, qd, qdd = (_plain(np.atleast_2d(x)) for x in (q, velocity, acceleration))
+        blends = _plain(s, (len(points),))
         here = self.correct(points, blends)
         out_v, out_a = np.empty_like(points), np.empty_like(points)
         rates.rates_batch(points, qd, qdd, here.q, self.models, blends, out_v, out_a)

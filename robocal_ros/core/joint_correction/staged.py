@@ -14,8 +14,11 @@ from robocal_ros.core.joint_correction import rates
 from robocal_ros.core.joint_correction.correction import (
     CorrectionResult,
     JointCorrection,
+    blend_models,
+    pack_model,
     path_rates,
 )
+from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 
@@ -141,3 +144,14 @@ class StagedCorrection:
         rates.rates_batch(corrected, velocity, zero, q, models, ones, out, unused)
         plain = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
         return np.where(plain[:, None], out, velocity)
+
+
+def load_kernels(arm: SerialArm) -> None:
+    """Call all compiled code once, so that the first command need not wait for it."""
+    packed, largest = pack_model(arm), np.ones(arm.n)
+    q, s = np.zeros((2, arm.n)), np.full(2, 0.5)
+    stage = StagedCorrection(packed, packed, packed.copy(), largest, largest)
+    stage.rates(q, q, q, s, np.zeros(2), stage.correct(q, s))
+    stage.uncorrect(q, s)
+    JointCorrection.between(arm, arm).point(q[0])
+    blend_models(packed, packed.copy(), 0.5)

@@ -1,0 +1,145 @@
+"""Parameters of the joint correction node."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.core import frames
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.nodes.parameters import Setting
+from robocal_ros.sessions.correction_bounds import CorrectionConfig, ShiftBounds
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = "nominal"
+
+
+def _tool_fault(values: list[float]) -> str | None:
+    if len(values) != 7:
+        return "not seven numbers: x, y, z, qx, qy, qz, qw"
+    if any(values) and abs(math.hypot(*values[3:]) - 1.0) > 1e-3:
+        return "the quaternion is not of unit length"
+    return None
+
+
+SETTINGS = (
+    Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
+    Setting(
+        "reference",
+        NOMINAL,
+        "Model that the program was made with: nominal, or path of a robot file that holds the "
+        "calibrated cold model of a taught program",
+    ),
+    Setting(
+        "taught_tool",
+        [0.0] * 7,
+        "Tool on the flange that the program was made with: x, y, z in m, qx, qy, qz, qw; all "
+        "zero: the tool of the robot file",
+        check=_tool_fault,
+    ),
+    Setting("flange_frame", "tool0", "Parent frame of the tool_frame input"),
+    Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
+    Setting(
+        "thermal_tcp_mm",
+        1.0,
+        "Largest correction of the arm's drift at the tool",
+        unit="mm",
+        low=0.0,
+        high=20.0,
+    ),
+    Setting(
+        "thermal_tcp_deg",
+        0.1,
+        "and in orientation",
+        unit="deg",
+        low=0.0,
+        high=5.0,
+    ),
+    Setting(
+        "thermal_joint_deg",
+        0.3,
+        "and of one joint; near a singularity less is corrected, so that this holds",
+        unit="deg",
+        low=0.001,
+        high=5.0,
+    ),
+    Setting(
+        "tool_tcp_mm",
+        10.0,
+        "Largest change of the tool that is made up for",
+        unit="mm",
+        low=0.0,
+        high=100.0,
+    ),
+    Setting("tool_tcp_deg", 3.0, "and in orientation", unit="deg", low=0.0, high=30.0),
+    Setting(
+        "tool_joint_deg",
+        5.0,
+        "and by one joint; where more is needed, commands are refused",
+        unit="deg",
+        low=0.001,
+        high=30.0,
+    ),
+    Setting(
+        "blend_deg_s",
+        0.5,
+        "Fastest change of a joint's correction",
+        unit="deg/s",
+        low=0.001,
+        high=5.0,
+    ),
+    Setting(
+        "blend_mm_s",
+        1.0,
+        "Fastest change of a sliding joint's correction",
+        unit="mm/s",
+        low=0.001,
+        high=20.0,
+    ),
+    Setting(
+        "longest_step_s",
+        0.02,
+        "A pause in a stream of targets advances a blend by no more than this",
+        unit="s",
+        low=1e-4,
+        high=0.1,
+    ),
+)
+
+
+def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
+    """The nominal arm, and the reference arm with the taught tool.
+
+    Raises
+    ------
+    InputError
+        When a robot file cannot be read.
+    """
+    nominal = load_robot(settings["robot"])
+    chosen = settings["reference"]
+    reference = nominal if chosen == NOMINAL else load_robot(chosen)
+    tool = settings["taught_tool"]
+    if any(tool):
+        reference = replace(reference, T_flange_tool=frames.transform_from_quat(tool[:3], tool[3:]))
+    return nominal, reference
+
+
+def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
+    """Settings of the session, in SI."""
+
+    def bounds(what: str) -> ShiftBounds:
+        degrees = (settings[f"{what}_{where}_deg"] for where in ("tcp", "joint"))
+        return ShiftBounds(
+            settings[f"{what}_tcp_mm"] * 1e-3, *(float(np.radians(x)) for x in degrees)
+        )
+
+    return CorrectionConfig(
+        thermal=bounds("thermal"),
+        tool=bounds("tool"),
+        blend_rad_s=float(np.radians(settings["blend_deg_s"])),
+        blend_m_s=settings["blend_mm_s"] * 1e-3,
+        longest_step_s=settings["longest_step_s"],
+        flange_frame=settings["flange_frame"],
+    )

@@ -1,0 +1,296 @@
+"""The joint correction node over DDS."""
+
+import time
+from array import array
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
+from robocal_msgs.msg import KinematicModel
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.base import AUTOSTART, SERIAL
+from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.nodes.joint_correction_settings import SETTINGS
+from robocal_ros.sessions.correction_inputs import CORRECTED, TAUGHT
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = load_robot("kr150_r3100")
+NAMES = list(NOMINAL.joint_names)
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+NODE = "/joint_correction_node"
+
+
+def drifted() -> SerialArm:
+    rng = np.random.default_rng(0)
+    chosen = NOMINAL.parameters
+    size = np.where(chosen.is_length, 1e-4, 5e-5)
+    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
+
+
+def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> KinematicModel:
+    fields = {
+        "serial": "s1",
+        "model_hash": NOMINAL.model_hash,
+        "revision": revision,
+        "state": KinematicModel.ACCEPTED,
+        "stamp": Header(frame_id="base"),
+    }
+    return conversions.kinematic_model(model_document(arm), **(fields | changes))
+
+
+def joints(q: Any, **fields: Any) -> JointState:
+    return JointState(name=NAMES, position=array("d", q), **fields)
+
+
+def trajectory(q: np.ndarray, times: np.ndarray, **fields: Any) -> JointTrajectory:
+    still = array("d", np.zeros(6))
+    points = [
+        JointTrajectoryPoint(
+            positions=array("d", row),
+            velocities=still,
+            accelerations=still,
+            effort=array("d", np.full(6, 7.0)),
+            time_from_start=Duration(sec=int(t), nanosec=round(t % 1 * 1e9)),
+        )
+        for row, t in zip(q, times, strict=True)
+    ]
+    return JointTrajectory(joint_names=NAMES, points=points, **fields)
+
+
+class Line:
+    """The node between a planner and a controller, both played by the probe."""
+
+    def __init__(self, graph: Any, **parameters: Any) -> None:
+        self.graph = graph
+        self.node = graph.add(JointCorrectionNode, {"serial": "s1"} | parameters)
+        self.targets = graph.collect(JointState, f"{NODE}/joint_targets")
+        self.paths = graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
+        self.states = graph.collect(JointState, f"{NODE}/joint_states")
+        self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
+        self.to_target = graph.publisher(JointState, "joint_targets")
+        self.to_path = graph.publisher(JointTrajectory, "joint_trajectory")
+        self.to_states = graph.publisher(JointState, "joint_states")
+        self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+        self.to_tool = graph.publisher(TransformStamped, "tool_frame", qos.LATCHED)
+        outputs = (self.node._outputs[name] for name in ("joint_targets", "joint_states"))
+        graph.spin_until(
+            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
+        )
+
+    def wait(self, inbox: list[Any], count: int = 1) -> Any:
+        self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs")
+        return inbox[-1]
+
+    def target(self, q: Any = HOME, **fields: Any) -> JointState:
+        count = len(self.targets)
+        self.to_target.publish(joints(q, **fields))
+        return self.wait(self.targets, count + 1)
+
+    def enable(self, on: bool = True) -> str:
+        answer = self.graph.call(SetBool, f"{NODE}/enable", data=on)
+        assert answer.success
+        return str(answer.message)
+
+    def take(self, message: Any, publisher: Any, topic: str) -> None:
+        count = self.node.inputs[topic]
+        before = count.received
+        publisher.publish(message)
+        self.graph.spin_until(lambda: count.received > before, f"{topic} is received")
+
+    def refused(self, publisher: Any, message: Any, topic: str) -> None:
+        count = self.node.inputs[topic]
+        before = count.invalid
+        publisher.publish(message)
+        self.graph.spin_until(lambda: count.invalid > before, f"{topic} is refused")
+
+    def settle(self) -> JointState:
+        for _ in range(3000):
+            out = self.target()
+            if self.node._session.status().settled:
+                return out
+        pytest.fail("the blend does not end")
+
+
+def distance(actual: SerialArm, q: Any, reference: SerialArm = NOMINAL) -> float:
+    goal = reference.fk(HOME) @ reference.T_flange_tool
+    T = actual.fk(np.array(q)) @ actual.T_flange_tool
+    return float(np.linalg.norm((T - goal)[:3, 3]))
+
+
+def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:
+    line = Line(graph)
+    actual = drifted()
+    line.take(model_message(actual), line.to_model, "kinematic_model")
+    out = line.target(effort=array("d", np.full(6, 3.0)))
+    assert list(out.position) == HOME.tolist()
+    assert out.header.frame_id == ""
+    assert "revision 1" in line.enable()
+    first = line.target()
+    assert np.abs(np.array(first.position) - HOME).max() < 1e-3
+    q = line.settle()
+    assert distance(actual, HOME) > 1e-4
+    assert distance(actual, q.position) < 1e-9
+    assert q.header.frame_id == CORRECTED
+    line.to_states.publish(joints(q.position, velocity=array("d", np.zeros(6))))
+    taught = line.wait(line.states)
+    assert np.allclose(taught.position, HOME, rtol=0.0, atol=1e-12)
+    assert taught.header.frame_id == TAUGHT
+    assert line.enable(False).startswith("off")
+    assert list(line.settle().position) == HOME.tolist()
+
+
+def test_a_trajectory_keeps_its_times_and_a_stop_passes(graph: Any) -> None:
+    line = Line(graph, enable_on_start=True)
+    actual = drifted()
+    line.take(model_message(actual), line.to_model, "kinematic_model")
+    line.settle()
+    times = np.array([0.0, 0.5, 1.25])
+    message = trajectory(np.stack([HOME, HOME + 0.1, HOME]), times)
+    line.to_path.publish(message)
+    out = line.wait(line.paths)
+    assert [p.time_from_start for p in out.points] == [p.time_from_start for p in message.points]
+    assert out.joint_names == NAMES
+    assert distance(actual, out.points[-1].positions) < 1e-9
+    assert list(out.points[0].velocities) == [0.0] * 6
+    assert list(out.points[0].effort) == [7.0] * 6
+    assert out.header.frame_id == CORRECTED
+    # an empty trajectory stops the controller: as it came, whatever it carries
+    stop = JointTrajectory(joint_names=["any"], header=Header(frame_id=CORRECTED))
+    line.to_path.publish(stop)
+    assert line.wait(line.paths, 2) == stop
+
+
+def test_a_new_tool_and_a_taught_one(graph: Any) -> None:
+    tool = [0.01, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
+    line = Line(graph, enable_on_start=True, taught_tool=tool)
+    message = TransformStamped()
+    message.header.frame_id = "tool0"
+    t = message.transform.translation
+    t.x, t.y, t.z = 0.012, 0.0, 0.25
+    line.take(message, line.to_tool, "tool_frame")
+    q = line.settle()
+    T = np.eye(4)
+    T[:3, 3] = tool[:3]
+    new = T.copy()
+    new[0, 3] = 0.012
+    miss = NOMINAL.fk(np.array(q.position)) @ new - NOMINAL.fk(HOME) @ T
+    assert np.abs(miss).max() < 1e-9
+    message.transform.rotation.w = 0.5
+    line.refused(line.to_tool, message, "tool_frame")
+
+
+def test_hostile_messages_are_refused_and_named(graph: Any) -> None:
+    line = Line(graph, enable_on_start=True)
+    line.take(model_message(drifted()), line.to_model, "kinematic_model")
+    line.settle()
+    line.targets.clear()
+    bad = HOME.copy()
+    bad[2] = np.nan
+    line.refused(line.to_target, joints(bad), "joint_targets")
+    line.refused(line.to_target, JointState(name=NAMES[:3], position=[0.0]), "joint_targets")
+    line.refused(line.to_target, JointState(name=["x"], position=[0.0]), "joint_targets")
+    line.refused(line.to_target, joints(HOME, header=Header(frame_id=CORRECTED)), "joint_targets")
+    line.refused(line.to_states, joints(bad), "joint_states")
+    times = np.array([0.0, 1.0])
+    line.refused(line.to_path, trajectory(np.stack([HOME, bad]), times), "joint_trajectory")
+    line.refused(line.to_path, trajectory(np.stack([HOME] * 2), times[::-1]), "joint_trajectory")
+    for change in ({"serial": "s2"}, {"state": KinematicModel.CANDIDATE}, {"model_hash": "other"}):
+        message = model_message(drifted(), 9, **change)
+        line.refused(line.to_model, message, "kinematic_model")
+    assert not line.targets
+    assert not line.paths
+
+    def status() -> DiagnosticStatus | None:
+        found = [s for array in line.diagnostics for s in array.status]
+        return next((s for s in found if s.level == DiagnosticStatus.WARN), None)
+
+    graph.spin_until(lambda: status() is not None, "a warning")
+    report = status()
+    assert report is not None
+    assert report.hardware_id == "s1"
+    assert "refused" in report.message
+    assert {v.key for v in report.values} >= {"refused, a value is not finite", "correction"}
+    assert np.all(np.isfinite(line.target().position))
+
+
+def test_its_own_output_is_not_corrected_again(graph: Any) -> None:
+    line = Line(graph)
+    other = graph.probe.create_publisher(JointState, f"{NODE}/joint_targets", 10)
+    looped = graph.add(
+        JointCorrectionNode,
+        {"serial": "s1"},
+        namespace="second",
+        cli_args=["--ros-args", "-r", f"joint_targets:={NODE}/joint_targets"],
+    )
+    graph.spin_until(lambda: looped._sources["joint_targets"].fault != "", "the loop is seen")
+    assert "joint_correction_node" in looped._sources["joint_targets"].fault
+    count = looped.inputs["joint_targets"]
+    line.target()
+    graph.spin_until(lambda: count.invalid > 0, "the looped target is refused")
+    graph.probe.destroy_publisher(other)
+
+
+def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
+    line = Line(graph, enable_on_start=True)
+    actual = drifted()
+    line.take(model_message(actual), line.to_model, "kinematic_model")
+    line.settle()
+    q = HOME + np.linspace(0.0, 0.1, 10_000)[:, None]
+    line.to_path.publish(trajectory(q, np.arange(1, 10_001) * 1e-3))
+    out = line.wait(line.paths)
+    assert len(out.points) == 10_000
+    assert distance(actual, out.points[0].positions) < 1e-9
+
+
+@pytest.mark.parametrize("parameters", [{"taught_tool": [1.0]}, {"taught_tool": [0.1] * 7}])
+def test_a_tool_that_makes_no_sense_is_named(graph: Any, parameters: dict[str, Any]) -> None:
+    node = graph.add(JointCorrectionNode, parameters)
+    assert not node.is_active
+    assert "taught_tool" in node._full_health().message
+
+
+def test_the_configuration_file_shows_every_parameter_with_its_default() -> None:
+    path = Path(__file__).parents[2] / "config" / "joint_correction_node.yaml"
+    (content,) = yaml.safe_load(path.read_text()).values()
+    defaults = {s.name: s.default for s in (AUTOSTART, SERIAL, *SETTINGS)}
+    assert content["ros__parameters"] == defaults
+
+
+def test_as_a_process_it_answers_in_time_and_streams(graph: Any) -> None:
+    began = time.monotonic()
+    process = graph.start(
+        "joint_correction_node",
+        {"serial": "s1", "enable_on_start": "true"},
+        {"kinematic_model": "/somebody/model"},
+    )
+    assert graph.call(SetBool, f"{NODE}/enable", data=True).success
+    assert time.monotonic() - began < 1.5
+    actual = drifted()
+    outputs = graph.collect(JointState, f"{NODE}/joint_targets")
+    graph.publisher(KinematicModel, "/somebody/model", qos.LATCHED).publish(model_message(actual))
+    target = graph.publisher(JointState, "joint_targets")
+    target.publish(joints(HOME))
+    graph.spin_until(lambda: len(outputs) == 1, "the first output")
+    for i in range(2, 1000):
+        target.publish(joints(HOME))
+        graph.spin_until(lambda count=i: len(outputs) >= count, f"output {i}")
+        if distance(actual, outputs[-1].position) < 1e-9:
+            break
+    q = np.array([out.position for out in outputs])
+    assert np.all(np.isfinite(q))
+    assert np.abs(np.diff(q, axis=0)).max() <= np.radians(0.5) * 0.02 + 1e-12
+    assert distance(actual, q[-1]) < 1e-9
+    assert process.stop() == 0
+    assert "Traceback" not in process.output
