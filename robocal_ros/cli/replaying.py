@@ -124,7 +124,7 @@ def _commands(
     for sample in watch("looking for cycles", recording):
         feed(scout, sample, recording.inputs)
     newest = max(scout.desk.newest_ns.values(), default=0)
-    observed = scout.desk.window(-1, newest, scout.desk.newest_ns)
+    observed = scout.desk.window(-1, newest, scout.desk.marks)
     if not observed:
         raise InputError(
             f"no measurement at standstill in this recording{_ignored_words(scout)}",

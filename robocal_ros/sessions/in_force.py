@@ -1,11 +1,16 @@
 """What the history has in force, followed while other processes decide in it too."""
 
+from collections.abc import Mapping
+
+from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import reference_of
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Decision, Head
 from robocal_ros.core.thermal.identification import ColdReference
+from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
+from robocal_ros.sessions.observations import JOINTS
 
 REFERENCE = "reference"
 
@@ -55,3 +60,12 @@ class InForce:
         head = self._history.head(REFERENCE)
         reference = None if head.model is None else reference_of(head.model, self._nominal)
         return reference, head.calibration_id
+
+
+def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:
+    """Put another process's decision as a command that was carried out, for the record."""
+    chosen = decision.calibration_id or 0
+    arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
+    command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
+    message = f"revision {decision.head_after}: decided outside this node"
+    return Outcome(command, Code.ACCEPT, message, None, chosen, decision.head_after, outside=True)

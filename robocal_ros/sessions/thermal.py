@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict, hold_out, pose_groups
+from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import (
     arm_of,
@@ -16,10 +16,9 @@ from robocal_ros.core.documents import (
     reference_document,
 )
 from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
-from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_judge
-from robocal_ros.core.identification.mismatch import require_match
+from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_hold_out
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, Decision, Head, Proposal
+from robocal_ros.core.proposals import THERMAL, Head, Proposal
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
 from robocal_ros.core.thermal.identification import (
     ColdReference,
@@ -29,7 +28,7 @@ from robocal_ros.core.thermal.identification import (
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.in_force import REFERENCE, InForce
+from robocal_ros.sessions.in_force import REFERENCE, InForce, outside_decision
 from robocal_ros.sessions.observations import (
     JOINTS,
     JUMPS,
@@ -152,7 +151,9 @@ class ThermalSession:
         if command.marks is None:
             command = self._marked(command)
         outcome = self._carry_out(command, wall_ns)
-        outside += [self._outside(decision) for decision in self._current.look(wall_ns)]
+        outside += [
+            outside_decision(decision, self.desk.marks) for decision in self._current.look(wall_ns)
+        ]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
 
     def _marked(self, command: Command) -> Command:
@@ -251,11 +252,13 @@ class ThermalSession:
                 prior_covariance=self.prior,
                 method=method,
             )
-        held = hold_out(pose_groups(data.q), self.config.hold_out, self.config.seed)
-        require_match(self.nominal, data, base=True, tool=True)
-        in_force = self.arm if self.in_force.model is not None else None
-        return identify_and_judge(
-            self.nominal, data.take(~held), data.take(held), method=method, in_force=in_force
+        return identify_and_hold_out(
+            self.nominal,
+            data,
+            share=self.config.hold_out,
+            seed=self.config.seed,
+            method=method,
+            in_force=self.arm if self.in_force.model is not None else None,
         )
 
     def _propose(
@@ -320,13 +323,4 @@ class ThermalSession:
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""
-        return [self._outside(decision) for decision in self._current.look()]
-
-    def _outside(self, decision: Decision) -> Outcome:
-        chosen, marks = decision.calibration_id or 0, self.desk.marks
-        arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
-        command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
-        message = f"revision {decision.head_after}: decided outside this node"
-        return Outcome(
-            command, Code.ACCEPT, message, None, chosen, decision.head_after, outside=True
-        )
+        return [outside_decision(decision, self.desk.marks) for decision in self._current.look()]

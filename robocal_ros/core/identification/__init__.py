@@ -1,7 +1,11 @@
 """Identification of a robot's kinematic model from measured points or poses."""
 
 from robocal_ros.core.identification.cell import CellModel
-from robocal_ros.core.identification.judged import JudgedIdentification, identify_and_judge
+from robocal_ros.core.identification.judged import (
+    JudgedIdentification,
+    identify_and_hold_out,
+    identify_and_judge,
+)
 from robocal_ros.core.identification.solve import Identification, Method, Part, identify
 
 __all__ = [
@@ -11,5 +15,6 @@ __all__ = [
     "Method",
     "Part",
     "identify",
+    "identify_and_hold_out",
     "identify_and_judge",
 ]

@@ -6,10 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import ErrorSummary, Verdict, judge, pose_groups, summarise
+from robocal_ros.core.assessment import (
+    ErrorSummary,
+    Verdict,
+    hold_out,
+    judge,
+    pose_groups,
+    summarise,
+)
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification.cell import CellModel
+from robocal_ros.core.identification.mismatch import require_match
 from robocal_ros.core.identification.solve import Identification, Method, Part, identify
 from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
@@ -85,6 +93,30 @@ def identify_and_judge(
         workspace_rms_m=result.workspace_rms(result.estimate.covariance),
         verdict=verdict,
     )
+
+
+def identify_and_hold_out(
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    share: float,
+    seed: int,
+    method: Method = "map",
+    in_force: SerialArm | None = None,
+) -> JudgedIdentification:
+    """Identify base, targets and model from a part of the poses, judge on the ``share`` left out.
+
+    Raises
+    ------
+    InputError
+        When the data miss the arm by a mistake that can be named.
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer.
+    """
+    held = hold_out(pose_groups(data.q), share, seed)
+    require_match(arm, data, base=True, tool=True)
+    train, check = data.take(~held), data.take(held)
+    return identify_and_judge(arm, train, check, method=method, in_force=in_force)
 
 
 def uninformative(result: Identification, current_rms_m: float, in_force: SerialArm) -> str:
