@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 Cell = str | float | int | None
 
 
@@ -18,7 +20,7 @@ class Goal:
     @property
     def met(self) -> bool:
         """Whether it does."""
-        return self.value >= self.limit if self.at_least else self.value <= self.limit
+        return bool(self.value >= self.limit if self.at_least else self.value <= self.limit)
 
     def __str__(self) -> str:
         words = f"{'≥' if self.at_least else '≤'} {self.limit:.4g}"
@@ -82,7 +84,7 @@ def _plain(cell: Cell | Goal) -> Any:
             "at_least": cell.at_least,
             "met": cell.met,
         }
-    return cell
+    return cell.item() if isinstance(cell, np.generic) else cell
 
 
 def show(tables: Sequence[Table]) -> None:
