@@ -10,7 +10,6 @@ error is known, at poses that were never measured.
 import argparse
 import json
 import shutil
-import subprocess
 import sys
 import time
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 from demo_graph import ROOT, CellController, DemoError
+from demo_output import commit, show, write
 from make_demo_shift import BAG, ROBOT, SERIAL, DemoCell, build
 from make_demo_shift import write as write_bag
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from std_srvs.srv import SetBool
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.report.drift import TOLERANCE_MM, Decided, DriftReport, Origin
+from robocal_ros.report.drift import Decided, DriftReport, Origin
 from robocal_ros.sim import kr150
 from robocal_ros.sim.robot import Effects
 from robocal_ros.sim.shift import REFERENCE
@@ -36,7 +36,7 @@ from robocal_ros.storage.robots import load_robot
 Array = NDArray[np.float64]
 
 OUT = ROOT / "out"
-RATE = 1000.0  # recorded seconds per second
+RATE = 600.0  # recorded seconds per second
 
 
 @dataclass
@@ -108,6 +108,7 @@ class Demo:
         answer = self._controller.call(CaptureReference, "/thermal_node/capture_reference")
         if not answer.success:
             raise DemoError(f"no cold reference: {answer.message}")
+        require_all(answer.samples, len(self._cell.plan.reference))
 
     def _cycle(self, name: str, taught: Array, uncorrected: Array) -> None:
         controller, shift = self._controller, self.shift
@@ -119,6 +120,7 @@ class Demo:
         answer = controller.call(Identify, "/thermal_node/identify", cycle_id=name)
         if answer.candidate_id:
             controller.wait(lambda: controller.quality, "the candidate's quality")
+            require_all(controller.quality[-1].samples, len(self._cell.plan.cycle))
         if answer.status == Code.ACCEPT:
             self._accept(answer.candidate_id)
         shift.after.append(self._error(name, taught))
@@ -205,57 +207,13 @@ class Demo:
         )
 
 
-def commit() -> str:
-    """Version of the software, with its commit where git knows it."""
-    from robocal_ros import __version__
-
-    words = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=10"]
-    found = subprocess.run(words, capture_output=True, text=True, check=False)
-    return f"robocal_ros {__version__} {found.stdout.strip()}".strip()
-
-
-def write(report: DriftReport, folder: Path) -> None:
-    """Write the page, the figures' numbers as JSON, and every error as CSV."""
-    from robocal_ros.report.html import page
-
-    (folder / "report.html").write_text(page(report), encoding="utf-8")
-    document = json.dumps(report.document(), indent=1, allow_nan=False)
-    (folder / "report.json").write_text(document + "\n", encoding="utf-8")
-    (folder / "errors.csv").write_text(report.table(), encoding="utf-8")
-
-
-def show(report: DriftReport, folder: Path, seconds: float) -> None:
-    """Print the summary."""
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(highlight=False)
-    cycles, poses, _ = report.before.shape
-    console.print(f"\n[bold]{report.title}[/bold]  [red]simulated[/red]")
-    console.print(
-        f"{cycles} measuring cycles in {report.hours[-1]:.1f} h; true error of the tool at {poses} "
-        "poses that were never measured:\n"
-    )
-    table = Table(box=None, header_style="dim")
-    table.add_column("mm", no_wrap=True)
-    for head in ("mean", "rms", "p95", "max", f"within {TOLERANCE_MM:g} mm"):
-        table.add_column(head, justify="right")
-    for i, (name, found) in enumerate(report.rows()):
-        keys = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
-        cells = [f"{found[key]:.3f}" for key in keys] + [f"{found['share_within_tolerance']:.1%}"]
-        table.add_row(name, *cells, style="bold green" if i == 1 else None)
-    console.print(table)
-    accepted = sum(decided.code == Code.ACCEPT.name for decided in report.decisions)
-    predicted = [d.predicted_mm for d in report.decisions if d.predicted_mm is not None]
-    if predicted:
-        console.print(
-            f"\npredicted there from the models' own covariance: "
-            f"{np.sqrt(np.mean(np.square(predicted))):.3f} mm rms"
+def require_all(samples: int, poses: int) -> None:
+    """The replay must not have run on into the next cycle before it was told to pause."""
+    if samples != poses:
+        raise DemoError(
+            f"{samples} samples of {poses} poses: this machine is too busy for the replay's speed; "
+            "try --rate 100"
         )
-    console.print(f"{accepted} of {cycles} candidates accepted; the report says why:")
-    page = folder / "report.html"
-    console.print(str(page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page))
-    console.print(f"[dim]{seconds:.0f} s, through three nodes as processes over DDS[/dim]")
 
 
 def main() -> int:
