@@ -21,7 +21,7 @@ OUT = ROOT / "docs" / "figures"
 
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
-    from bench import monte_carlo, real_data, speed, startup
+    from bench import files, monte_carlo, real_data, speed, startup
 
     def start() -> Sequence[Table]:
         if startup.EXECUTABLES.is_dir():
@@ -34,6 +34,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "monte_carlo": monte_carlo.tables,
         "speed": speed.tables,
         "startup": start,
+        "files": lambda: [files.file_times()],
     }
 
 

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -81,16 +80,7 @@ class TestUsage:
 
 
 class TestStart:
-    def test_help_is_fast_and_loads_nothing_heavy(self):
-        took = []
-        for _ in range(5):
-            start = time.perf_counter()
-            assert robocal("--help").returncode == 0
-            took.append(time.perf_counter() - start)
-        start = time.perf_counter()
-        subprocess.run([sys.executable, "-c", "pass"], check=True, env=environment())
-        bare = time.perf_counter() - start
-        assert min(took) - bare < 0.15
+    def test_help_loads_nothing_heavy(self):
         heavy = "import sys; from robocal_ros.cli.main import main; main(['--help']); print(sorted("
         heavy += "{'numpy', 'scipy', 'rich', 'rclpy', 'numba'} & set(sys.modules)))"
         done = subprocess.run(
