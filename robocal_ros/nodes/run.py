@@ -1,15 +1,21 @@
 """Run one node as a process."""
 
+import os
+import signal
 import sys
+import threading
 import traceback
+from collections.abc import Callable
 
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from robocal_ros.nodes.base import HouseNode
 
 SPIN_S = 0.5
+ENDING = {signal.SIGINT, signal.SIGTERM}
 
 
 def run(node_class: type[HouseNode], *, events: bool = False) -> None:
@@ -20,7 +26,10 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
     node_class : what to run; its parameters come from the command line.
     events : use the events executor: half the CPU and latency, but no ``async`` services.
     """
-    rclpy.init()
+    # A signal must not break into a callback: neither as an exception in the middle of it (the
+    # conversion of a message then fails) nor as a shutdown of the context below it.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
         node = node_class()
@@ -39,16 +48,31 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
 
 
 def _spin(node: HouseNode, events: bool) -> None:
+    ending = threading.Event()
     if not events:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        while rclpy.ok():
+        _watch_signals(ending, executor.wake)
+        while rclpy.ok() and not ending.is_set():
             executor.spin_once(timeout_sec=SPIN_S)
         return
     from rclpy.experimental.events_executor import EventsExecutor
 
     executor = EventsExecutor()
     executor.add_node(node)
-    while rclpy.ok():
+    _watch_signals(ending, executor.wake)
+    while rclpy.ok() and not ending.is_set():
         # A new future each time: one that never ends would gather callbacks.
         executor.spin_until_future_complete(Future(), timeout_sec=SPIN_S)
+
+
+def _watch_signals(ending: threading.Event, wake: Callable[[], object]) -> None:
+    """End the spinning at the first signal, the process at a second one."""
+
+    def watch() -> None:
+        signal.sigwait(ENDING)
+        ending.set()
+        wake()
+        os._exit(128 + signal.sigwait(ENDING))
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -11,7 +11,7 @@ from rclpy.task import Future
 from robocal_msgs.msg import CalibrationQuality, KinematicModel, SessionEvent
 from sensor_msgs.msg import JointState
 
-import robocal_ros
+from robocal_ros import __version__
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.nodes import conversions, qos
@@ -90,8 +90,7 @@ class ThermalNode(HouseNode):
         if self._history is None:
             raise ValueError("activated before it was configured")
         config = session_config(self.settings)
-        software = f"robocal_ros {robocal_ros.__version__}"
-        self._session = ThermalSession(self._nominal, self._history, config, software)
+        self._session = ThermalSession(self._nominal, self._history, config, __version__)
         self._shown = ()
         self._show_in_force()
 

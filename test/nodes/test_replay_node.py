@@ -6,18 +6,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cell import KEEP_ALL
+from cell import KEEP_ALL, Cell, message_of
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from shift import Shift, built, postures
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.replay_topics import chosen_topics
 from robocal_ros.storage.bags import BagWriter
+from robocal_ros.storage.robots import load_robot
 
 NS = 1_000_000_000
 START_NS = 100 * NS
@@ -144,6 +147,29 @@ def test_it_pauses_and_goes_on(graph, tmp_path):
     refused = graph.call(Trigger, "/replay_node/play")
     assert not refused.success
     assert "done" in refused.message
+
+
+def test_a_thermal_node_takes_all_of_a_fast_replay(graph, tmp_path):
+    nominal = load_robot("kr150_r3100")
+    shift = Shift(nominal.joint_names)
+    samples = list(shift.visit(built(nominal), postures(nominal, 20)))
+    with BagWriter(tmp_path / "visit.mcap") as bag:
+        for sample in samples:
+            joints = isinstance(sample, JointSample)
+            topic = "/joint_states" if joints else "/measured_point"
+            kind = "sensor_msgs/msg/JointState" if joints else "geometry_msgs/msg/PointStamped"
+            bag.write(topic, kind, message_of(sample), sample.stamp_ns)
+    cell = Cell(graph)
+    bag, wait = tmp_path / "visit.mcap", "[/joint_states,/measured_point]"
+    player = graph.start(
+        "replay_node",
+        {"bag": bag, "rate": 0.0, "wait_for_subscribers": wait, "exit_at_end": True},
+    )
+    sent = str(sum(isinstance(sample, JointSample) for sample in samples))
+    graph.spin_until(lambda: cell.value("joint_states received") == sent, "all arrived")
+    assert player.process.wait(10) == 0
+    answer = cell.call("capture_reference")
+    assert (answer.success, answer.samples) == (True, 20)
 
 
 def test_a_bag_that_is_none_is_said(graph, tmp_path):

@@ -336,9 +336,7 @@ def test_live_equals_replay_bit_for_bit(graph, visits, nominal, tmp_path):
         again = CalibrationHistory.open(
             "again", model_hash=nominal.model_hash, state_dir=tmp_path / "again"
         )
-        session = ThermalSession(
-            nominal, again, config_of(configured.arguments), f"robocal_ros {__version__}"
-        )
+        session = ThermalSession(nominal, again, config_of(configured.arguments), __version__)
         report = replay(
             session,
             bag.messages(list(topics)),
@@ -350,6 +348,11 @@ def test_live_equals_replay_bit_for_bit(graph, visits, nominal, tmp_path):
     with CalibrationHistory.open("live", state_dir=graph.state) as live:
         assert content(again) == content(live)
         assert again.head() == live.head()
+        done = robocal(graph, "replay", str(path), "--state", str(tmp_path / "cli"), "--json")
+        assert done.returncode == 0, done.stderr
+        assert json.loads(done.stdout)["differs"] == []
+        with CalibrationHistory.open("live", state_dir=tmp_path / "cli") as printed:
+            assert content(printed) == content(live)
 
 
 class Recorder:
