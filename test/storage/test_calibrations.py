@@ -317,7 +317,7 @@ class TestManyProcesses:
             assert found in (old, old + 1)
             before = found
         assert len(seen) == rounds
-        assert before > rounds  # they were at work when they were killed
+        assert before >= rounds  # they were at work when they were killed
         with contextlib.closing(sqlite3.connect(tmp_path / "KR-7.sqlite")) as raw:
             assert raw.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
             assert raw.execute("PRAGMA foreign_key_check").fetchall() == []
