@@ -44,7 +44,8 @@ lint: setup-python  ## style and strict types
 	$(VENV)/bin/mypy
 
 test-floor: $(VENV)-floor/.stamp  ## tests that need no ROS, with the versions of Ubuntu 24.04
-	OPENBLAS_NUM_THREADS=1 $(VENV)-floor/bin/python -m pytest -m "not ros" $(TESTS)
+	OPENBLAS_NUM_THREADS=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)-floor/kernels \
+		$(VENV)-floor/bin/python -m pytest -m "not ros" $(TESTS)
 
 setup: setup-python setup-ros $(STAMPS)/kernels  ## everything that demo and test need
 
@@ -73,7 +74,9 @@ $(STAMPS)/editable: $(STAMPS)/wheels $(PYTHON_FILES)
 
 # Compiled kernels are kept beside their source; nodes start 1.5 s sooner with them.
 $(STAMPS)/kernels: $(STAMPS)/editable $(shell grep -rls '^from numba\|^import numba' robocal_ros)
-	@$(VENV)/bin/python tools/warm_kernels.py
+	@# Numba notices a change in a kernel's own file only, not in one that it was built from.
+	find robocal_ros -name '*.nb[ic]' -delete
+	$(VENV)/bin/python tools/warm_kernels.py
 	touch $@
 
 # ---- ROS: the two packages in install/ ---------------------------------------------------------

@@ -98,7 +98,8 @@ def rates_batch(
         k.blend(models[2], models[3], s[i], model)
         _twist(corrected[i], zero, zero, model, frames, poses, J, v2, a2)
         if not k.factor(J, L):
-            velocity[i], acceleration[i] = np.nan, np.nan
+            for j in range(n):
+                velocity[i, j], acceleration[i, j] = np.nan, np.nan
             continue
         k.solve(J, L, v, zero, velocity[i])
         _twist(corrected[i], velocity[i], zero, model, frames, poses, J, v2, a2)

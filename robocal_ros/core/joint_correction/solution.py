@@ -100,9 +100,10 @@ def _first_steps(
     x, step = steps[0, :n], steps[1, :n]
     k.solve(J, L, e, x, step)
     share = k.share(step, largest)
-    steps[2, :6] = e
+    for r in range(6):
+        steps[2, r] = e[r]
     start = ends[4]
-    start[:] = ends[3]
+    k.copy(ends[3], start)
     if share < 1.0:
         k.part_of_the_way(start, steps[2, :6], share, ends[2])
     for i in range(n):
@@ -151,7 +152,8 @@ def _newton(
     """
     n = q.shape[0]
     x, step = steps[0, :n], steps[1, :n]
-    x[:] = 0.0
+    for i in range(n):
+        x[i] = 0.0
     share, iterations = 1.0, 0
     converged = k.largest_of(e) <= SMALL_RESIDUAL
     while not converged and iterations < MOST_ITERATIONS:
@@ -208,7 +210,7 @@ def correct_point(
     k.at_tool(here, ends[1])
     k.residual(goal, here, e)
     out[n + TCP_SHIFT], out[n + TCP_ROTATION] = k.length(e, 0), k.length(e, 3)
-    ends[2] = goal
+    k.copy(goal, ends[2])
     _newton(q, links, ends, largest, frames, J, L, steps, out, e)
     if out[n + SHARE] < 1.0:
         walk(out[:n], links, ends[0], frames, here)
