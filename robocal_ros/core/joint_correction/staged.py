@@ -147,11 +147,10 @@ class StagedCorrection:
 
 
 def load_kernels(arm: SerialArm) -> None:
-    """Call all compiled code once, so that the first command need not wait for it."""
+    """Call the compiled code of a stage once, so that the first command need not wait for it."""
     packed, largest = pack_model(arm), np.ones(arm.n)
     q, s = np.zeros((2, arm.n)), np.full(2, 0.5)
     stage = StagedCorrection(packed, packed, packed.copy(), largest, largest)
     stage.rates(q, q, q, s, np.zeros(2), stage.correct(q, s))
     stage.uncorrect(q, s)
-    JointCorrection.between(arm, arm).point(q[0])
     blend_models(packed, packed.copy(), 0.5)
