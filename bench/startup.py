@@ -1,7 +1,7 @@
 """From the start of each executable to the first answer of its services.
 
 Needs rclpy, which the other benchmarks' venv has not: ``start_times`` runs this file in the venv
-of the nodes, as ``tools/with_ros python bench/startup.py`` does.
+of the nodes, as ``tools/with_ros python -m bench.startup`` does.
 """
 
 import json
@@ -35,7 +35,8 @@ def start_times() -> Table:
     done = subprocess.run(
         [ROOT / "tools" / "with_ros", "python", "-m", "bench.startup"],
         cwd=ROOT,
-        capture_output=True,
+        env=os.environ | {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)},
+        stdout=subprocess.PIPE,
         text=True,
         check=True,
     )
