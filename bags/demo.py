@@ -36,6 +36,7 @@ from robocal_ros.storage.robots import load_robot
 Array = NDArray[np.float64]
 
 OUT = ROOT / "out"
+INPUTS = ("joint_states", "measured_point")
 RATE = 600.0  # recorded seconds per second
 
 
@@ -66,8 +67,12 @@ class Demo:
         """Start the three nodes; the replay waits."""
         common = {"robot": ROBOT, "serial": SERIAL}
         controller = self._controller
-        # The cell controller's mark comes after the last measurement: nothing is under way.
-        controller.start(folder, "thermal_node", lateness_s=0.0, **common)
+        # At this speed nothing may be lost on the way. The cell controller's mark comes after the
+        # last measurement: nothing is under way then.
+        reliable = {
+            f"qos_overrides./{topic}.subscription.reliability": "reliable" for topic in INPUTS
+        }
+        controller.start(folder, "thermal_node", lateness_s=0.0, **common, **reliable)
         controller.start(
             folder,
             "joint_correction_node",
@@ -94,7 +99,7 @@ class Demo:
         for _ in self._cycles:
             controller.trigger("/replay_node/play")
             controller.wait(lambda: controller.done and controller.truth, "the end of a cycle")
-            controller.pause("thermal_node", ("joint_states", "measured_point"))
+            controller.pause("thermal_node", INPUTS)
             name = controller.done.popleft().data
             truth = json.loads(controller.truth.popleft().data)
             if truth["cycle"] != name:

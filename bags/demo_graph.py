@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
-PATIENCE_S = 20.0
+PATIENCE_S = 30.0
 END_S = 5.0
 POINT_S = 4.0  # between two check poses
 
