@@ -15,6 +15,8 @@ from cell import DEEP, KEEP_ALL, Cell, message_of
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseStamped
 from history_content import content
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
 from robocal_msgs.msg import KinematicModel, SessionEvent
 from robocal_msgs.srv import Decide, ListCalibrations
@@ -28,6 +30,7 @@ from robocal_ros.core.proposals import Head, Proposal, State
 from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
+from robocal_ros.nodes.diagnostics import Health
 from robocal_ros.nodes.thermal_node import EVENTS
 from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.replay import input_topics, read_events, replay
@@ -264,7 +267,7 @@ def propose(history: CalibrationHistory, nominal: Any, number: int) -> int:
     )
 
 
-ROUNDS, ROBOTS = 3, 4
+ROUNDS, ROBOTS = int(os.environ.get("ROBOCAL_KILL_ROUNDS", "3")), 4  # more for a long run
 
 
 def test_a_kill_during_accept_leaves_the_old_or_the_new_state(graph, nominal):
@@ -404,6 +407,38 @@ def test_a_damaged_history_is_set_aside_and_said(graph):
     assert "damaged" in cell.status().message
     assert cell.models[-1].revision == 0
     assert list(graph.state.glob("s1.sqlite.damaged-*"))
+
+
+def test_a_history_that_vanishes_fails_calls_and_not_the_node(graph):
+    cell = Cell(graph)
+    path = graph.state / "s1.sqlite"
+    path.rename(graph.state / "elsewhere")
+    answer = cell.call("rollback_trigger")
+    assert answer.message.startswith("0 STORAGE_FAILED ")
+    graph.spin_until(lambda: "deleted" in (cell.status() or Health()).message, "it is said")
+    assert cell.status().level == DiagnosticStatus.ERROR
+    (graph.state / "elsewhere").rename(path)
+    graph.spin_until(lambda: "deleted" not in cell.status().message, "it is mended")
+    assert cell.call("rollback_trigger").message.startswith("0 CONFLICT ")
+
+
+def test_a_deactivated_node_refuses_and_comes_back(graph):
+    cell = Cell(graph)
+
+    def change(transition: int) -> None:
+        request = {"transition": Transition(id=transition)}
+        assert graph.call(ChangeState, "/thermal_node/change_state", **request).success
+
+    change(Transition.TRANSITION_DEACTIVATE)
+    answer = cell.call("identify")
+    assert (answer.success, answer.status) == (False, Code.CONFLICT)
+    assert "activate it" in answer.message
+    cell.models.clear()
+    change(Transition.TRANSITION_ACTIVATE)
+    graph.spin_until(lambda: cell.models, "the model in force")
+    assert cell.call("identify").status == Code.TOO_FEW_SAMPLES
+    graph.spin_until(lambda: len(cell.events) == 3, "three events")
+    assert [e.command for e in cell.events] == ["configure", "configure", "identify"]
 
 
 def test_a_state_folder_that_cannot_be_used_does_not_end_the_node(graph):

@@ -192,6 +192,36 @@ def test_a_recording_that_began_later_starts_from_what_was_then_in_force(nominal
     assert len(commands) == 5
 
 
+@pytest.mark.parametrize("jumped_before", [0, 3])
+def test_a_clock_that_jumped_back_in_the_recording(nominal, visits, tmp_path, jumped_before):
+    """A simulation that began again: a command belongs to its own run of the clock."""
+    parts = [visits[1], visits[0], visits[1], visits[3]]
+    node = session_in(tmp_path / "live", nominal)
+    node.desk.jumps = jumped_before  # the recording began later
+    log = [event(configuration(node))]
+
+    def play(part: Sequence[Any]) -> None:
+        for sample in part:
+            node.add(sample)
+            for outcome in node.advance(wall_ns=3):
+                log.append(event(outcome.command, outcome_text(outcome)))
+
+    play(parts[0])
+    node.submit(Command(events.REJECT, {"id": 99}))  # late on the clock, early in the recording
+    play(parts[1])
+    node.submit(Command(events.CAPTURE_REFERENCE))
+    play(parts[2])
+    node.submit(Command(events.IDENTIFY))
+    play(parts[3])
+    assert node.desk.jumps == jumped_before + 1
+    assert [r.message.command for r in log[1:]] == ["reject", "capture_reference", "identify"]
+    _, commands = read_events(log)
+    samples = [recorded(s) for part in parts for s in part]
+    report = replay(session_in(tmp_path / "again", nominal), samples, commands)
+    assert report.differs == []
+    assert [o.samples for o in report.outcomes] == [0, POSES, POSES]
+
+
 def test_a_configuration_comes_back_whole(nominal, tmp_path):
     config = ThermalConfig(method="lsq", sigma_m=1.23e-5, target="cube", lateness_s=0.5, seed=7)
     session = session_in(tmp_path, nominal, config)
