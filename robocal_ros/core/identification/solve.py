@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from robocal_ros.core import estimation
 from robocal_ros.core.errors import RankDeficientError
 from robocal_ros.core.identification.cell import CellModel, CellProblem, Layout, make_layout
+from robocal_ros.core.identification.priors import default_prior, fitted_prior
 from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.observability import describe, observability
@@ -19,9 +20,6 @@ Array = NDArray[np.float64]
 Part = Literal["base", "tool", "geometry"]
 Method = Literal["map", "lsq"]
 
-# Spread of a new robot's parameters about the nominal ones: machining and mastering tolerances.
-TOLERANCE_LENGTH_M = 3e-3
-TOLERANCE_ANGLE_RAD = float(np.radians(0.5))
 _STILL_RAD = float(np.radians(5.0))
 _ORIENTATION_SHARE = 0.25
 _SHORTEST_LEVER_M = 0.02
@@ -110,11 +108,6 @@ class Identification:
         return mask
 
 
-def default_prior(arm: SerialArm) -> Array:
-    """Variances (k,) of the free parameters of an arm as built."""
-    return np.where(arm.parameters.is_length, TOLERANCE_LENGTH_M, TOLERANCE_ANGLE_RAD) ** 2
-
-
 def identify(
     arm: SerialArm,
     data: Measurements,
@@ -133,7 +126,8 @@ def identify(
     data : m samples of one or several targets; poses when ``data.rotation`` is given.
     method : ``map`` keeps every free parameter, with a Gaussian prior about the nominal one;
         ``lsq`` has no prior and holds parameters whose effect base or targets have too.
-    prior_covariance : (k, k) of the arm's free parameters, SI; default: building tolerances.
+    prior_covariance : (k, k) of the arm's free parameters, SI; default: building tolerances,
+        scaled to what the data show (``priors.fitted_prior``).
     start : known base and targets; where a part of them is not in ``fit`` it is held there.
 
     Raises
@@ -157,13 +151,17 @@ def identify(
     if method == "lsq":
         held = _redundant(complete, initial, arm, len(names))
     layout = layout_of(tuple(n for n in names if n not in held)) if held else complete
-    prior, covariance = None, None
-    if method == "map" and names:
-        prior = np.zeros((len(layout.names), len(layout.names)))
-        covariance = np.diag(default_prior(arm)) if prior_covariance is None else prior_covariance
-        prior[: len(names), : len(names)] = np.linalg.inv(covariance)
+    by_prior = method == "map" and bool(names)
+    covariance = prior_covariance if by_prior else None
+    if by_prior and covariance is None:
+        covariance = np.diag(default_prior(arm))
     try:
-        estimate, lever = _solve(arm, data, layout, initial, prior, robust)
+        estimate, lever = _solve(arm, data, layout, initial, covariance, robust)
+        if by_prior and prior_covariance is None:
+            found = arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
+            known = estimate.covariance[: len(names), : len(names)]
+            covariance = np.diag(fitted_prior(arm, found, known))
+            estimate, lever = _solve(arm, data, layout, estimate.state, covariance, robust)
     except RankDeficientError as error:
         raise RankDeficientError(f"{error}{_still_joints(arm, data)}", error.directions) from error
     result = _report(arm, data, estimate, layout, complete, method, held, lever)
@@ -175,7 +173,7 @@ def _solve(
     data: Measurements,
     layout: Layout,
     initial: CellModel,
-    prior: Array | None,
+    prior_covariance: Array | None,
     robust: bool,
 ) -> tuple[estimation.Estimate[CellModel], float]:
     """Solve; orientations settle what positions leave open and weigh little beside them.
@@ -187,6 +185,11 @@ def _solve(
     sigma = np.ones(len(data)) if data.sigma is None else data.sigma
     reach = float(np.linalg.norm(initial.T_flange_target[:, :3, 3], axis=1).mean())
     most = max(_ORIENTATION_SHARE * reach, _SHORTEST_LEVER_M)
+    prior = None
+    if prior_covariance is not None:
+        count = len(prior_covariance)
+        prior = np.zeros((len(layout.names), len(layout.names)))
+        prior[:count, :count] = np.linalg.inv(prior_covariance)
     lever = most
     if data.rotation is not None:
         unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm.mdh)
