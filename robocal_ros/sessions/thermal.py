@@ -26,6 +26,7 @@ from robocal_ros.core.thermal.identification import (
     identify_drift,
 )
 from robocal_ros.sessions import events
+from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE, InForce, outside_decision
@@ -296,30 +297,7 @@ class ThermalSession:
         )
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
-        arguments = command.arguments
-        chosen = int(arguments.get("id", 0))
-        by, why = str(arguments.get("by", "")), str(arguments.get("reason", ""))
-        expected = self.in_force.revision
-        if command.name == events.REJECT:
-            self._history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
-            return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
-        if command.name == events.ACCEPT:
-            head = self._history.accept(
-                chosen, by=by, reason=why, expected_head=expected, wall_ns=wall_ns
-            )
-        else:
-            head = self._history.rollback(
-                None if arguments.get("previous", False) else chosen,
-                by=by,
-                reason=why,
-                expected_head=expected,
-                wall_ns=wall_ns,
-            )
-        chosen = head.calibration_id or 0
-        what = f"calibration {head.calibration_id}" if head.calibration_id else "the nominal model"
-        return Outcome(
-            command, Code.ACCEPT, f"revision {head.revision}: {what} in force", None, chosen
-        )
+        return decide(self._history, command, self.in_force.revision, wall_ns)
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""
