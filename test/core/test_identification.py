@@ -295,6 +295,24 @@ def test_a_joint_that_never_moves(cell, joint):
     assert np.all(away[cell.nominal.parameters.is_length] < 9e-3)  # three sigmas of the prior
 
 
+@pytest.mark.parametrize("joint", range(6))
+def test_a_joint_that_moves_in_the_check_only(cell, joint):
+    """Still in both: no judgement of what it does. Moved in the check: the check decides."""
+    rng = np.random.default_rng(32)
+    q, other = cell.postures(60, rng), cell.postures(60, rng)
+    q[:, joint] = q[0, joint]
+    train = cell.measure(q[:40], rng, noise_m=NOISE_M)
+    alike = cell.measure(q[40:], rng, noise_m=NOISE_M)
+    refused = identify_and_judge(cell.nominal, train, alike).verdict
+    assert refused.code is Code.POSES_NOT_INFORMATIVE
+    assert f"{cell.nominal.joint_names[joint]} moves only 0 deg: move it" in refused.reason
+    moved = identify_and_judge(
+        cell.nominal, train, cell.measure(other, rng, noise_m=NOISE_M), check_refit=("base", "tool")
+    )
+    assert "moves only" not in moved.verdict.reason
+    assert moved.verdict.accept == (moved.candidate.rms_m < 0.9 * moved.current.rms_m)
+
+
 @pytest.mark.parametrize(("count", "error"), [(4, TooFewSamplesError), (8, TooFewSamplesError)])
 def test_too_few_samples(cell, count, error):
     """5 samples place base and target; 27 unknowns need 9."""

@@ -18,7 +18,13 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.identification.mismatch import require_match
-from robocal_ros.core.identification.solve import Identification, Method, Part, identify
+from robocal_ros.core.identification.solve import (
+    Identification,
+    Method,
+    Part,
+    identify,
+    still_joints,
+)
 from robocal_ros.core.identification.start import linear_start
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
@@ -78,7 +84,8 @@ def identify_and_judge(
         before = _check_error(_set_up(in_force, train, set_up), check, check_refit)
     after = _check_error(result.cell, check, check_refit)
     predicted, total = _predicted(result, check, check_refit)
-    doubt = uninformative(result, summarise(before).rms_m, in_force or arm)
+    doubt = still_joints(arm, train) and still_joints(arm, check)
+    doubt = doubt or uninformative(result, summarise(before).rms_m, in_force or arm)
     verdict = judge(before, after, pose_groups(check.q), doubt)
     if "geometry" not in fit and verdict.code is Code.WORSE_THAN_CURRENT:
         why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"

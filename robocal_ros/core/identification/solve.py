@@ -21,6 +21,7 @@ Part = Literal["base", "tool", "geometry"]
 Method = Literal["map", "lsq"]
 
 _STILL_RAD = float(np.radians(5.0))
+_STILL_M = 0.01
 _ORIENTATION_SHARE = 0.25
 _SHORTEST_LEVER_M = 0.02
 _LEVER_ROUNDS = 4
@@ -163,7 +164,10 @@ def identify(
             covariance = np.diag(fitted_prior(arm, found, known))
             estimate, lever = _solve(arm, data, layout, estimate.state, covariance, robust)
     except RankDeficientError as error:
-        raise RankDeficientError(f"{error}{_still_joints(arm, data)}", error.directions) from error
+        still = still_joints(arm, data)
+        raise RankDeficientError(
+            f"{error}; {still}" if still else f"{error}", error.directions
+        ) from error
     result = _report(arm, data, estimate, layout, complete, method, held, lever)
     return replace(result, prior_covariance=covariance)
 
@@ -243,14 +247,17 @@ def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> t
     return tuple(layout.names[i] for i, d in zip(order, dependent, strict=True) if d)
 
 
-def _still_joints(arm: SerialArm, data: Measurements) -> str:
+def still_joints(arm: SerialArm, data: Measurements) -> str:
+    """Name the joints that the data do not turn by 5 deg (or move by 1 cm); empty if none."""
     span = np.ptp(data.q, axis=0)
     still = [
-        f"{name} moves only {np.degrees(s):.2g} deg"
+        f"{name} moves only {s * 1e3:.2g} mm"
+        if slides
+        else f"{name} moves only {np.degrees(s):.2g} deg"
         for name, s, slides in zip(arm.joint_names, span, arm.prismatic, strict=True)
-        if s < _STILL_RAD and not slides
+        if s < (_STILL_M if slides else _STILL_RAD)
     ]
-    return f"; in these data {', '.join(still)}: move it" if still else ""
+    return f"in these data {', '.join(still)}: move it" if still else ""
 
 
 def _report(
