@@ -14,6 +14,7 @@ from robocal_ros.storage.robots import load_robot
 
 LARGEST_MEAN_MM = {"A": 0.41, "B": 0.41, "C": 0.45, "D": 0.365}
 LARGEST_LATER_MEAN_MM = {"B": 0.455, "C": 0.52, "D": 0.40}
+DRAWS = 10
 LARGEST_UR5E_MEAN_MM, LARGEST_UR5E_MAX_MM = 0.0445, 0.081
 WHEN = {"A": "July 2020, grid", "B": "Nov. 2020", "C": "Nov. 2020, random", "D": "March 2021"}
 
@@ -97,6 +98,32 @@ def later_table() -> Table:
     return table
 
 
+def few_poses_table() -> Table:
+    """How many poses it takes."""
+    table = Table(
+        "ur10_few_poses",
+        f"UR10, campaign C: how many poses? rms at 1500 other poses, mean of {DRAWS} draws, mm",
+        ("poses", "nominal", "least squares", "with prior (default)", "accepted"),
+        "Accepted: of the draws, with prior, judged on as many other poses as identified it (at "
+        "least 20). The prior's width is found from the data.",
+    )
+    arm, data = load_robot("ur10"), load_campaign("C")
+    for count in (12, 16, 24, 40, 80, 160):
+        squares, accepted = np.zeros(3), 0
+        for seed in range(DRAWS):
+            order = np.random.default_rng(seed).permutation(len(data))
+            train, rest = data.take(order[:count]), data.take(order[-1500:])
+            judge_by = data.take(order[count : 2 * count + max(20 - count, 0)])
+            plain = identify_and_judge(arm, train, rest, method="lsq")
+            mine = identify_and_judge(arm, train, rest)
+            squares += [
+                errors.rms_m**2 for errors in (plain.nominal, plain.candidate, mine.candidate)
+            ]
+            accepted += identify_and_judge(arm, train, judge_by).verdict.accept
+        table.add(count, *(np.sqrt(squares / DRAWS) * 1e3).tolist(), f"{accepted} of {DRAWS}")
+    return table
+
+
 def ur5e_table() -> Table:
     """The factory calibration of a UR5e."""
     table = Table(
@@ -120,4 +147,4 @@ def tables() -> Sequence[Table]:
     if not data_folder().is_dir():
         print(f"no real measurements at {data_folder()} (set ROBOCAL_DATA): their tables left out")
         return []
-    return [campaigns_table(), later_table(), ur5e_table()]
+    return [campaigns_table(), later_table(), few_poses_table(), ur5e_table()]
