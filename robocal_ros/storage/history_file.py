@@ -184,14 +184,16 @@ class HistoryFile:
             self.connection.close()
 
     def _refuse_foreign(self) -> None:
-        """Look at the file without touching it: closing a writable one would write to it."""
-        probe = sqlite3.connect(f"file:{quote(str(self.path))}?mode=ro", uri=True)
+        """Look at the file without touching it: closing a writable one would write to it.
+
+        Where a killed writer left a rollback journal, SQLite must undo that write to read at all.
+        """
         try:
-            version = probe.execute("PRAGMA user_version").fetchone()[0]
-            mark = probe.execute("PRAGMA application_id").fetchone()[0]
-            tables = probe.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-        finally:
-            probe.close()
+            version, mark, tables = self._probe("ro")
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_READONLY:
+                raise
+            version, mark, tables = self._probe("rw")
         if mark != APPLICATION_ID and (mark or tables):
             raise StorageError(f"{self.path}: is not a calibration history; it was not touched")
         if version > SCHEMA_VERSION:
@@ -200,6 +202,18 @@ class HistoryFile:
                 f"{SCHEMA_VERSION}: made by a newer robocal, update this one; "
                 "the file was not touched"
             )
+
+    def _probe(self, mode: str) -> tuple[int, int, int]:
+        """Schema version, application and number of schema entries of whatever file this is."""
+        probe = sqlite3.connect(
+            f"file:{quote(str(self.path))}?mode={mode}", uri=True, timeout=self._timeout_s
+        )
+        try:
+            version = probe.execute("PRAGMA user_version").fetchone()[0]
+            mark = probe.execute("PRAGMA application_id").fetchone()[0]
+            return version, mark, probe.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+        finally:
+            probe.close()
 
     def _migrate(self) -> None:
         if self._version() == SCHEMA_VERSION:

@@ -307,6 +307,26 @@ class TestPlace:
 
 
 class TestManyProcesses:
+    def test_killed_while_the_file_was_made(self, tmp_path: Path) -> None:
+        """A hot rollback journal, as a kill before the switch to write-ahead logging leaves it."""
+        with CalibrationHistory.open(SERIAL, state_dir=tmp_path) as history:
+            path = history.path
+        path.unlink()
+        code = (
+            "import os, signal, sqlite3, sys\n"
+            "c = sqlite3.connect(sys.argv[1], isolation_level=None)\n"
+            "c.execute('PRAGMA cache_size=2')\n"
+            "c.execute('BEGIN')\n"
+            "c.execute('CREATE TABLE t (x)')\n"
+            "c.executemany('INSERT INTO t VALUES (?)', [(b'x' * 4000,)] * 200)\n"
+            "os.kill(os.getpid(), signal.SIGKILL)\n"
+        )
+        subprocess.run([sys.executable, "-c", code, path], check=False)
+        assert Path(f"{path}-journal").exists()
+        with CalibrationHistory.open(SERIAL, state_dir=tmp_path) as history:
+            assert history.head().revision == 0
+            assert history.damaged is None
+
     def test_killed_at_any_moment(self, tmp_path: Path) -> None:
         rounds = 100
         seen = in_process("kill_while_accepting", tmp_path, rounds, 1)
