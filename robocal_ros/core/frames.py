@@ -24,11 +24,11 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 def transform_from_quat(xyz: ArrayLike, quat_xyzw: ArrayLike) -> Array:
     """Assemble (..., 4, 4) from positions (..., 3), m, and unit quaternions (..., 4)."""
-    quat = np.asarray(quat_xyzw, dtype=np.float64)
-    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    v, w = quat[..., :3], quat[..., 3, None, None]
-    V = skew(v)
-    return transform(np.eye(3) + 2.0 * (w * V + V @ V), xyz)
+    from scipy.spatial.transform import Rotation
+
+    quat = np.array(quat_xyzw, dtype=np.float64)  # a copy: SciPy 1.11 refuses read-only arrays
+    R = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix().reshape(*quat.shape[:-1], 3, 3)
+    return transform(R, xyz)
 
 
 def invert(T: Array) -> Array:
@@ -38,24 +38,13 @@ def invert(T: Array) -> Array:
 
 
 def quat_xyzw(T: Array) -> Array:
-    """Unit quaternions (..., 4), w >= 0, of transforms (..., 4, 4) or rotations (..., 3, 3).
+    """Unit quaternions (..., 4), w >= 0, of transforms (..., 4, 4) or rotations (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
 
-    ``4 q q^T`` (Bar-Itzhack 2000) is linear in the rotation; its column with the largest
-    diagonal element gives q without cancellation.
-    """
-    R = np.asarray(T, dtype=np.float64)[..., :3, :3]
-    K = np.empty((*R.shape[:-2], 4, 4))
-    trace = np.trace(R, axis1=-2, axis2=-1)
-    K[..., :3, :3] = R + np.swapaxes(R, -1, -2) + np.eye(3) * (1.0 - trace)[..., None, None]
-    K[..., 3, 0] = R[..., 2, 1] - R[..., 1, 2]
-    K[..., 3, 1] = R[..., 0, 2] - R[..., 2, 0]
-    K[..., 3, 2] = R[..., 1, 0] - R[..., 0, 1]
-    K[..., :3, 3] = K[..., 3, :3]
-    K[..., 3, 3] = 1.0 + trace
-    largest = np.argmax(np.diagonal(K, axis1=-2, axis2=-1), axis=-1)
-    quat = np.take_along_axis(K, largest[..., None, None], axis=-1)[..., 0]
-    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
-    return np.asarray(np.where(quat[..., 3:] < 0.0, -quat, quat))
+    R = np.array(T[..., :3, :3], dtype=np.float64)  # a copy, as above
+    quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
+    quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
+    return np.asarray(quat.reshape(*R.shape[:-2], 4))
 
 
 def exp_rotation(rotvec: ArrayLike) -> Array:
