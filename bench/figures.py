@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from bench.real_data import model_of_a, own_half
+from bench.real_data import carried_over, own_half
 from bench.ur10_campaigns import SERIES
 from robocal_ros.report.drift import read_report
 from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE, drift_over_time, png
@@ -42,7 +42,7 @@ def campaign_errors() -> dict[str, dict[str, float]]:
             "n": judged.candidate.n,
         }
         if series != "A":
-            found[series]["old"] = model_of_a(series).candidate.mean_m * 1e3
+            found[series]["old"] = carried_over("A", series).candidate.mean_m * 1e3
     return found
 
 
