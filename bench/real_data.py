@@ -96,8 +96,8 @@ def later_table() -> Table:
             "verdict",
         ),
         "The tracker stood elsewhere and the T-Mac was mounted anew, so those are fitted to the "
-        "later data, for both models; the geometry is held. A's grid fills the workspace, C's poses "
-        "a part of it.",
+        "later data, for both models; the geometry is held. A's grid fills the workspace, "
+        "C's poses a part of it.",
     )
     for source, series in ("AB", "AC", "AD", "CB", "CD"):
         judged = carried_over(source, series)
