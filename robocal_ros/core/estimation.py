@@ -6,6 +6,7 @@ and the rest is solved by plain (efficient) least squares.
 """
 
 from dataclasses import dataclass
+from itertools import count
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -19,6 +20,10 @@ S = TypeVar("S")
 
 FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
 MOST_ITERATIONS = 50
+DAMPINGS = (0.0, *(10.0**power for power in range(-4, 7)))
+SOUND_FIT = 0.999  # residuals beyond this quantile say that given sigmas are too small
+CLEAR_STRETCH = 1.6  # beyond the scatter of a median of six samples
+FREE_ATTEMPTS = 5  # in which a rejected sample may come back
 STEP_TOLERANCE = 1e-4  # of a standard deviation
 FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
 SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
@@ -53,7 +58,8 @@ class Estimate(Generic[S]):
     ----------
     state : the estimate.
     covariance : (k, k) of the increments at the estimate, in the problem's units.
-    scale : standard deviation of the whitened residual: 1 where sigmas were given.
+    scale : standard deviation of the whitened residual: 1 where sigmas were given, unless the
+        residuals are clearly larger; then covariances are widened by it.
     residual : (m, c) whitened; ``rejected`` (m,) marks samples not used.
     """
 
@@ -68,7 +74,7 @@ class Estimate(Generic[S]):
     converged: bool
 
 
-def chi2_quantile(probability: float, dof: int) -> float:
+def chi2_quantile(probability: float, dof: float) -> float:
     """Quantile of the chi-square distribution."""
     from scipy.special import gammaincinv
 
@@ -118,11 +124,13 @@ def solve(
         limit = float(np.sqrt(chi2_quantile(0.95, c)))
         run = descent.run(run, keep, huber=limit, tolerance=FIRST_TOLERANCE)
         keep = descent.inliers(run, keep)
-    for _ in range(10):
+    for attempt in count():
         if flat and not np.all(keep):
             _require_full_rank(observability(_rows(run.jacobian, keep)), problem.names)
         run = descent.run(run, keep)
         update = descent.inliers(run, keep) if robust else keep
+        if attempt >= FREE_ATTEMPTS:  # a sample at the limit must not come and go for ever
+            update = update & keep
         if np.array_equal(update, keep):
             break
         keep = update
@@ -130,7 +138,7 @@ def solve(
     seen = observability(_rows(run.jacobian, keep), information)
     if flat:
         _require_full_rank(seen, problem.names)
-    scale = descent.plain_scale(run.residual, keep)
+    scale = descent.final_scale(run.residual, keep, information)
     covariance = descent.posterior(information, scale)
     if not np.all(np.diag(covariance) > 0.0):
         words = [describe(column, problem.names) for column in seen.null.T]
@@ -189,25 +197,24 @@ class _Descent(Generic[S]):
         """Minimise the (Huber) cost until a step is far below a standard deviation."""
         k = run.jacobian.shape[2]
         state, residual, jacobian = run.state, run.residual, run.jacobian
-        damping = 0.0
-        iterations, small = run.iterations, False
-        while not small and iterations < run.iterations + MOST_ITERATIONS:
-            iterations += 1
+        for iterations in range(run.iterations + 1, run.iterations + MOST_ITERATIONS + 1):
             scale = self._scale(residual, keep, huber)
             normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
-            while True:
-                step = _damped_step(normal, gradient, damping)
+            step = _damped_step(normal, gradient, 0.0)
+            if float(step @ normal @ step) < tolerance**2 * k:
+                near = residual + jacobian @ step  # exact enough so near
+                return _Run(self.problem.retract(state, step), near, jacobian, iterations, True)
+            for damping in DAMPINGS:
+                if damping:
+                    step = _damped_step(normal, gradient, damping)
                 trial = self.problem.retract(state, step)
-                if small := float(step @ normal @ step) < tolerance**2 * k:
-                    state, residual = trial, residual + jacobian @ step  # exact enough so near
-                    break
                 new_residual, new_jacobian = self.problem.linearise(trial)
                 if self._cost(trial, new_residual, keep, scale, huber) <= cost:
-                    state, residual, jacobian = trial, new_residual, new_jacobian
                     break
-                damping = max(10.0 * damping, 1e-4)
-            damping /= 10.0
-        return _Run(state, residual, jacobian, iterations, small)
+            else:  # no step of any length helps: not a minimum that can be trusted
+                return _Run(state, residual, jacobian, iterations, False)
+            state, residual, jacobian = trial, new_residual, new_jacobian
+        return _Run(state, residual, jacobian, iterations, False)
 
     def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: float) -> float:
         return (
@@ -232,6 +239,28 @@ class _Descent(Generic[S]):
         spread = np.median(np.sum(used**2, axis=1)) / chi2_quantile(0.5, self.scale_components)
         spread *= used.size / max(used.size - len(self.problem.names), 1)
         return max(float(np.sqrt(spread)), SMALLEST_SCALE)
+
+    def final_scale(self, residual: Array, keep: NDArray[np.bool_], information: Array) -> float:
+        """The estimated scale; with given sigmas 1, or the misfit where chi-square rejects 1."""
+        if self.scale_components:
+            return self.plain_scale(residual, keep)
+        used = residual[keep]
+        explained = float(np.trace(information @ self.posterior(information, 1.0)))
+        freedom = used.size - explained
+        misfit = float(np.sum(used**2))
+        if freedom < 1.0 or misfit <= chi2_quantile(SOUND_FIT, freedom):
+            return 1.0
+        return float(np.sqrt(misfit / freedom))
+
+    def _stretch(self, squared: Array, keep: NDArray[np.bool_], c: int) -> float:
+        """Factor by which studentised distances (m,) are larger than given sigmas explain.
+
+        From their median, which outliers cannot inflate; 1 unless it is clearly larger.
+        """
+        if self.scale_components:
+            return 1.0
+        stretch = float(np.sqrt(np.median(squared[keep]) / chi2_quantile(0.5, c)))
+        return stretch if stretch > CLEAR_STRETCH else 1.0
 
     def _normal(
         self,
@@ -277,9 +306,9 @@ class _Descent(Generic[S]):
         sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
-        inlier = np.sum(run.residual * whitened, axis=1) < chi2_quantile(
-            1.0 - FALSE_REJECTION / m, c
-        )
+        squared = np.sum(run.residual * whitened, axis=1)
+        limit = chi2_quantile(1.0 - FALSE_REJECTION / m, c) * self._stretch(squared, keep, c) ** 2
+        inlier = squared < limit
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep
 

@@ -288,5 +288,5 @@ def _report(
         prior_covariance=None,
         unobservable=words,
         rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
-        noise_m=estimate.scale if known is None else float(np.sqrt(np.mean(known**2))),
+        noise_m=estimate.scale * (1.0 if known is None else float(np.sqrt(np.mean(known**2)))),
     )

@@ -177,5 +177,5 @@ def _identify(
             for direction in estimate.observability.null.T
         ),
         rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
-        noise_m=float(np.sqrt(np.mean(data.sigma**2))),
+        noise_m=estimate.scale * float(np.sqrt(np.mean(data.sigma**2))),
     )
