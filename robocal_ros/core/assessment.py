@@ -15,6 +15,8 @@ SAME_POSE_RAD = 1e-3
 FEWEST_GROUPS = 5
 SIGNIFICANCE = 0.05
 LARGEST_RMS_M = 5e-3
+GROSS_RATIO = 10.0
+SMALLEST_GROSS_M = 1e-4
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,16 @@ def hold_out(groups: Index, share: float, seed: int) -> NDArray[np.bool_]:
     held = int(np.clip(round(share * count), 1, count - 1))
     chosen = np.random.default_rng(seed).permutation(count) < held
     return np.asarray(chosen[groups])
+
+
+def gross(current: Array, candidate: Array) -> NDArray[np.bool_]:
+    """Mark held-out samples (m,) that are wrong whichever model is true.
+
+    Both models must miss them by more than ten times the median of the better one's distances,
+    and by 0.1 mm: a bad model alone cannot hide its errors this way.
+    """
+    best = np.minimum(current, candidate)
+    return np.asarray(best > max(GROSS_RATIO * float(np.median(best)), SMALLEST_GROSS_M))
 
 
 def judge(current: Array, candidate: Array, groups: Index, uninformative: str = "") -> Verdict:

@@ -132,6 +132,7 @@ def identification_document(judged: JudgedIdentification) -> Document:
         "unobservable": list(result.unobservable),
         "held": list(result.held),
         "rejected": list(result.rejected),
+        "held_out_rejected": list(judged.held_out_rejected),
         "converged": result.estimate.converged,
         "verdict": verdict_document(judged.verdict),
     }

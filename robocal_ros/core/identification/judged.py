@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.assessment import (
     ErrorSummary,
     Verdict,
+    gross,
     hold_out,
     judge,
     pose_groups,
@@ -43,6 +44,7 @@ class JudgedIdentification:
     predicted_rms_m : the candidate's error expected from its covariance alone.
     predicted_total_rms_m : the same with the noise of the measurements added.
     workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
+    held_out_rejected : samples left out of the judgement because no model can fit them.
     """
 
     identification: Identification
@@ -52,6 +54,7 @@ class JudgedIdentification:
     predicted_rms_m: float
     predicted_total_rms_m: float
     workspace_rms_m: float
+    held_out_rejected: tuple[str, ...]
     verdict: Verdict
 
 
@@ -85,19 +88,21 @@ def identify_and_judge(
     after = _check_error(result.cell, check, check_refit)
     predicted, total = _predicted(result, check, check_refit)
     doubt = still_joints(arm, train) and still_joints(arm, check)
-    doubt = doubt or uninformative(result, summarise(before).rms_m, in_force or arm)
-    verdict = judge(before, after, pose_groups(check.q), doubt)
+    sound = ~gross(before, after)
+    doubt = doubt or uninformative(result, summarise(before[sound]).rms_m, in_force or arm)
+    verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
     if "geometry" not in fit and verdict.code is Code.WORSE_THAN_CURRENT:
         why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
         verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
     return JudgedIdentification(
         identification=result,
-        nominal=summarise(plain),
-        current=summarise(before),
-        candidate=summarise(after),
+        nominal=summarise(plain[sound]),
+        current=summarise(before[sound]),
+        candidate=summarise(after[sound]),
         predicted_rms_m=predicted,
         predicted_total_rms_m=total,
         workspace_rms_m=result.workspace_rms(result.estimate.covariance),
+        held_out_rejected=tuple(check.sample[i] for i in np.flatnonzero(~sound)),
         verdict=verdict,
     )
 

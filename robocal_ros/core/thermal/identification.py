@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import estimation
-from robocal_ros.core.assessment import judge, pose_groups, summarise
+from robocal_ros.core.assessment import gross, judge, pose_groups, summarise
 from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.identification.cell import CellModel, CellProblem, make_layout
 from robocal_ros.core.identification.judged import JudgedIdentification, uninformative
@@ -45,11 +45,11 @@ def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
     return ColdReference(identify(arm, data, fit=("base", "tool"), method="lsq").cell, data)
 
 
-def against_reference(reference: ColdReference, warm: Measurements) -> Measurements:
+def against_reference(reference: ColdReference, warm: Measurements, sigma_m: float) -> Measurements:
     """Warm measurements less the cold residual of the same pose (static errors cancel).
 
-    Poses are the same when all joints agree within 0.5 deg; the joints measured in each visit
-    are used for its own prediction.
+    Poses are the same when all joints agree within 0.5 deg. Visits of one pose are averaged,
+    because they share the noise of its cold visit: the result's sigma holds both.
 
     Raises
     ------
@@ -57,17 +57,36 @@ def against_reference(reference: ColdReference, warm: Measurements) -> Measureme
         When a warm sample has no cold counterpart.
     """
     cold = reference.cell.residual(reference.data)
-    position = warm.position.copy()
-    for i in range(len(warm)):
-        same = np.array([t == warm.target[i] for t in reference.data.target], dtype=np.bool_)
-        near = same & (np.max(np.abs(reference.data.q - warm.q[i]), axis=1) < SAME_VISIT_RAD)
-        if not np.any(near):
-            raise InputError(
-                f"sample {warm.sample[i]} of target '{warm.target[i]}' was not measured in the "
-                "cold reference: visit the reference poses, or capture a new reference"
-            )
-        position[i] += cold[near].mean(axis=0)
-    return replace(warm, position=position, rotation=None)
+    visits: dict[tuple[int, str], list[int]] = {}
+    for i, group in enumerate(pose_groups(warm.q)):
+        visits.setdefault((int(group), warm.target[i]), []).append(i)
+    rows = [np.array(indices) for indices in visits.values()]
+    near = [_cold_visits(reference, warm, int(row[0])) for row in rows]
+    counts = [(np.sum(visit), len(row)) for visit, row in zip(near, rows, strict=True)]
+    return Measurements(
+        q=np.array([warm.q[row].mean(axis=0) for row in rows]),
+        position=np.array(
+            [
+                warm.position[row].mean(axis=0) + cold[visit].mean(axis=0)
+                for row, visit in zip(rows, near, strict=True)
+            ]
+        ),
+        target=tuple(warm.target[row[0]] for row in rows),
+        sample=tuple("+".join(warm.sample[i] for i in row) for row in rows),
+        sigma=np.array([sigma_m * np.sqrt(1.0 / before + 1.0 / now) for before, now in counts]),
+    )
+
+
+def _cold_visits(reference: ColdReference, warm: Measurements, i: int) -> NDArray[np.bool_]:
+    """Mark the cold samples of the same target and pose as a warm one."""
+    same = np.array([t == warm.target[i] for t in reference.data.target], dtype=np.bool_)
+    near = same & (np.max(np.abs(reference.data.q - warm.q[i]), axis=1) < SAME_VISIT_RAD)
+    if not np.any(near):
+        raise InputError(
+            f"sample {warm.sample[i]} of target '{warm.target[i]}' was not measured in the "
+            "cold reference: visit the reference poses, or capture a new reference"
+        )
+    return np.asarray(near)
 
 
 def identify_drift(
@@ -84,8 +103,7 @@ def identify_drift(
 
     Parameters
     ----------
-    sigma_m : standard deviation of one coordinate of one visit (sensor and repeatability);
-        the difference of two visits has sqrt(2) of it.
+    sigma_m : standard deviation of one coordinate of one visit (sensor and repeatability).
     in_force : the model that the candidate must beat at the left-out poses.
     prior_covariance : (k, k), SI, of the drift of the free parameters, for ``map``.
 
@@ -94,36 +112,49 @@ def identify_drift(
     TooFewSamplesError
         With fewer than two poses.
     """
-    noise = float(np.sqrt(2.0)) * sigma_m
-    data = against_reference(reference, warm)
-    data = replace(data, sigma=np.full(len(data), noise))
+    data = against_reference(reference, warm, sigma_m)
     groups = pose_groups(data.q)
     if groups.max() < 1:
         raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
     prior = prior_covariance if method == "map" else None
     result = _identify(nominal, reference, data, method, prior)
-    after, model = np.empty(len(data)), np.empty(len(data))
+    after, model = _left_out(nominal, reference, data, groups, method, prior)
+    current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
+    plain = np.linalg.norm(reference.cell.residual(data), axis=1)
+    before = np.linalg.norm(current.residual(data), axis=1)
+    sound = ~gross(before, after)
+    doubt = _doubt(result, summarise(before[sound]).rms_m, in_force, prior)
+    return JudgedIdentification(
+        identification=result,
+        nominal=summarise(plain[sound]),
+        current=summarise(before[sound]),
+        candidate=summarise(after[sound]),
+        predicted_rms_m=float(np.sqrt(model.mean())),
+        predicted_total_rms_m=float(np.sqrt(model.mean() + 3.0 * result.noise_m**2)),
+        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
+        held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
+        verdict=judge(before[sound], after[sound], groups[sound], doubt),
+    )
+
+
+def _left_out(
+    nominal: SerialArm,
+    reference: ColdReference,
+    data: Measurements,
+    groups: NDArray[np.int64],
+    method: Method,
+    prior: Array | None,
+) -> tuple[Array, Array]:
+    """Error (m,) at each sample of the model without its pose, and its predicted variance (m,)."""
+    error, variance = np.empty(len(data)), np.empty(len(data))
     for group in range(int(groups.max()) + 1):
         left = groups == group
         part, others = data.take(left), data.take(~left)
         without = _identify(nominal, reference, others, method, prior)
-        after[left] = np.linalg.norm(without.cell.residual(part), axis=1)
-        variance = without.predicted_variance(part.q, part.target_index(without.cell.targets))
-        model[left] = np.trace(variance, axis1=1, axis2=2)
-    current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
-    before = np.linalg.norm(current.residual(data), axis=1)
-    predicted = float(np.sqrt(model.mean()))
-    doubt = _doubt(result, summarise(before).rms_m, in_force, prior)
-    return JudgedIdentification(
-        identification=result,
-        nominal=summarise(reference.cell.residual(data)),
-        current=summarise(before),
-        candidate=summarise(after),
-        predicted_rms_m=predicted,
-        predicted_total_rms_m=float(np.sqrt(model.mean() + 3.0 * noise**2)),
-        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
-        verdict=judge(before, after, groups, doubt),
-    )
+        error[left] = np.linalg.norm(without.cell.residual(part), axis=1)
+        spread = without.predicted_variance(part.q, part.target_index(without.cell.targets))
+        variance[left] = np.trace(spread, axis1=1, axis2=2)
+    return error, variance
 
 
 def _doubt(
