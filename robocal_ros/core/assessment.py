@@ -106,7 +106,8 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
     groups : (m,) pose group of each sample; visits of one pose count once.
     uninformative : why the measured poses do not carry over to other ones; empty if they do.
 
-    The gain in squared error must be positive at 5 % significance (one-sided t over groups).
+    The gain in squared error must be positive at 5 % significance (one-sided t over groups) to
+    be accepted, and negative at 5 % to be called worse.
     """
     before, after = summarise(current), summarise(candidate)
     what = (
@@ -127,10 +128,12 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
             f"{what}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
             "robot file, units, joint signs and target names",
         )
-    if after.rms_m >= before.rms_m or after.mean_m >= before.mean_m:
+    if _one_sided_p(-gain) <= SIGNIFICANCE:
         return Verdict(Code.WORSE_THAN_CURRENT, what)
     if uninformative:
         return Verdict(Code.POSES_NOT_INFORMATIVE, f"{uninformative}; {what}")
+    if after.rms_m >= before.rms_m or after.mean_m >= before.mean_m:
+        return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{what}; no better, and not clearly worse")
     p = _one_sided_p(gain)
     if p > SIGNIFICANCE:
         return Verdict(

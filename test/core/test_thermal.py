@@ -170,6 +170,55 @@ def test_static_errors_cancel(nominal, cold):
     assert np.abs(found[0] - found[1]).max() < 2e-6
 
 
+def test_repeated_visits_do_not_pass_for_independent_ones(nominal, cold):
+    """Ten warm visits of each pose share its one cold visit.
+
+    With truth drawn from the prior the squared error is the predicted one; 60 runs give the mean
+    ratio a standard error below 0.12.
+    """
+    rng = np.random.default_rng(12)
+    prior = drift_prior(nominal)
+    q, check = postures(nominal, 8, rng), postures(nominal, 40, rng)
+    ratio = []
+    for _ in range(60):
+        warm = drifted(cold, prior, rng)
+        reference = capture_reference(cold, visit(cold, q, rng))
+        judged = identify_drift(
+            nominal,
+            reference,
+            visit(warm, np.tile(q, (10, 1)), rng),
+            sigma_m=SIGMA_M,
+            in_force=cold,
+            prior_covariance=prior,
+        )
+        result = judged.identification
+        error = drift_error(result.cell.arm, cold, warm, cold, check)
+        predicted = result.predicted_variance(check, np.zeros(len(check), dtype=np.int64))
+        ratio.append(np.sum(error**2) / np.trace(predicted.sum(axis=0)))
+    assert abs(np.mean(ratio) - 1.0) < 4.0 * np.std(ratio) / np.sqrt(len(ratio))
+
+
+def test_an_outlier_neither_moves_the_model_nor_the_verdict(nominal, cold):
+    rng = np.random.default_rng(13)
+    warm = drifted(cold, drift_prior(nominal), rng)
+    q = postures(nominal, 12, rng)
+    reference = capture_reference(nominal, visit(cold, q, rng))
+    measured = visit(warm, q, rng)
+    measured.position[5] += [0.0, 0.02, 0.0]
+    judged = identify_drift(
+        nominal,
+        reference,
+        measured,
+        sigma_m=SIGMA_M,
+        in_force=nominal,
+        prior_covariance=drift_prior(nominal),
+    )
+    assert judged.identification.rejected == ("5",)
+    assert judged.held_out_rejected == ("5",)
+    assert judged.candidate.n == 11
+    assert judged.verdict.code is Code.ACCEPT
+
+
 def test_a_pose_without_cold_visit_is_refused(nominal, cold):
     rng = np.random.default_rng(7)
     q = postures(nominal, 8, rng)

@@ -17,6 +17,7 @@ from robocal_ros.core.assessment import (
 )
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.frames import log_rotation
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.identification.mismatch import require_match
 from robocal_ros.core.identification.solve import (
@@ -31,6 +32,8 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 
 Array = NDArray[np.float64]
+
+LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,7 @@ def identify_and_judge(
     if "geometry" in check_refit:
         raise InputError("the geometry is what is checked: refit only base and tool")
     result = identify(arm, train, fit=fit, method=method)
+    _require_orientations(result, train)
     set_up = frozenset(fit) - {"geometry"}
     plain = _check_error(_set_up(arm, train, set_up), check, check_refit)
     before = plain
@@ -105,6 +109,21 @@ def identify_and_judge(
         held_out_rejected=tuple(check.sample[i] for i in np.flatnonzero(~sound)),
         verdict=verdict,
     )
+
+
+def _require_orientations(result: Identification, data: Measurements) -> None:
+    """Refuse orientations that do not belong to the joints; positions alone would hide it."""
+    if data.rotation is None:
+        return
+    T = result.cell.predict(data.q, data.target_index(result.cell.targets))
+    turn = log_rotation(T[:, :3, :3] @ np.swapaxes(data.rotation, 1, 2))
+    off = float(np.median(np.linalg.norm(turn, axis=1)))
+    if off > LARGEST_TURN_RAD:
+        raise InputError(
+            f"measured orientations miss the model by {np.degrees(off):.3g} deg (median) while "
+            "positions fit: check the order of the quaternion (x, y, z, w), the convention of the "
+            "angles, and that the rows belong together; or leave the orientations out"
+        )
 
 
 def identify_and_hold_out(

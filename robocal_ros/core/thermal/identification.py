@@ -122,7 +122,7 @@ def identify_drift(
     current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
     plain = np.linalg.norm(reference.cell.residual(data), axis=1)
     before = np.linalg.norm(current.residual(data), axis=1)
-    sound = ~gross(before, after)
+    sound = ~(gross(before, after) | result.estimate.rejected)
     doubt = _doubt(result, summarise(before[sound]).rms_m, in_force, prior)
     return JudgedIdentification(
         identification=result,
