@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
 from robocal_ros.core import frames
-from robocal_ros.core.estimation import chi2_quantile
+from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.identification import CellModel, Identification, identify
 from robocal_ros.core.samples import Measurements
 from robocal_ros.sim import kr150

@@ -7,47 +7,27 @@ and the rest is solved by plain (efficient) least squares.
 
 from dataclasses import dataclass
 from itertools import count
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.descent import (
+    FIRST_TOLERANCE,
+    Descent,
+    Problem,
+    Run,
+    chi2_quantile,
+    information_of,
+    rows_of,
+)
 from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.core.observability import Observability, describe, observability
 
 Array = NDArray[np.float64]
 S = TypeVar("S")
 
-FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
-MOST_ITERATIONS = 50
-DAMPINGS = (0.0, *(10.0**power for power in range(-4, 7)))
-SOUND_FIT = 0.999  # residuals beyond this quantile say that given sigmas are too small
-CLEAR_STRETCH = 1.6  # beyond the scatter of a median of six samples
 FREE_ATTEMPTS = 5  # in which a rejected sample may come back
-STEP_TOLERANCE = 1e-4  # of a standard deviation
-FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
-SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
-
-
-class Problem(Protocol[S]):
-    """Residuals of m samples with c components each, linearised at a state."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names (k) of the increments, for reports."""
-
-    def linearise(self, state: S) -> tuple[Array, Array]:
-        """Residual (m, c), prediction minus measurement over sigma, and Jacobian (m, c, k)."""
-
-    def retract(self, state: S, step: Array) -> S:
-        """Move the state by an increment (k,)."""
-
-    @property
-    def scale_components(self) -> int:
-        """How many of the c components tell the noise when it is unknown (the first ones)."""
-
-    def deviation(self, state: S) -> Array:
-        """Distance (k,) of the state from the prior's mean; zero where the prior is flat."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +52,6 @@ class Estimate(Generic[S]):
     observability: Observability
     iterations: int
     converged: bool
-
-
-def chi2_quantile(probability: float, dof: float) -> float:
-    """Quantile of the chi-square distribution."""
-    from scipy.special import gammaincinv
-
-    return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
 def solve(
@@ -117,25 +90,10 @@ def solve(
             raise TooFewSamplesError(f"{m} samples give {m * c} equations for {k} unknowns")
         _require_full_rank(observability(jacobian.reshape(-1, k)), problem.names)
     prior = np.zeros((k, k)) if prior_information is None else prior_information
-    descent = _Descent(problem, prior, 0 if noise_known else problem.scale_components)
-    keep = np.ones(m, dtype=np.bool_)
-    run = _Run(start, residual, jacobian, 0, False)
-    if robust:
-        limit = float(np.sqrt(chi2_quantile(0.95, c)))
-        run = descent.run(run, keep, huber=limit, tolerance=FIRST_TOLERANCE)
-        keep = descent.inliers(run, keep)
-    for attempt in count():
-        if flat and not np.all(keep):
-            _require_full_rank(observability(_rows(run.jacobian, keep)), problem.names)
-        run = descent.run(run, keep)
-        update = descent.inliers(run, keep) if robust else keep
-        if attempt >= FREE_ATTEMPTS:  # a sample at the limit must not come and go for ever
-            update = update & keep
-        if np.array_equal(update, keep):
-            break
-        keep = update
-    information = _information(run.jacobian, keep)
-    seen = observability(_rows(run.jacobian, keep), information)
+    descent = Descent(problem, prior, 0 if noise_known else problem.scale_components)
+    run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
+    information = information_of(run.jacobian, keep)
+    seen = observability(rows_of(run.jacobian, keep), information)
     if flat:
         _require_full_rank(seen, problem.names)
     scale = descent.final_scale(run.residual, keep, information)
@@ -160,6 +118,30 @@ def solve(
     )
 
 
+def _settle(
+    descent: Descent[S], run: Run[S], robust: bool, flat: bool
+) -> tuple[Run[S], NDArray[np.bool_]]:
+    """Descend and reject in turn until the samples in use no longer change."""
+    m, c, _ = run.jacobian.shape
+    keep = np.ones(m, dtype=np.bool_)
+    if robust:
+        limit = float(np.sqrt(chi2_quantile(0.95, c)))
+        run = descent.run(run, keep, huber=limit, tolerance=FIRST_TOLERANCE)
+        keep = descent.inliers(run, keep)
+    for attempt in count():
+        if flat and not np.all(keep):
+            seen = observability(rows_of(run.jacobian, keep))
+            _require_full_rank(seen, descent.problem.names)
+        run = descent.run(run, keep)
+        update = descent.inliers(run, keep) if robust else keep
+        if attempt >= FREE_ATTEMPTS:  # a sample at the limit must not come and go for ever
+            update = update & keep
+        if np.array_equal(update, keep):
+            break
+        keep = update
+    return run, keep
+
+
 def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:
     if seen.null.shape[1]:
         words = [describe(column, names) for column in seen.null.T]
@@ -168,172 +150,3 @@ def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:
             + "; ".join(words),
             words,
         )
-
-
-@dataclass(frozen=True)
-class _Run(Generic[S]):
-    state: S
-    residual: Array
-    jacobian: Array
-    iterations: int
-    converged: bool
-
-
-@dataclass(frozen=True)
-class _Descent(Generic[S]):
-    """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known."""
-
-    problem: Problem[S]
-    prior: Array
-    scale_components: int
-
-    def run(
-        self,
-        run: _Run[S],
-        keep: NDArray[np.bool_],
-        huber: float = np.inf,
-        tolerance: float = STEP_TOLERANCE,
-    ) -> _Run[S]:
-        """Minimise the (Huber) cost until a step is far below a standard deviation."""
-        k = run.jacobian.shape[2]
-        state, residual, jacobian = run.state, run.residual, run.jacobian
-        for iterations in range(run.iterations + 1, run.iterations + MOST_ITERATIONS + 1):
-            scale = self._scale(residual, keep, huber)
-            normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
-            step = _damped_step(normal, gradient, 0.0)
-            if float(step @ normal @ step) < tolerance**2 * k:
-                near = residual + jacobian @ step  # exact enough so near
-                return _Run(self.problem.retract(state, step), near, jacobian, iterations, True)
-            for damping in DAMPINGS:
-                if damping:
-                    step = _damped_step(normal, gradient, damping)
-                trial = self.problem.retract(state, step)
-                new_residual, new_jacobian = self.problem.linearise(trial)
-                if self._cost(trial, new_residual, keep, scale, huber) <= cost:
-                    break
-            else:  # no step of any length helps: not a minimum that can be trusted
-                return _Run(state, residual, jacobian, iterations, False)
-            state, residual, jacobian = trial, new_residual, new_jacobian
-        return _Run(state, residual, jacobian, iterations, False)
-
-    def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: float) -> float:
-        return (
-            self.plain_scale(residual, keep)
-            if huber == np.inf
-            else self.robust_scale(residual, keep)
-        )
-
-    def plain_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
-        """Standard deviation of the kept residuals, unknowns counted; 1 where it is known."""
-        if not self.scale_components:
-            return 1.0
-        used = residual[keep, : self.scale_components]
-        freedom = max(used.size - len(self.problem.names), 1)
-        return max(float(np.sqrt(np.sum(used**2) / freedom)), SMALLEST_SCALE)
-
-    def robust_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
-        """The same from the median, which outliers cannot inflate."""
-        if not self.scale_components:
-            return 1.0
-        used = residual[keep, : self.scale_components]
-        spread = np.median(np.sum(used**2, axis=1)) / chi2_quantile(0.5, self.scale_components)
-        spread *= used.size / max(used.size - len(self.problem.names), 1)
-        return max(float(np.sqrt(spread)), SMALLEST_SCALE)
-
-    def final_scale(self, residual: Array, keep: NDArray[np.bool_], information: Array) -> float:
-        """The estimated scale; with given sigmas 1, or the misfit where chi-square rejects 1."""
-        if self.scale_components:
-            return self.plain_scale(residual, keep)
-        used = residual[keep]
-        explained = float(np.trace(information @ self.posterior(information, 1.0)))
-        freedom = used.size - explained
-        misfit = float(np.sum(used**2))
-        if freedom < 1.0 or misfit <= chi2_quantile(SOUND_FIT, freedom):
-            return 1.0
-        return float(np.sqrt(misfit / freedom))
-
-    def _stretch(self, squared: Array, keep: NDArray[np.bool_], c: int) -> float:
-        """Factor by which studentised distances (m,) are larger than given sigmas explain.
-
-        From their median, which outliers cannot inflate; 1 unless it is clearly larger.
-        """
-        if self.scale_components:
-            return 1.0
-        stretch = float(np.sqrt(np.median(squared[keep]) / chi2_quantile(0.5, c)))
-        return stretch if stretch > CLEAR_STRETCH else 1.0
-
-    def _normal(
-        self,
-        state: S,
-        residual: Array,
-        jacobian: Array,
-        keep: NDArray[np.bool_],
-        scale: float,
-        huber: float,
-    ) -> tuple[Array, Array, float]:
-        weight = np.where(keep, 1.0, 0.0)
-        if huber < np.inf:
-            distance = _lengths(residual)
-            weight *= np.minimum(1.0, huber * scale / np.maximum(distance, np.finfo(float).tiny))
-        J = jacobian.reshape(-1, jacobian.shape[2])
-        gradient = J.T @ (residual * weight[:, None]).ravel() / scale**2
-        gradient += self.prior @ self.problem.deviation(state)
-        information = _information(jacobian, weight) / scale**2 + self.prior
-        return information, gradient, self._cost(state, residual, keep, scale, huber)
-
-    def _cost(
-        self, state: S, residual: Array, keep: NDArray[np.bool_], scale: float, huber: float
-    ) -> float:
-        distance = _lengths(residual[keep]) / scale
-        near = np.minimum(distance, huber)
-        away = self.problem.deviation(state)
-        return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
-
-    def posterior(self, normal: Array, scale: float) -> Array:
-        """Covariance (k, k) of the unknowns from the data's normal matrix."""
-        information = normal / scale**2 + self.prior
-        unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        inverse = np.linalg.inv(information * np.outer(unit, unit))
-        return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
-
-    def inliers(self, run: _Run[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Samples whose residual fits its own predicted covariance (studentised, chi-square)."""
-        m, c, _ = run.jacobian.shape
-        scale = self.robust_scale(run.residual, keep)
-        J = run.jacobian
-        JC = (J.reshape(m * c, -1) @ self.posterior(_information(J, keep), scale)).reshape(J.shape)
-        spread = JC @ np.swapaxes(J, 1, 2)
-        sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
-        expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
-        whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
-        squared = np.sum(run.residual * whitened, axis=1)
-        limit = chi2_quantile(1.0 - FALSE_REJECTION / m, c) * self._stretch(squared, keep, c) ** 2
-        inlier = squared < limit
-        enough = 2 * np.sum(inlier) > m
-        return np.asarray(inlier) if enough else keep
-
-
-def _rows(jacobian: Array, keep: NDArray[np.bool_]) -> Array:
-    """Rows (N, k) of the samples to keep, copied only when some are left out."""
-    used = jacobian if np.all(keep) else jacobian[keep]
-    return used.reshape(-1, jacobian.shape[2])
-
-
-def _lengths(rows: Array) -> Array:
-    return np.asarray(np.sqrt(np.einsum("mc,mc->m", rows, rows)))
-
-
-def _information(jacobian: Array, weight: NDArray[np.float64 | np.bool_]) -> Array:
-    """Normal matrix (k, k) of a Jacobian (m, c, k) whose samples have weights (m,)."""
-    used = jacobian
-    if not np.all(weight == 1.0):
-        used = jacobian * np.sqrt(weight)[:, None, None]
-    J = used.reshape(-1, jacobian.shape[2])
-    return np.asarray(J.T @ J)
-
-
-def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
-    scaled = normal * np.outer(scale, scale)
-    scaled[np.diag_indices_from(scaled)] += damping
-    return np.asarray(np.linalg.solve(scaled, -gradient * scale) * scale)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
+from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
-from robocal_ros.core.estimation import chi2_quantile, solve
+from robocal_ros.core.estimation import solve
 from robocal_ros.core.observability import describe, observability
 
 TRUTH = frames.exp_rotation([0.4, -0.7, 1.1])

@@ -7,8 +7,8 @@ import pytest
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
+from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.core.estimation import chi2_quantile
 from robocal_ros.core.identification import CellModel, identify, identify_and_judge
 from robocal_ros.core.identification.cell import CellProblem, make_layout
 from robocal_ros.core.identification.start import linear_start
