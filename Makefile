@@ -24,7 +24,7 @@ $(shell rm -rf $(VENV) $(VENV)-* build install log)
 endif
 endif
 
-.PHONY: help demo test bench lint test-floor setup clean
+.PHONY: help demo test bench figures lint test-floor setup clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -37,6 +37,9 @@ test: setup  ## all tests
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries
 	$(ROS) $(VENV)-bench/bin/python -m bench
+
+figures: setup $(VENV)-bench/.stamp  ## bench, kept as the figures of docs/
+	$(ROS) $(VENV)-bench/bin/python -m bench --keep
 
 lint: setup-python  ## style and strict types
 	$(VENV)/bin/ruff check .

@@ -1,4 +1,7 @@
-"""Make every table, print it, and keep it in docs/figures: ``python -m bench``."""
+"""Make every table, print it, and write it to out/bench: ``python -m bench``.
+
+With ``--keep`` also to docs/figures, where the documents refer to it.
+"""
 
 import os
 
@@ -17,7 +20,8 @@ from pathlib import Path
 from bench.tables import Table, show
 
 ROOT = Path(__file__).resolve().parent.parent
-OUT = ROOT / "docs" / "figures"
+OUT = ROOT / "out" / "bench"
+KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
@@ -64,22 +68,24 @@ def _about(seconds: float) -> dict[str, str]:
     }
 
 
-def _write(tables: Sequence[Table], about: dict[str, str]) -> None:
-    OUT.mkdir(parents=True, exist_ok=True)
+def _write(folder: Path, tables: Sequence[Table], about: dict[str, str]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
     document = {"about": about, "tables": [table.document() for table in tables]}
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-    (OUT / "bench_core.json").write_text(text + "\n")
+    (folder / "bench_core.json").write_text(text + "\n")
     words = ", ".join(f"{name} {value}" for name, value in about.items())
     body = "\n".join(table.markdown() for table in tables)
-    (OUT / "bench_core.md").write_text(f"Made by `make bench`: {words}.\n\n{body}")
+    (folder / "bench_core.md").write_text(f"Made by `make bench`: {words}.\n\n{body}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the chosen parts (all of them, which also writes the files); 1 when a goal is missed."""
+    """Run the chosen parts; all of them write the files. 1 when a goal is missed."""
     parts = _parts()
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("part", nargs="*", choices=[*parts, []], help=f"of {', '.join(parts)}")
-    chosen = parser.parse_args(arguments).part
+    parser.add_argument("--keep", action="store_true", help="write docs/figures too")
+    given = parser.parse_args(arguments)
+    chosen = given.part
     tables: list[Table] = []
     missed: list[str] = []
     start = time.monotonic()
@@ -95,8 +101,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         show(made)
         tables += made
     if not chosen:
-        _write(tables, _about(time.monotonic() - start))
-        print(f"written: {OUT / 'bench_core.json'}, {OUT / 'bench_core.md'}")
+        about = _about(time.monotonic() - start)
+        for folder in (OUT, KEPT) if given.keep else (OUT,):
+            _write(folder, tables, about)
+            print(f"written: {folder / 'bench_core.json'}, {folder / 'bench_core.md'}")
     missed += [table.title for table in tables if not table.met]
     for title in missed:
         print(f"goal missed: {title}", file=sys.stderr)

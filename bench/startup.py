@@ -91,7 +91,11 @@ def _first_answer(name: str, command: list[str]) -> float:
         raise TimeoutError(f"{name} did not answer within {GIVE_UP_S} s")
     finally:
         process.terminate()
-        process.wait(GIVE_UP_S)
+        try:
+            process.wait(GIVE_UP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
         node.destroy_node()
         rclpy.shutdown()
 
