@@ -17,6 +17,9 @@ NOISE_M = 5e-5
 POINTS = {"ball": (0.10, 0.05, 0.20), "peg": (-0.15, 0.02, 0.10)}
 
 
+R_FRAME_BASE = frames.exp_rotation(np.array([0.3, -0.2, 1.0]))
+
+
 def true_arm(seed: int = 0) -> SerialArm:
     """The robot as built: off its nominal model by tenths of a millimetre."""
     nominal = load_robot(ROBOT)
@@ -45,7 +48,7 @@ def measured(
     rng = np.random.default_rng(seed + 1000)
     names = tuple(targets[i % len(targets)] for i in range(count))
     points = np.array([[*POINTS[name], 1.0] for name in names])
-    T_frame_base = frames.transform(frames.exp_rotation(np.array([0.3, -0.2, 1.0])), place)
+    T_frame_base = frames.transform(R_FRAME_BASE, place)
     flange = T_frame_base @ arm.fk(q)
     position = np.einsum("mij,mj->mi", flange, points)[:, :3]
     return Measurements(
@@ -62,7 +65,7 @@ def table(path: Path, data: Measurements) -> Path:
 
 
 def with_rotations(data: Measurements, arm: SerialArm) -> Measurements:
-    return replace(data, rotation=arm.fk(data.q)[:, :3, :3])
+    return replace(data, rotation=R_FRAME_BASE @ arm.fk(data.q)[:, :3, :3])
 
 
 def edited(path: Path, column: str, change) -> Path:

@@ -191,6 +191,13 @@ class TestAnswer:
         status, document = identify("--data", check, "--check", data)
         assert (status, document["verdict"]["code"]) == (0, "ACCEPT")
 
+    def test_orientations_of_other_rows_are_refused(self, folder: Path, identify) -> None:
+        turned = with_rotations(measured(60, 9), true_arm())
+        mixed = replace(turned, rotation=turned.rotation[::-1])
+        status, document = identify("--data", table(folder / "mixed.csv", mixed))
+        assert status == 2
+        assert "measured orientations miss the model by" in document["error"]["message"]
+
     def test_readings_beyond_the_limits_are_told(self, folder: Path, identify) -> None:
         beyond = measured(60)
         q = beyond.q.copy()

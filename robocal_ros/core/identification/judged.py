@@ -95,7 +95,10 @@ def identify_and_judge(
     sound = ~gross(before, after)
     doubt = doubt or uninformative(result, summarise(before[sound]).rms_m, in_force or arm)
     verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
-    if "geometry" not in fit and verdict.code is Code.WORSE_THAN_CURRENT:
+    if "geometry" not in fit and verdict.code in (
+        Code.WORSE_THAN_CURRENT,
+        Code.NO_SIGNIFICANT_GAIN,
+    ):
         why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
         verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
     return JudgedIdentification(
