@@ -49,7 +49,7 @@ class ThermalServices:
         for name in (ACCEPT, REJECT, ROLLBACK):
             add(Decide, f"~/{name}", self._decide(name))
         add(Trigger, "~/accept_trigger", self._twin(ACCEPT, self._only_candidate))
-        add(Trigger, "~/reject_trigger", self._twin(REJECT, self._only_candidate))
+        add(Trigger, "~/reject_trigger", self._reject_twin)
         add(Trigger, "~/rollback_trigger", self._twin(ROLLBACK, lambda: {"previous": True}))
 
     async def _capture_reference(self, request: Any, response: Any) -> Any:
@@ -114,6 +114,20 @@ class ThermalServices:
             return response
 
         return trigger
+
+    async def _reject_twin(self, request: Any, response: Any) -> Any:
+        """Reject all that is pending: a PLC's way out when the accept twin may not choose."""
+        reject_one = self._twin(REJECT, self._newest_candidate)
+        await reject_one(request, response)
+        while response.success and self._history.pending():
+            await reject_one(request, response)
+        return response
+
+    def _newest_candidate(self) -> dict[str, Any]:
+        pending = self._history.pending()
+        if not pending:
+            raise ConflictError("no fresh candidate is pending, found none: identify first")
+        return {"id": pending[0].id}
 
     def _only_candidate(self) -> dict[str, Any]:
         """The candidate that a twin decides about, when there is no doubt which."""

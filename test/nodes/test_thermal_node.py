@@ -142,6 +142,8 @@ def test_a_twin_does_not_choose_between_candidates(graph, visits):
     assert not answer.success
     assert answer.message.startswith("0 CONFLICT ")
     assert f"{second}, {first}" in answer.message
+    assert cell.call("reject_trigger").success  # the way out: all of them
+    assert cell.call("reject_trigger").message.startswith("0 CONFLICT ")
 
 
 REFUSALS = [
