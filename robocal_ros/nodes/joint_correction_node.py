@@ -27,6 +27,7 @@ from robocal_ros.sessions.correction_inputs import (
     Reason,
     RefusedError,
     TrajectoryCommand,
+    finite_command,
     joint_command,
     offered_model,
     offered_tool,
@@ -98,18 +99,21 @@ class JointCorrectionNode(HouseNode):
         guard = self._sources[topic]
 
         def receive(message: Any) -> None:
-            if guard.fault:
+            stop = topic == TRAJECTORY and not message.points  # nothing may hold it up
+            if guard.fault and not stop:
                 self._session.counted(lambda: _refuse(guard.fault))
             act(message)
 
         return receive
 
     def _on_target(self, message: Any) -> None:
-        command = self._session.counted(lambda: joint_command(message))
+        command = self._session.counted(lambda: finite_command(message))
         self._put_out(TARGETS, message, self._session.target(command, time.monotonic()))
 
     def _on_states(self, message: Any) -> None:
         command = self._session.counted(lambda: joint_command(message))
+        if not np.all(np.isfinite(message.effort)):
+            message.effort = _doubles(np.empty(0))  # many drivers have none: no NaN goes out
         self._put_out(STATES, message, self._session.reading(command, time.monotonic()))
 
     def _put_out(self, topic: str, message: Any, command: JointCommand) -> None:
@@ -122,7 +126,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_path(self, message: Any) -> None:
         now = time.monotonic()
-        if not message.points:  # a stop: nothing may hold it up
+        if not message.points:
             self._outputs[TRAJECTORY].publish(message)
             self._session.trajectory(_STOP, now)
             return

@@ -107,7 +107,8 @@ class CorrectionSession:
         shift, corrected = 0.0, command
         if not self._corrector.passes(q, now_s):
             pause = 0.0 if self._streamed_s is None else now_s - self._streamed_s
-            done = self._corrector.point(q, now_s, pause)
+            whole = len(index) == self._joints.count
+            done = self._corrector.point(q, now_s, pause, whole)
             velocity = None
             if speeds is not None:
                 qd = self._joints.spread(speeds, index)
@@ -147,7 +148,8 @@ class CorrectionSession:
         require_finite(command.names, command.acceleration)
         corrected = command
         if not self._corrector.passes(q, now_s):
-            done = self._corrector.path(q, times, now_s, starts_in_s)
+            whole = len(index) == self._joints.count
+            done = self._corrector.path(q, times, now_s, starts_in_s, whole)
             position = done.result.q[:, index]
             corrected = replace(command, position=position, mark=CORRECTED)
             if command.velocity is not None:

@@ -28,6 +28,7 @@ class Commanded:
     start, end : packed models; a constant one has both the same.
     begin_s : start of the trajectory on the session's clock.
     times_s, s : (m,) blend along the trajectory; constant before and after.
+    before : what is commanded until ``begin_s``, while a trajectory waits for its start.
     """
 
     start: Array
@@ -35,9 +36,12 @@ class Commanded:
     begin_s: float = 0.0
     times_s: Array | None = None
     s: Array | None = None
+    before: "Commanded | None" = None
 
     def at(self, now_s: float) -> Array:
         """The packed model at an instant."""
+        if self.before is not None and now_s < self.begin_s:
+            return self.before.at(now_s)
         if self.start is self.end or self.times_s is None or self.s is None:
             return self.end
         s = float(np.interp(now_s - self.begin_s, self.times_s, self.s))

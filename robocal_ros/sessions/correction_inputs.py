@@ -147,8 +147,20 @@ def joint_command(message: Any) -> JointCommand:
             raise RefusedError(Reason.NO_POSITION, f"of {', '.join(names)}")
         position = np.empty(0)
     velocity = _values(message.velocity, names, "velocities")
+    _require_finite(position, "a position")
     header = message.header
     return JointCommand(names, position, velocity, stamp_ns(header.stamp), str(header.frame_id))
+
+
+def finite_command(message: Any) -> JointCommand:
+    """``joint_command`` of targets, whose efforts must be finite too: they go out as they came."""
+    _require_finite(message.effort, "an effort")
+    return joint_command(message)
+
+
+def _require_finite(values: Any, what: str) -> None:
+    if not np.all(np.isfinite(values)):
+        raise RefusedError(Reason.NOT_FINITE, f"{what}: {list(values)}")
 
 
 def trajectory_command(message: Any) -> TrajectoryCommand:
@@ -161,6 +173,8 @@ def trajectory_command(message: Any) -> TrajectoryCommand:
     """
     names = tuple(message.joint_names)
     points = message.points
+    for point in points:
+        _require_finite(point.effort, "an effort")
     rows = {
         what: _rows([getattr(point, what) for point in points], len(names), what)
         for what in ("positions", "velocities", "accelerations")

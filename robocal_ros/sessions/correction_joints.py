@@ -26,6 +26,11 @@ class JointBook:
         self.measured = np.full(arm.n, np.nan)
         self.taught = np.full(arm.n, np.nan)
 
+    @property
+    def count(self) -> int:
+        """Number of the arm's joints."""
+        return len(self._names)
+
     def complete(self, names: tuple[str, ...], position: Array) -> tuple[Array, Index]:
         """All joints (m, n) of a command (m, k), and the joint number (k,) of each name.
 

@@ -1,6 +1,6 @@
 """Which model corrects the commands at every instant, and the corrected joints themselves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,14 +85,18 @@ class Corrector:
         self.figures = (0.0, 0.0, 0.0)
         return True
 
-    def point(self, q: Array, now_s: float, pause_s: float) -> Corrected:
-        """Correct one point (1, n) of a stream, ``pause_s`` after the one before."""
+    def point(self, q: Array, now_s: float, pause_s: float, whole: bool = True) -> Corrected:
+        """Correct one point (1, n) of a stream, ``pause_s`` after the one before.
+
+        The blend waits while the stream is not ``whole``: it would move joints that are not in
+        the commands, and the next whole command would make up for it in one step.
+        """
         model = self._commanded.at(now_s)
         stage = self._stage_between(model, self._wanted)
         if model is self._wanted:
             s, result = 1.0, stage.correct(q, np.ones(1))
         else:
-            dt = min(pause_s, self._config.longest_step_s)
+            dt = min(pause_s, self._config.longest_step_s) if whole else 0.0
             s, result = step_towards(stage, q, self._config.blend_rates(self._arm), dt)
             if s > 0.0 and self._fault(result) is not None:
                 s, result = 0.0, stage.correct(q, np.zeros(1))
@@ -105,12 +109,19 @@ class Corrector:
         self._note(q, result)
         return Corrected(stage, np.array([s]), result)
 
-    def path(self, q: Array, times_s: Array, now_s: float, starts_in_s: float) -> Corrected:
-        """Correct the points (m, n) of a trajectory."""
-        model = self._commanded.at(now_s)
+    def path(
+        self, q: Array, times_s: Array, now_s: float, starts_in_s: float, whole: bool = True
+    ) -> Corrected:
+        """Correct the points (m, n) of a trajectory, from what is commanded when it begins.
+
+        The blend waits while the commands are not ``whole``, as in `point`.
+        """
+        model = self._commanded.at(now_s + max(0.0, starts_in_s))
         stage = self._stage_between(model, self._wanted)
         s = np.ones(len(q))
-        if model is not self._wanted:
+        if model is not self._wanted and not whole:
+            s = np.zeros(len(q))
+        elif model is not self._wanted:
             rates = self._config.blend_rates(self._arm)
             s = blend_along(stage, q, times_s, -starts_in_s, rates)
         result = stage.correct(q, s)
@@ -122,9 +133,17 @@ class Corrector:
             now_s + starts_in_s,
             np.append(first, np.maximum(times_s, first)),
             np.append(0.0, s),
+            self._running(now_s) if starts_in_s > 0.0 else None,
         )
         self._note(q, result)
         return Corrected(stage, s, result)
+
+    def _running(self, now_s: float) -> Commanded:
+        """What is under way: a trajectory that still waits for its start is replaced."""
+        latest = self._commanded
+        if latest.before is not None and now_s < latest.begin_s:
+            return latest.before
+        return replace(latest, before=None)
 
     def commanded(self, now_s: float) -> StagedCorrection | None:
         """The correction in the commands at an instant, at blend 1; None when there is none."""

@@ -22,6 +22,7 @@ from robocal_ros.sessions.correction_inputs import (
     Reason,
     RefusedError,
     TrajectoryCommand,
+    finite_command,
     joint_command,
     trajectory_command,
 )
@@ -371,6 +372,37 @@ def test_a_later_trajectory_begins_when_it_says(robot: Robot) -> None:
     assert np.allclose(taught.position, command.position[-1], rtol=0.0, atol=1e-9)
 
 
+def test_a_waiting_trajectory_begins_from_what_is_commanded_then(robot: Robot) -> None:
+    """The running one goes on until then, and the readings follow it."""
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    running = swing()
+    first = robot.session.trajectory(running, robot.now)
+    robot.session.offer_model(offer(drifted(0.5), revision=2))
+    waiting = replace(running, position=np.tile(running.position[50], (201, 1)))
+    second = robot.session.trajectory(waiting, robot.now + 0.1, starts_in_s=0.4)
+    i = 50  # what the first commands at 0.5 s, where the second begins
+    assert running.time_from_start_s[i] == pytest.approx(0.5)
+    assert np.allclose(second.position[0], first.position[i], rtol=0.0, atol=1e-9)
+    for i in (10, 30, 49):
+        state = JointCommand(NAMES, first.position[i])
+        taught = robot.session.reading(state, robot.now + running.time_from_start_s[i])
+        assert np.allclose(taught.position, running.position[i], rtol=0.0, atol=1e-9)
+
+
+def test_a_part_of_the_joints_does_not_blend_the_others_unseen(robot: Robot) -> None:
+    """Only joint 1 is commanded while a model comes into force; then all of them."""
+    before = robot.stream()
+    robot.read(before)
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.session.enable(True)
+    for _ in range(1000):
+        robot.now += DT
+        robot.session.target(JointCommand(NAMES[:1], HOME[:1]), robot.now)
+    allowed = CorrectionConfig().blend_rates(NOMINAL) * DT
+    assert np.all(np.abs(robot.stream() - before) <= allowed * 1.001)
+
+
 def test_a_stop_passes_at_once_and_as_it_came(warm: Robot) -> None:
     stop = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
     before = warm.stream()
@@ -631,6 +663,23 @@ def test_targets_are_built_from_messages() -> None:
     refused(Reason.WRONG_SIZE, joint_command, message)
     message.position = []
     refused(Reason.NO_POSITION, joint_command, message)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_efforts_that_are_not_finite_do_not_go_out(bad: float) -> None:
+    target = SimpleNamespace(header=header(), name=["a"], position=[1.0], velocity=[], effort=[bad])
+    refused(Reason.NOT_FINITE, finite_command, target)
+    moved = point(0.0, [1.0], [], [])
+    moved.effort = [bad]
+    path = SimpleNamespace(header=header(), joint_names=["a"], points=[moved])
+    refused(Reason.NOT_FINITE, trajectory_command, path)
+
+
+def test_readings_of_foreign_joints_that_are_not_finite_are_refused() -> None:
+    state = SimpleNamespace(
+        header=header(), name=["a", "gripper"], position=[1.0, np.nan], velocity=[], effort=[]
+    )
+    refused(Reason.NOT_FINITE, joint_command, state)
 
 
 def point(t: float, q: list[float], v: list[float], a: list[float]) -> SimpleNamespace:
