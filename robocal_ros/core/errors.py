@@ -73,6 +73,12 @@ class LimitError(RobocalError):
     code = Code.LIMIT_EXCEEDED
 
 
+class ResidualError(RobocalError):
+    """Measurements that miss the model by more than any calibration error."""
+
+    code = Code.RESIDUAL_TOO_LARGE
+
+
 class ConflictError(RobocalError):
     """Another change came first."""
 

@@ -15,6 +15,8 @@ from robocal_ros.core.errors import InputError
 Array = NDArray[np.float64]
 
 DEFAULT_TARGET = "tool"
+CORRECTED = "robocal_corrected"  # frame_id of commands that carry a joint correction
+TAUGHT = "robocal_taught"  # frame_id of joint states from which the correction was removed
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,8 +123,14 @@ def joint_sample(message: Any) -> JointSample:
     Raises
     ------
     InputError
-        When names and positions differ in number, a name is doubled or a value is not finite.
+        When names and positions differ in number, a name is doubled or a value is not finite,
+        or the readings are not the controller's own.
     """
+    if message.header.frame_id in (CORRECTED, TAUGHT):
+        raise InputError(
+            "joint states come from a joint correction: subscribe to the robot's own, or the model "
+            "would be identified against itself"
+        )
     names = tuple(message.name)
     position = np.array(message.position, dtype=np.float64)
     if len(names) != len(position):

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction_blend import blend_rates
 from robocal_ros.sessions.correction_bounds import CorrectionConfig
 from robocal_ros.sessions.correction_gate import CorrectionGate
@@ -24,8 +25,6 @@ from robocal_ros.sessions.correction_guard import (
     CorrectionStatus,
 )
 from robocal_ros.sessions.correction_inputs import (
-    CORRECTED,
-    TAUGHT,
     JointCommand,
     OfferedModel,
     OfferedTool,

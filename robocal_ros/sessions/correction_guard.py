@@ -8,9 +8,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction_inputs import (
-    CORRECTED,
-    TAUGHT,
     JointCommand,
     Reason,
     RefusedError,

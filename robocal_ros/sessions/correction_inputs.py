@@ -17,10 +17,6 @@ from robocal_ros.core.samples import stamp_ns
 
 Array = NDArray[np.float64]
 
-# Marks in header.frame_id, which joint messages leave empty.
-CORRECTED = "robocal_corrected"
-TAUGHT = "robocal_taught"
-
 
 class Reason(StrEnum):
     """Why an input was refused; counted one by one."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.assessment import Verdict, summarise
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import (
     arm_of,
@@ -207,8 +207,23 @@ class ThermalSession:
         data = as_measurements(self._window(command))
         reference = capture_reference(self.arm, data)
         model = reference_document(reference)
-        verdict = Verdict(Code.ACCEPT, "cold reference captured")
-        calibration_id = self._propose(REFERENCE, command, wall_ns, "lsq", verdict, {}, model, data)
+        rms_mm = summarise(reference.cell.residual(reference.data)).rms_m * 1e3
+        left_out = f", not fitting: {', '.join(reference.rejected)}" if reference.rejected else ""
+        message = (
+            f"cold reference of {len(reference.data)} measurements captured, residual "
+            f"{rms_mm:.3f} mm rms{left_out}"
+        )
+        document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
+        calibration_id = self._propose(
+            REFERENCE,
+            command,
+            wall_ns,
+            "lsq",
+            Verdict(Code.ACCEPT, message),
+            document,
+            model,
+            data,
+        )
         self._history.accept(
             calibration_id,
             by=str(command.arguments.get("by", "")),
@@ -217,9 +232,9 @@ class ThermalSession:
             wall_ns=wall_ns,
         )
         self.desk.use(command.stamp_ns or 0)
-        count = len(data)
-        message = f"cold reference of {count} measurements captured"
-        return Outcome(command, Code.ACCEPT, message, calibration_id=calibration_id, samples=count)
+        return Outcome(
+            command, Code.ACCEPT, message, calibration_id=calibration_id, samples=len(data)
+        )
 
     def _identify(self, command: Command, wall_ns: int) -> Outcome:
         method = str(command.arguments.get("method") or self.config.method)

@@ -7,7 +7,7 @@ import pytest
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import InputError, ResidualError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.identification import capture_reference, identify_drift
@@ -250,3 +250,22 @@ def test_learned_prior_keeps_the_default_where_nothing_was_seen():
     learned = learned_prior(np.eye(2), drifts, unseen)
     assert learned[1, 1] == pytest.approx(1.0)
     assert learned[0, 0] < 0.2
+
+
+def test_a_cold_visit_of_another_robot_is_no_reference(nominal, cold):
+    """A joint that counts the other way is named; what cannot be named is refused by its size."""
+    rng = np.random.default_rng(9)
+    q = postures(nominal, 20, rng)
+    turned = visit(cold, q * np.array([1, 1, 1, -1, 1, 1]), rng)
+    with pytest.raises(InputError, match="counts the other way"):
+        capture_reference(nominal, replace(turned, q=q))
+    noise = visit(cold, q, rng, noise=0.01)
+    with pytest.raises(ResidualError, match="mm rms, more than any robot's static error"):
+        capture_reference(nominal, noise)
+
+
+def test_a_cold_sample_that_does_not_fit_is_named(nominal, cold):
+    rng = np.random.default_rng(10)
+    measured = visit(cold, postures(nominal, 14, rng), rng)
+    measured.position[3] += [0.0, 0.05, 0.0]
+    assert capture_reference(nominal, measured).rejected == ("3",)

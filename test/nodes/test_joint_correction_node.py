@@ -19,11 +19,11 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.joint_correction_settings import SETTINGS
-from robocal_ros.sessions.correction_inputs import CORRECTED, TAUGHT
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = load_robot("kr150_r3100")

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction import CorrectionSession
 from robocal_ros.sessions.correction_bounds import CorrectionConfig
 from robocal_ros.sessions.correction_inputs import (
-    CORRECTED,
-    TAUGHT,
     JointCommand,
     OfferedModel,
     OfferedTool,

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import estimation
-from robocal_ros.core.assessment import gross, judge, pose_groups, summarise
-from robocal_ros.core.errors import InputError, TooFewSamplesError
+from robocal_ros.core.assessment import LARGEST_RMS_M, gross, judge, pose_groups, summarise
+from robocal_ros.core.errors import InputError, ResidualError, TooFewSamplesError
 from robocal_ros.core.identification.cell import CellModel, CellProblem, make_layout
 from robocal_ros.core.identification.judged import JudgedIdentification, uninformative
+from robocal_ros.core.identification.mismatch import require_match
 from robocal_ros.core.identification.solve import Identification, Method, identify
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.observability import describe
@@ -28,21 +29,38 @@ class ColdReference:
     ----------
     cell : the cold model with base and targets as fitted to the cold visit.
     data : the cold measurements.
+    rejected : names of those that did not fit the others.
     """
 
     cell: CellModel
     data: Measurements
+    rejected: tuple[str, ...] = ()
 
 
 def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
     """Place base and targets from a cold visit with the cold model ``arm``.
 
+    Samples that do not fit the others do not place them, and are named in ``rejected``; a warm
+    visit of such a pose will not fit either.
+
     Raises
     ------
     TooFewSamplesError, RankDeficientError
         When the visit cannot place them.
+    InputError, ResidualError
+        When the visit misses the arm by a mistake that can be named, or by more than 5 mm rms.
     """
-    return ColdReference(identify(arm, data, fit=("base", "tool"), method="lsq").cell, data)
+    require_match(arm, data, base=True, tool=True)
+    placed = identify(arm, data, fit=("base", "tool"), method="lsq")
+    used = data.take(~placed.estimate.rejected)
+    rms = summarise(placed.cell.residual(used)).rms_m
+    if rms > LARGEST_RMS_M:
+        raise ResidualError(
+            f"the cold visit misses the model by {rms * 1e3:.1f} mm rms, more than any robot's "
+            f"static error ({LARGEST_RMS_M * 1e3:.0f} mm): check robot file, units, joint signs "
+            "and target names"
+        )
+    return ColdReference(placed.cell, data, placed.rejected)
 
 
 def against_reference(reference: ColdReference, warm: Measurements, sigma_m: float) -> Measurements:
