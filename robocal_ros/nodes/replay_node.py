@@ -180,9 +180,13 @@ class ReplayNode(HouseNode):
 
     def _end(self, state: str) -> None:
         self._set_state(state)
+        doubt = self._topics.doubt() if self._topics is not None else ""
+        if doubt:
+            self.get_logger().error(f"{state}: loss cannot be excluded: {doubt}")
+        else:
+            self.get_logger().info(f"{state}: nothing was lost")
         if self.settings["exit_at_end"]:
-            topics = self._topics
-            lost = state == FAILED or (topics is not None and topics.unacknowledged > 0)
+            lost = state == FAILED or bool(doubt)
             self._status.wait_for_all_acked(Duration(seconds=1))
             raise SystemExit(EXIT_LOSS if lost else 0)
 

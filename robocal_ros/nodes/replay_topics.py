@@ -99,8 +99,22 @@ class ReplayTopics:
 
     def heard(self, names: Collection[str]) -> bool:
         """Whether every one of these played names has a subscriber."""
-        count = {p.topic: p.publisher.get_subscription_count() for p in self.played.values()}
-        return all(count.get(name, 0) > 0 for name in names)
+        played = self.played.values()
+        count = {p.publisher.topic_name: p.publisher.get_subscription_count() for p in played}
+        return all(count.get(self._node.resolve_topic_name(name), 0) > 0 for name in names)
+
+    def doubt(self) -> str:
+        """Why messages may have been lost: not acknowledged, or sent to best-effort inputs."""
+        words = []
+        if self.unacknowledged:
+            words.append(f"{self.unacknowledged} messages were not acknowledged")
+        words += [
+            f"{played.topic} went to best-effort subscribers ({', '.join(sorted(names))}): make "
+            "them reliable"
+            for played in self.played.values()
+            if (names := set(played.untracked.values()))
+        ]
+        return "; ".join(words)
 
     def close(self) -> None:
         """Take the publishers down."""
