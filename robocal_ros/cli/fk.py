@@ -20,6 +20,8 @@ HELP = "pose of the flange, and of the tool, at given joint values"
 _VALUE = re.compile(r"\s*([-+]?[0-9.]+(?:e[-+]?[0-9]+)?)\s*([a-z]*)\s*", re.IGNORECASE)
 _TO_SI = {"deg": 3.141592653589793 / 180.0, "rad": 1.0, "mm": 1e-3, "m": 1.0}
 
+_MOST_DEG = 1e6
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
@@ -94,7 +96,13 @@ def _value(cell: str, unit: str, option: str, arm: "SerialArm", joint: int) -> f
             f"{option}: '{cell.strip()}' needs the unit {' or '.join(units)}; joint {joint + 1} "
             f"of {arm.name} is {kind}"
         )
-    return number * _TO_SI[unit or given]
+    value = number * _TO_SI[unit or given]
+    if not arm.prismatic[joint] and abs(value) > _MOST_DEG * _TO_SI["deg"]:
+        raise InputError(
+            f"{option}: '{cell.strip()}' of joint {joint + 1} is beyond {_MOST_DEG:g} deg; no "
+            "joint turns that far"
+        )
+    return value
 
 
 def _joint_documents(arm: "SerialArm", q: list[float]) -> list[dict[str, Any]]:

@@ -23,6 +23,7 @@ HELP = "list the calibrations of a robot; accept, reject or roll back"
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
+_KINDS = (THERMAL, "reference")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,7 +81,10 @@ def _add_rollback_target(action: argparse.ArgumentParser) -> None:
         "before the present one",
     )
     action.add_argument(
-        "--kind", type=text, default=THERMAL, help=f"kind of calibration, default {THERMAL}"
+        "--kind",
+        choices=_KINDS,
+        default=THERMAL,
+        help=f"kind of calibration, default {THERMAL}",
     )
 
 

@@ -16,7 +16,7 @@ from robocal_ros.cli.arguments import (
     warn,
 )
 from robocal_ros.cli.identify_view import headline, show_identification
-from robocal_ros.cli.output import DONE, NO_ANSWER, Outcome, refusal
+from robocal_ros.cli.output import DONE, NO_ANSWER, Outcome, refusal, tell
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 
@@ -36,22 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", required=True, type=Path, metavar="CSV", help="measurements to solve from"
     )
-    judging = parser.add_mutually_exclusive_group()
-    judging.add_argument(
-        "--check",
-        type=Path,
-        metavar="CSV",
-        help="measurements to judge on, none of them in --data",
-    )
-    judging.add_argument(
-        "--hold-out",
-        type=share,
-        metavar="SHARE",
-        help=f"without --check: share of the poses of --data to judge on, default {_HOLD_OUT}",
-    )
-    parser.add_argument(
-        "--seed", type=seed, metavar="N", help="which poses are held out, default 0"
-    )
+    _add_judging(parser)
     parser.add_argument(
         "--check-refit",
         type=parts,
@@ -80,6 +65,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_judging(parser: argparse.ArgumentParser) -> None:
+    judging = parser.add_mutually_exclusive_group()
+    judging.add_argument(
+        "--check",
+        type=Path,
+        metavar="CSV",
+        help="measurements to judge on, none of them in --data",
+    )
+    judging.add_argument(
+        "--hold-out",
+        type=share,
+        metavar="SHARE",
+        help=f"without --check: share of the poses of --data to judge on, default {_HOLD_OUT}",
+    )
+    parser.add_argument(
+        "--seed", type=seed, metavar="N", help="which poses are held out, default 0"
+    )
+
+
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     _require_sense(args)
@@ -97,6 +101,7 @@ def run(args: argparse.Namespace) -> Outcome:
     status = DONE
     if answer.judged.verdict.code is Code.TOO_FEW_SAMPLES:
         document |= refusal(Code.TOO_FEW_SAMPLES, answer.judged.verdict.reason)
+        tell(Code.TOO_FEW_SAMPLES.name, answer.judged.verdict.reason)
         status = NO_ANSWER
     return Outcome(document, partial(show_identification, document=document), status)
 

@@ -108,10 +108,14 @@ def _show_doubts(console: "Console", document: Document) -> None:
         console.print(f"Not seen in the data, {owner}:")
         for words in document["unobservable"]:
             console.print(Text(f"  {words}"), soft_wrap=True)
-    rejected = document["rejected"]
+    rejected, not_judging = document["rejected"], document["held_out_rejected"]
     if rejected:
-        listed = ", ".join(rejected[:MOST_LISTED]) + (" …" if len(rejected) > MOST_LISTED else "")
-        console.print(
-            Text(f"Rejected, {len(rejected)} of {document['samples']} samples: {listed}"),
-            soft_wrap=True,
-        )
+        words = f"Rejected, {len(rejected)} of {document['samples']} samples: {_listed(rejected)}"
+        console.print(Text(words), soft_wrap=True)
+    if not_judging:
+        words = f"Left out of the judgement, no model fits them: {_listed(not_judging)}"
+        console.print(Text(words), soft_wrap=True)
+
+
+def _listed(samples: list[str]) -> str:
+    return ", ".join(samples[:MOST_LISTED]) + (" …" if len(samples) > MOST_LISTED else "")

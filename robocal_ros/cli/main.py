@@ -30,6 +30,7 @@ from robocal_ros.cli.output import (
     exit_status,
     failure,
     show,
+    tell,
     write_json,
 )
 from robocal_ros.cli.parsing import (
@@ -114,7 +115,7 @@ def _answer(arguments: Sequence[str], stream: TextIO, as_json: bool) -> int:
 def _fail(error: RobocalError, stream: TextIO, as_json: bool) -> int:
     if isinstance(error, UsageError):
         print(error.usage.rstrip(), file=sys.stderr)
-    print(f"robocal: {error} [{error.code.name}]", file=sys.stderr)
+    tell(error.code.name, error)
     _write_failure(failure(error), stream, as_json)
     return BAD_REQUEST if isinstance(error, UsageError) else exit_status(error)
 

@@ -79,6 +79,11 @@ def refusal(code: Code, message: str) -> Document:
     }
 
 
+def tell(code: str, message: object) -> None:
+    """Say on standard error, in one line, why a command ends without an answer."""
+    print(f"robocal: {message} [{code}]", file=sys.stderr)
+
+
 def write_json(document: Document, stream: TextIO) -> None:
     """Write the one document."""
     stream.write(json.dumps(document, indent=2, allow_nan=False) + "\n")

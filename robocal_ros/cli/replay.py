@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
-from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, Outcome, progress_console
+from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, Outcome, progress_console, tell
 from robocal_ros.cli.replay_view import show_replay
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, WrongRobotError
@@ -80,6 +80,7 @@ def run(args: argparse.Namespace) -> Outcome:
     request = Request(
         bag=args.bag,
         find_robot=partial(_robot, args.robot, warnings),
+        robot_named=args.robot is not None,
         cold=args.cold,
         warm=tuple(args.warm),
         auto=args.auto,
@@ -97,7 +98,7 @@ def _status(document: dict[str, Any]) -> int:
     if "error" not in document:
         return DONE
     error = document["error"]
-    print(f"robocal: {error['message']} [{error['code']}]", file=sys.stderr)
+    tell(error["code"], error["message"])
     return NO_ANSWER if error["code"] in _NO_ANSWER else BAD_REQUEST
 
 

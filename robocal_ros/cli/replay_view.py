@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 Document = dict[str, Any]
 
 MOST_REASONS = 5
+_NOTHING_ACCEPTED = (
+    "Nothing was accepted: each cycle is judged against the model in force at the start."
+)
 _COLUMNS = (
     "number", "time (UTC)", "cycle", "samples", "in force", "candidate", "predicted", "verdict",
 )  # fmt: skip
@@ -26,6 +29,8 @@ def show_replay(console: "Console", document: Document) -> None:
         show_identification(console, candidates[0])
     elif candidates:
         console.print(_candidates(candidates))
+        if not document["recorded"]:
+            console.print(_NOTHING_ACCEPTED, soft_wrap=True)
     for entry in document["commands"]:
         if entry["code"] != "ACCEPT" and not (entry["command"] == "identify" and entry["samples"]):
             words = f"{entry['command']}: {entry['code']}: {entry['message']}"

@@ -40,6 +40,7 @@ class Request:
     Attributes
     ----------
     find_robot : gives the arm for the recorded configuration (None: nothing was recorded).
+    robot_named : whether the user said which robot it is.
     cold, warm : windows, s from the first joint reading; without any the recorded commands.
     topics : input to topic of the bag, where given.
     state : folder of a history that is kept; None: one that is not.
@@ -49,6 +50,7 @@ class Request:
     find_robot: Callable[[Command | None], SerialArm]
     cold: Window | None = None
     warm: tuple[Window, ...] = ()
+    robot_named: bool = False
     auto: bool = False
     topics: Mapping[str, str] = field(default_factory=dict)
     state: Path | None = None
@@ -67,7 +69,8 @@ def replay_bag(request: Request, watch: Watch) -> Document:
     with BagReader(request.bag) as reader:
         recording = open_recording(reader, request.topics)
         if not (request.auto or request.cold or request.warm or recording.commands):
-            raise InputError(_NO_COMMANDS, file=str(request.bag))
+            words = _NO_COMMANDS if request.robot_named else _NO_COMMANDS + _NO_ROBOT
+            raise InputError(words, file=str(request.bag))
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
             kept = _GOES_ON.format(history.path) if history.list(1) else ""
@@ -86,6 +89,7 @@ _NO_COMMANDS = (
     "(repeat it for more cycles; --cold T0:T1 for a cold reference), in seconds from the first "
     "joint reading, or let --auto find the cycles"
 )
+_NO_ROBOT = "; and name its robot with --robot"
 
 _GOES_ON = "{} already holds calibrations: the replay went on from there"
 

@@ -7,6 +7,14 @@ from pathlib import Path
 
 from robocal_ros.core.errors import InputError
 
+MOST_QUOTED = 60
+
+
+def quoted(value: object) -> str:
+    """A user's text for a message: in quotes, on one line, cut where it is long."""
+    text = " ".join(str(value).split())
+    return f"'{text}'" if len(text) <= MOST_QUOTED else f"'{text[:MOST_QUOTED]}…'"
+
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """Words that suggest the known name nearest to ``name``: `` (did you mean 'x_mm'?)``, or none.

@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 import yaml
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import nearest
+from robocal_ros.storage.files import nearest, quoted
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -18,7 +18,7 @@ class _StrictLoader(yaml.SafeLoader):
         for key_node, _ in node.value:
             if str(key_node.value) in seen:
                 raise yaml.MarkedYAMLError(
-                    problem=f"key '{key_node.value}' appears twice",
+                    problem=f"key {quoted(key_node.value)} appears twice",
                     problem_mark=key_node.start_mark,
                 )
             seen.add(str(key_node.value))
@@ -62,7 +62,7 @@ class Fields:
         """Refuse keys beside the known ones."""
         for key in self.values:
             if key not in known:
-                self.fail(f"is not a known key{nearest(str(key), known)}", f"'{key}'")
+                self.fail(f"is not a known key{nearest(str(key), known)}", quoted(key))
 
     def _get(self, key: str) -> Any:
         if self.values.get(key) is None:
@@ -83,7 +83,7 @@ class Fields:
         value = self._get(key)
         if value not in known:
             words = " or ".join(known)
-            self.fail(f"is '{value}'; it must be {words}{nearest(str(value), known)}", key)
+            self.fail(f"is {quoted(value)}; it must be {words}{nearest(str(value), known)}", key)
         return str(value)
 
     def number(self, key: str, default: float | None = None) -> float:
@@ -115,7 +115,7 @@ class Fields:
             try:
                 value = float(value)
             except ValueError:
-                self.fail(f"is '{value}', not a number", key)
+                self.fail(f"is {quoted(value)}, not a number", key)
         if isinstance(value, bool) or not isinstance(value, int | float):
             self.fail(f"must be a number, not {_kind(value)}", key)
         if not math.isfinite(value):
@@ -135,5 +135,5 @@ class Fields:
 
 
 def _kind(value: Any) -> str:
-    kinds = {dict: "keys and values", list: "a list", str: f"'{value}'", type(None): "nothing"}
+    kinds = {dict: "keys and values", list: "a list", str: quoted(value), type(None): "nothing"}
     return kinds.get(type(value), str(value))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.storage.files import nearest, read_text, write_text
+from robocal_ros.storage.files import nearest, quoted, read_text, write_text
 from robocal_ros.storage.places import share_folders
 from robocal_ros.storage.robot_fields import Fields, load_yaml
 
@@ -74,7 +74,7 @@ def load_description(name: str | Path) -> RobotDescription:
     names = [joint.name for joint in joints]
     doubled = next((name for name in names if names.count(name) > 1), None)
     if doubled is not None:
-        top.fail(f"two joints have the name '{doubled}'", "joints")
+        top.fail(f"two joints have the name {quoted(doubled)}", "joints")
     arm = SerialArm(
         name=robot,
         joint_names=tuple(names),
@@ -121,8 +121,8 @@ def find_robot(name: str | Path) -> Path:
             known.setdefault(file.stem, file)
     if str(name) not in known:
         raise InputError(
-            f"no robot '{name}'{nearest(str(name), known)}: give the path of a robot file, or one "
-            f"of {', '.join(sorted(known)) or '(no robot files are installed)'}"
+            f"no robot {quoted(name)}{nearest(str(name), known)}: give the path of a robot file, "
+            f"or one of {', '.join(sorted(known)) or '(no robot files are installed)'}"
         )
     return known[str(name)]
 
@@ -161,7 +161,7 @@ class _Joint:
 
     def __init__(self, fields: Fields, convention: str) -> None:
         self.name = fields.text("name")
-        fields.place += f" '{self.name}'"
+        fields.place += f" {quoted(self.name)}"
         self.prismatic = fields.choice("type", TYPES, "revolute") == "prismatic"
         unit, factor = UNITS[self.prismatic]
         limits = (f"lower_{unit}", f"upper_{unit}")

@@ -1,0 +1,35 @@
+"""The commands of the documentation run as they are typed, after ``make demo``."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from command import ROOT, robocal
+
+PREFIX = ".venv/bin/robocal "
+PAGES = ("README.md", *(f"docs/{name}.md" for name in ("quickstart", "identify", "history")))
+REPLAY = ("replay", "bags/demo_shift.mcap", "--robot", "kr150_r3100", "--auto")
+
+
+def commands(page: str) -> list[list[str]]:
+    text = (ROOT / page).read_text().replace("\\\n", " ")
+    blocks = re.findall(r"```bash\n(.*?)```", text, re.DOTALL)
+    lines = [line.strip() for block in blocks for line in block.splitlines()]
+    typed = [line.removeprefix(PREFIX) for line in lines if line.startswith(PREFIX)]
+    return [shlex.split(line.split(" > ")[0], comments=True) for line in typed]
+
+
+@pytest.mark.parametrize("page", [*PAGES, "docs/replay.md"])
+def test_commands_run_as_typed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("docs", "bags"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path)
+    typed = commands(page)
+    assert typed
+    if any("out/state" in words for words in typed):  # stands for the demo's history
+        assert robocal(*REPLAY, "--state", "out/state").returncode == 0
+    for words in typed:
+        done = robocal(*words)
+        assert done.returncode == 0, (words, done.stderr)
