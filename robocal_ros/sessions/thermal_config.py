@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.identification import Method
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import State
 from robocal_ros.core.samples import DEFAULT_TARGET
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.core.thermal.priors import drift_prior, learned_prior
@@ -18,6 +19,7 @@ Prior = Literal["default", "learned"]
 METHODS: tuple[Method, ...] = ("map", "lsq")
 PRIORS: tuple[Prior, ...] = ("default", "learned")
 LEARN_FROM = 500
+STOOD = (State.IN_FORCE, State.SUPERSEDED)  # what was rolled back was no drift
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class ThermalConfig:
     Attributes
     ----------
     method : estimator where a command names none.
-    prior : ``default``, or ``learned`` from the drifts accepted so far.
+    prior : ``default``, or ``learned`` from the drifts accepted and not rolled back so far.
     sigma_m : standard deviation of one measured coordinate in one visit of a pose.
     hold_out, seed : share of the poses kept to judge a calibration without reference.
     lateness_s : a command waits for joint readings this much newer, so that measurements
@@ -50,11 +52,11 @@ class ThermalConfig:
 def expected_drift(
     nominal: SerialArm, history: History, config: ThermalConfig
 ) -> NDArray[np.float64]:
-    """Covariance (k, k), SI, of the drift: the default, or learned from what was accepted."""
+    """Covariance (k, k), SI, of the drift: the default, or learned from what stood."""
     default = drift_prior(nominal)
     if config.prior == "default":
         return default
-    accepted = [entry.id for entry in history.list(LEARN_FROM) if entry.revision]
+    accepted = [entry.id for entry in history.list(LEARN_FROM) if entry.state in STOOD]
     models = [history.model(calibration_id) for calibration_id in accepted]
     drifts = [m for m in models if "reference_mdh" in m]
     if not drifts:
