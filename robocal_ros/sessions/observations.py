@@ -1,6 +1,7 @@
 """Measurements paired with the joints of the same instant, whatever order they arrive in."""
 
 import re
+from bisect import insort
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -40,6 +41,10 @@ class Observation:
     q: Array
     position: Array
     rotation: Array | None
+
+
+def _topic(sample: PointSample | PoseSample) -> str:
+    return POINT if isinstance(sample, PointSample) else POSE
 
 
 @dataclass
@@ -105,7 +110,11 @@ class ObservationDesk:
             self._begin(sample.stamp_ns)
         self.newest_ns[JOINTS] = sample.stamp_ns
         if self._pending:
-            self._pending = self._pair(self._pending)
+            ready = next(
+                (i for i, waiting in enumerate(self._pending) if not self._pair(waiting)),
+                len(self._pending),
+            )
+            del self._pending[:ready]
 
     def _begin(self, first_ns: int) -> None:
         """Start at the first joint reading; what an earlier clock stamped means nothing now."""
@@ -121,7 +130,7 @@ class ObservationDesk:
 
     def add_measurement(self, sample: PointSample | PoseSample) -> None:
         """Take a measured point or pose; its joints may come before or after it."""
-        topic = POINT if isinstance(sample, PointSample) else POSE
+        topic = _topic(sample)
         self.received[topic] += 1
         if sample.stamp_ns <= 0:
             self.ignore(topic, "no time stamp")
@@ -130,41 +139,39 @@ class ObservationDesk:
             self._ignore_frame(topic, sample.frame)
             return
         self.newest_ns[topic] = max(sample.stamp_ns, self.newest_ns.get(topic, sample.stamp_ns))
-        self._pending += self._pair([sample])
+        if not self._pair(sample):
+            insort(self._pending, sample, key=lambda waiting: waiting.stamp_ns)
         if len(self._pending) > MOST_WAITING:
-            del self._pending[0]
-            self.ignore(topic, "no joint readings came")
+            # The latest: one stamped far ahead must not displace those whose joints come next.
+            self.ignore(_topic(self._pending.pop()), "no joint readings came")
 
     def _ignore_frame(self, topic: str, frame: str) -> None:
         self.ignore(topic, f"frame '{frame}' is not the measuring frame '{self.frame}'")
 
-    def _pair(self, samples: list[PointSample | PoseSample]) -> list[PointSample | PoseSample]:
-        """Make observations of these measurements; return those whose joints are to come."""
-        waiting: list[PointSample | PoseSample] = []
-        for sample in samples:
-            topic = POINT if isinstance(sample, PointSample) else POSE
-            try:
-                reading = self.stream.standstill(sample.stamp_ns, self.rule)
-            except NotStillError as error:
-                self.ignore(topic, str(error))
-                continue
-            if reading is None:
-                waiting.append(sample)
-                continue
-            if isinstance(sample, PointSample):
-                position, rotation = sample.position_m, None
-            else:
-                T = sample.T_frame_target
-                position, rotation = T[:3, 3], T[:3, :3]
-            self._observed.append(
-                Observation(
-                    sample.stamp_ns, reading.ready_ns, topic, sample.frame, sample.target,
-                    reading.q, position, rotation,
-                )
-            )  # fmt: skip
+    def _pair(self, sample: PointSample | PoseSample) -> bool:
+        """Settle a measurement; False while its joints are to come."""
+        topic = _topic(sample)
+        try:
+            reading = self.stream.standstill(sample.stamp_ns, self.rule)
+        except NotStillError as error:
+            self.ignore(topic, str(error))
+            return True
+        if reading is None:
+            return False
+        if isinstance(sample, PointSample):
+            position, rotation = sample.position_m, None
+        else:
+            T = sample.T_frame_target
+            position, rotation = T[:3, 3], T[:3, :3]
+        self._observed.append(
+            Observation(
+                sample.stamp_ns, reading.ready_ns, topic, sample.frame, sample.target,
+                reading.q, position, rotation,
+            )
+        )  # fmt: skip
         if len(self._observed) > MOST_KEPT:
             self.ignore(self._observed.pop(0).topic, "no command used it")
-        return waiting
+        return True
 
     def window(self, after_ns: int, until_ns: int, marks: Mapping[str, int]) -> list[Observation]:
         """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.core.samples import JointSample, PointSample, PoseSample
-from robocal_ros.core.streams import StandstillRule
+from robocal_ros.core.streams import JointStream, Reading, StandstillRule
 from robocal_ros.sessions.observations import (
     JOINTS,
     MOST_REASONS,
@@ -216,3 +216,26 @@ def test_nothing_grows_without_bound():
         d.ignore(POSE, f"frame 'f{number}' is unknown")
     assert len(d.ignored[POSE]) == MOST_REASONS + 1
     assert sum(d.ignored[POSE].values()) == 3 * MOST_REASONS
+
+
+class CountedStream(JointStream):
+    """A joint stream that counts the questions asked of it."""
+
+    asked = 0
+
+    def standstill(self, stamp_ns: int, rule: StandstillRule) -> Reading | None:
+        self.asked += 1
+        return super().standstill(stamp_ns, rule)
+
+
+def test_measurements_whose_joints_are_far_off_cost_nothing_and_displace_none():
+    """A joint reading asks for one waiting measurement beyond those that it completes."""
+    d = desk()
+    d.stream = stream = CountedStream(NAMES)
+    for ms in range(MOST_WAITING):
+        d.add_measurement(point(10**9 + ms))
+    d.add_measurement(point(1500))  # the last to come, the first to be complete
+    stream.asked = 0
+    stand(d, 1000, 2000)
+    assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
+    assert stream.asked == 11 + 1
