@@ -18,6 +18,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.endpoints import LOG_EVERY_S
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.nodes.replay_topics import CLOCK, ReplayTopics, chosen_topics
 from robocal_ros.nodes.run import run
@@ -32,9 +33,11 @@ EXIT_LOSS = 3
 DDS_PROFILE = "replay_dds.xml"
 
 WAITING, PLAYING, PAUSED, DONE, FAILED = "waiting", "playing", "paused", "done", "failed"
+NO_BAG = "no bag"
+GIVE_BAG = "no bag: set the parameter 'bag' to an MCAP file or a recording's folder"
 
 SETTINGS = (
-    Setting("bag", "", "MCAP file, or folder of a recording"),
+    Setting("bag", "", "MCAP file, or folder of a recording; empty: nothing to play yet"),
     Setting(
         "rate",
         1.0,
@@ -74,10 +77,17 @@ class ReplayNode(HouseNode):
 
     def configure(self) -> None:
         """Open the bag and make the publishers."""
+        self._status = self.add_output(String, "~/status", qos.LATCHED)
+        self.add_service(Trigger, "~/play", self._play)
+        self.add_service(Trigger, "~/pause", self._pause)
+        if self.settings["bag"]:
+            self._open(Path(self.settings["bag"]).expanduser())
+        else:
+            self.get_logger().warning(GIVE_BAG)
+
+    def _open(self, bag: Path) -> None:
         settings = self.settings
-        if not settings["bag"]:
-            raise InputError("parameter 'bag' is empty: give an MCAP file or a recording's folder")
-        self._reader = BagReader(Path(settings["bag"]).expanduser())
+        self._reader = BagReader(bag)
         self._info = self._reader.info
         recorded = {name: topic.msgtype for name, topic in self._info.topics.items()}
         chosen, left = chosen_topics(recorded, settings["topics"], settings["remap"])
@@ -85,19 +95,20 @@ class ReplayNode(HouseNode):
         for topic, name in chosen.items():
             self._topics.add(topic, name, recorded[topic])
         self._topics.skipped |= left
+        self._topics.require(settings["wait_for_subscribers"])
+        # A clock that nothing drives would hold up every node on simulated time.
         self._clock_out = self.add_output(
             Clock, CLOCK, QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
-        self._status = self.add_output(String, "~/status", qos.LATCHED)
-        self.add_service(Trigger, "~/play", self._play)
-        self.add_service(Trigger, "~/pause", self._pause)
         self.add_timer(TICK_S, self._tick, steady=True)
         self.add_timer(STATUS_S, self._report, steady=True)
+        self.add_timer(LOG_EVERY_S, self._tell_waiting, steady=True)
 
     def activate(self) -> None:
         """Begin at the start of the bag."""
         if self._reader is None or self._topics is None:
-            raise ValueError("activated before it was configured")
+            self._set_state(NO_BAG)
+            return
         self._messages: Iterator[BagMessage] = self._reader.messages(
             list(self._topics.played), raw=True
         )
@@ -127,10 +138,9 @@ class ReplayNode(HouseNode):
             return
         now = time.monotonic()
         if self._play_state == WAITING:
-            if now < self._begin or not topics.heard(self.settings["wait_for_subscribers"]):
+            if now < self._begin or topics.unheard(self.settings["wait_for_subscribers"]):
                 return
-            self._restart(now)
-            self._set_state(PLAYING)
+            self._start(now)
         if not self._settled(topics, now):
             return
         try:
@@ -175,8 +185,16 @@ class ReplayNode(HouseNode):
         self._unsettled_since = None
         return True
 
-    def _restart(self, now: float) -> None:
+    def _start(self, now: float) -> None:
         self._since, self._from_ns = now, self._position_ns
+        self._set_state(PLAYING)
+
+    def _tell_waiting(self) -> None:
+        if self._topics is None or self._play_state != WAITING:
+            return
+        missing = self._topics.unheard(self.settings["wait_for_subscribers"])
+        if missing:
+            self.get_logger().info(f"waiting for subscribers of {', '.join(missing)}")
 
     def _end(self, state: str) -> None:
         self._set_state(state)
@@ -193,11 +211,15 @@ class ReplayNode(HouseNode):
     # ---- services and status --------------------------------------------------------------------
 
     def _play(self, request: Any, response: Any) -> Any:
+        if self._topics is None:
+            raise InputError(GIVE_BAG)
         if self._play_state in (DONE, FAILED):
             raise ConflictError(f"the bag is {self._play_state}: activate the node anew to repeat")
         if self._play_state == PAUSED:
-            self._restart(time.monotonic())
-            self._set_state(PLAYING)
+            if self._topics.unheard(self.settings["wait_for_subscribers"]):
+                self._set_state(WAITING)
+            else:
+                self._start(time.monotonic())
         response.success, response.message = True, self._play_state
         return response
 
@@ -213,6 +235,7 @@ class ReplayNode(HouseNode):
 
     def _report(self) -> None:
         if self._topics is None:
+            self._status.publish(String(data=json.dumps({"state": self._play_state})))
             return
         self._topics.look()
         status = {

@@ -20,7 +20,7 @@ CLOCK = "/clock"
 
 @dataclass
 class Played:
-    """What became of one topic's messages."""
+    """What became of one topic's messages; ``unheard`` were sent while nobody subscribed."""
 
     topic: str
     publisher: Any
@@ -67,6 +67,7 @@ class ReplayTopics:
     def publish(self, topic: str, cdr: bytes) -> None:
         """Send a message; the caller calls ``settle`` before ``DEPTH`` of them are in flight."""
         played = self.played[topic]
+        played.unheard += not played.publisher.get_subscription_count()
         played.publisher.publish(cdr)
         played.sent += 1
         self._in_flight[topic] = self._in_flight.get(topic, 0) + 1
@@ -97,11 +98,30 @@ class ReplayTopics:
                 if info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
             }
 
-    def heard(self, names: Collection[str]) -> bool:
-        """Whether every one of these played names has a subscriber."""
-        played = self.played.values()
-        count = {p.publisher.topic_name: p.publisher.get_subscription_count() for p in played}
-        return all(count.get(self._node.resolve_topic_name(name), 0) > 0 for name in names)
+    def require(self, names: Collection[str]) -> None:
+        """Refuse names that are not played: their subscribers would be waited for in vain.
+
+        Raises
+        ------
+        InputError
+            A name is not the played name of any topic.
+        """
+        played = {p.publisher.topic_name for p in self.played.values()}
+        unknown = [name for name in names if self._node.resolve_topic_name(name) not in played]
+        if unknown:
+            raise InputError(
+                f"wait_for_subscribers names {', '.join(unknown)}, which is not played; played "
+                f"are {', '.join(sorted(played))}"
+            )
+
+    def unheard(self, names: Collection[str]) -> list[str]:
+        """Those of these played names that have no subscriber."""
+        heard = {
+            p.publisher.topic_name
+            for p in self.played.values()
+            if p.publisher.get_subscription_count()
+        }
+        return [name for name in names if self._node.resolve_topic_name(name) not in heard]
 
     def doubt(self) -> str:
         """Why messages may have been lost: not acknowledged, or sent to best-effort inputs."""
@@ -127,7 +147,7 @@ class ReplayTopics:
         played = sorted(self.played.values(), key=lambda p: p.topic)
         return {
             "sent": {p.topic: p.sent for p in played},
-            "unheard": [p.topic for p in played if not p.publisher.get_subscription_count()],
+            "unheard": {p.topic: p.unheard for p in played if p.unheard},
             "unacknowledged": self.unacknowledged,
             "best_effort": {
                 p.topic: sorted(set(p.untracked.values())) for p in played if p.untracked

@@ -189,3 +189,36 @@ def test_wrong_choices_are_named():
         chosen_topics(recorded, ["/b"], [])
     with pytest.raises(InputError, match="recorded:=played"):
         chosen_topics(recorded, [], ["/a=/b"])
+
+
+def test_without_a_bag_it_is_there_and_says_what_it_needs(graph):
+    process = graph.start("replay_node", {})
+    reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+    graph.spin_until(lambda: reports, "it is active")
+    assert json.loads(reports[-1].data)["state"] == "no bag"
+    answer = graph.call(Trigger, "/replay_node/play")
+    assert not answer.success
+    assert "parameter 'bag'" in answer.message
+    assert process.process.poll() is None
+
+
+def test_play_waits_for_its_subscribers_and_says_for_which(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 20, 1_000_000)
+    reports = graph.collect(String, "/replay_node/status", qos.LATCHED)
+    settings = {"bag": bag, "rate": 0.0, "start_paused": True, "wait_for_subscribers": "[note]"}
+    process = graph.start("replay_node", settings)
+    graph.spin_until(lambda: reports, "it is active")
+    assert graph.call(Trigger, "/replay_node/play").message == "waiting"
+    graph.spin_until(lambda: "subscribers of note" in process.output, "it says so")
+    notes = graph.collect(String, "/note", KEEP_ALL)
+    graph.spin_until(lambda: json.loads(reports[-1].data)["state"] == "done", "it plays")
+    graph.spin_until(lambda: len(notes) == 2, "nothing was sent before")
+    status = json.loads(reports[-1].data)
+    assert status["unheard"] == {"/joint_states": 20, "/odd": 1}
+
+
+def test_waiting_for_what_is_not_played_is_refused(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 10, 1_000_000)
+    process = graph.start("replay_node", {"bag": bag, "wait_for_subscribers": "[/nothing]"})
+    graph.spin_until(lambda: "cannot configure" in process.output, "it is refused")
+    assert "/nothing, which is not played" in process.output
