@@ -51,7 +51,8 @@ def sphere_cloud(
     cap = place(reach * sine * np.cos(turn), reach * sine * np.sin(turn), reach * cosine)
     angle = rng.uniform(-1.0, 1.0, stems)  # the stem: a cylinder of a quarter of the diameter
     stem = place(0.25 * r * np.sin(angle), rng.uniform(r, 3.0 * r, stems), 0.25 * r * np.cos(angle))
-    plane = place(*rng.uniform(-4.0 * r, 4.0 * r, (2, behind)), np.full(behind, -3.0 * r))
+    x, y = rng.uniform(-4.0 * r, 4.0 * r, (2, behind))
+    plane = place(x, y, np.full(behind, -3.0 * r))
     wild = centre + rng.uniform(-2.0 * r, 2.0 * r, (spikes, 3))
     cloud = np.vstack([cap, stem, plane, wild])
     return np.asarray(cloud[rng.permutation(len(cloud))])
