@@ -81,7 +81,7 @@ def calibrate_sensor(
         )
     if len(data.targets) > 1:
         raise TooFewSamplesError(
-            f"{len(data.targets)} targets ({", ".join(data.targets)}) in one visit: give one sphere"
+            f"{len(data.targets)} targets ({', '.join(data.targets)}) in one visit: give one sphere"
         )
     require_match(arm, data, base=True, tool=True)
     cell, covariance, rejected = _place(arm, data, method)
