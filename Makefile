@@ -76,9 +76,8 @@ $(STAMPS)/editable: $(STAMPS)/wheels $(PYTHON_FILES)
 	touch $@
 
 # Compiled kernels are kept beside their source; nodes start 1.5 s sooner with them.
-$(STAMPS)/kernels: $(STAMPS)/editable $(shell grep -rls '^from numba\|^import numba' robocal_ros)
-	@# Numba notices a change in a kernel's own file only, not in one that it was built from.
-	find robocal_ros -name '*.nb[ic]' -delete
+$(STAMPS)/kernels: $(STAMPS)/editable \
+		$(shell grep -rls --include='*.py' 'robocal_ros.core.compiled import' robocal_ros) tools/warm_kernels.py
 	$(VENV)/bin/python tools/warm_kernels.py
 	touch $@
 
