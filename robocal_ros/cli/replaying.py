@@ -127,8 +127,7 @@ def _commands(
     scout = _session(recording, arm, history)
     for sample in watch("looking for cycles", recording):
         feed(scout, sample, recording.inputs)
-    newest = max(scout.desk.newest_ns.values(), default=0)
-    observed = scout.desk.window(-1, newest, scout.desk.marks)
+    observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:
         raise InputError(
             f"no measurement at standstill in this recording{_ignored_words(scout)}",

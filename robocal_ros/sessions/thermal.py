@@ -119,7 +119,7 @@ class ThermalSession:
         a second after the newest of them), else the newest stamp known.
         """
         if command.stamp_ns is None:
-            newest = max(self.desk.newest_ns.values(), default=0)
+            newest = self.desk.clock_ns
             near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
             command = replace(command, stamp_ns=clock_ns if near else newest)
         if command.name == events.IDENTIFY and not command.arguments.get("cycle_id"):
@@ -192,6 +192,7 @@ class ThermalSession:
             return Outcome(command, error.code, str(error))
 
     def _window(self, command: Command) -> list[Observation]:
+        self.desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", self.desk.from_ns)) - 1
         found = self.desk.window(after, command.stamp_ns or 0, command.marks or {})
         last = int(command.arguments.get("samples", 0))

@@ -1,6 +1,7 @@
 """The thermal session: what it proposes, and that only stamps and commands decide it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -286,3 +287,29 @@ def test_what_was_rolled_back_teaches_nothing(nominal, tmp_path):
         assert expected_drift(nominal, history, config)[0, 0] > 2.0 * before[0, 0]
         history.rollback(None, by="", reason="wrong", wall_ns=3)
         np.testing.assert_array_equal(expected_drift(nominal, history, config), before)
+
+
+@pytest.mark.parametrize("wrong", [JointSample, PointSample])
+def test_one_stamp_from_the_future_changes_no_bit_of_a_cycle(
+    nominal, visits, expected, tmp_path, wrong
+):
+    """Nor does it stamp the commands, which would blind the session for an hour."""
+    first, second, tail = visits
+    session = session_in(tmp_path, nominal)
+    todo = {
+        id(second[0]): Command(events.CAPTURE_REFERENCE, {"by": "test"}),
+        id(tail[0]): Command(events.IDENTIFY, {"cycle_id": "warm"}),
+    }
+    outliers = [id(of_kind(part, wrong)[3]) for part in (first, second)]
+    outcomes = []
+    for sample in [*first, *second, *tail]:
+        if id(sample) in todo:
+            session.submit(todo[id(sample)])
+        if id(sample) in outliers:
+            session.add(replace(sample, stamp_ns=sample.stamp_ns + 3600 * NS))
+        session.add(sample)
+        outcomes += session.advance(wall_ns=7)
+    assert [o.status for o in outcomes] == [Code.ACCEPT, Code.ACCEPT]
+    assert [digest(o.document) for o in outcomes] == expected[0]
+    kind = JOINTS if wrong is JointSample else POINT
+    assert session.desk.ignored[kind].total() == 2
