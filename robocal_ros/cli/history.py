@@ -32,18 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
         action = actions.add_parser(name, help=words, description=words)
-        action.add_argument(
-            "--robot-serial",
-            type=text,
-            metavar="S",
-            help="robot serial; may be left out where only one robot has a history",
-        )
-        action.add_argument(
-            "--state",
-            type=Path,
-            metavar="DIR",
-            help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-        )
+        _add_history(action)
         return action
 
     listing = add("list", "the latest calibrations, newest first")
@@ -69,6 +58,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
         if name == "rollback":
             _add_rollback_target(action)
+
+
+def _add_history(action: argparse.ArgumentParser) -> None:
+    action.add_argument(
+        "--robot-serial",
+        type=text,
+        metavar="S",
+        help="robot serial; may be left out where only one robot has a history",
+    )
+    action.add_argument(
+        "--state",
+        type=Path,
+        metavar="DIR",
+        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
+    )
 
 
 def _add_rollback_target(action: argparse.ArgumentParser) -> None:

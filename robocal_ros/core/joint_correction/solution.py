@@ -134,6 +134,17 @@ def _add_step(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
 
 
 @kernel
+def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bool:
+    """Joints ``q + x``; where that is no solution within reach, the point stays as it came."""
+    n = q.shape[0]
+    for i in range(n):
+        converged = converged and abs(x[i]) <= MOST_OVER * largest[i]
+    for i in range(n):
+        out[i] = q[i] + x[i] if converged else q[i]
+    return converged
+
+
+@kernel
 def _newton(
     q: Array,
     links: Array,
@@ -175,13 +186,9 @@ def _newton(
         if converged or (iterations > 1 and k.largest_of(step) <= SMALL_STEP):
             _add_step(J, L, e, x, step)
             converged = True
-    for i in range(n):
-        converged = converged and abs(x[i]) <= MOST_OVER * largest[i]
-    for i in range(n):
-        # never a half-solved pose: such a point stays as it came
-        out[i] = q[i] + x[i] if converged else q[i]
-    out[n + ITERATIONS], out[n + CONVERGED] = iterations, converged
-    out[n + SHARE] = share if converged else 0.0
+    out[n + CONVERGED] = _take(q, x, largest, converged, out)
+    out[n + ITERATIONS] = iterations
+    out[n + SHARE] = share if out[n + CONVERGED] else 0.0
 
 
 @kernel
