@@ -129,25 +129,15 @@ def _commands(
         feed(scout, sample, recording.inputs)
     observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:
-        raise InputError(
-            f"no measurement at standstill in this recording{_ignored_words(scout)}",
-            file=str(request.bag),
-        )
+        lost = scout.desk.ignored.words()
+        words = "no measurement at standstill in this recording" + (f"; {lost}" if lost else "")
+        raise InputError(words, file=str(request.bag))
     return automatic_commands(observed)
 
 
 def _stamps(window: Window, recording: Recording) -> tuple[int, int]:
     start, end = (recording.start_ns + round(t * 1e9) for t in window)
     return start, end
-
-
-def _ignored_words(session: ThermalSession) -> str:
-    worst = [
-        f"{topic}: {reason} ({count} times)"
-        for topic, reasons in session.desk.ignored.items()
-        for reason, count in reasons.most_common(1)
-    ]
-    return f"; ignored: {'; '.join(worst)}" if worst else ""
 
 
 def _document(report: ReplayReport, session: ThermalSession, recording: Recording) -> Document:

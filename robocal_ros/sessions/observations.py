@@ -1,6 +1,5 @@
 """Measurements paired with the joints of the same instant, whatever order they arrive in."""
 
-import re
 from bisect import bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
 from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
+from robocal_ros.sessions.ignored import Ignored
 
 Array = NDArray[np.float64]
 
@@ -22,10 +22,8 @@ JUMPS = "clock_jumps"
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
 MOST_KEPT = 20000  # observations that no command has used
-MOST_REASONS = 30
 LEAD_NS = 1_000_000_000  # a topic is at most so far ahead of another where the clock jumps
 FAR_AHEAD_NS = 60_000_000_000  # a measurement stamped so much after the joints is an error
-_NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +72,7 @@ class ObservationDesk:
     used_ns: int = -1
     jumps: int = 0
     received: Counter[str] = field(default_factory=Counter)
-    ignored: dict[str, Counter[str]] = field(default_factory=dict)
+    ignored: Ignored = field(default_factory=Ignored)
     _complete_ns: int | None = None
     _left_ns: int | None = None
     _behind: deque[tuple[int, PointSample | PoseSample]] = field(
@@ -105,27 +103,37 @@ class ObservationDesk:
         """How far the samples have come: newest stamp of each topic, and jumps of the clock."""
         return self.newest_ns | {JUMPS: self.jumps}
 
-    def ignore(self, topic: str, reason: str, count: int = 1) -> None:
-        """Count samples that are not used; numbers in the reason do not tell reasons apart."""
-        counter = self.ignored.setdefault(topic, Counter())
-        reason = _NUMBER.sub("#", reason)
-        counter[reason if reason in counter or len(counter) < MOST_REASONS else "other"] += count
+    def why_nothing(self) -> str:
+        """Say why a window holds no observation."""
+        had_joints = self.received[JOINTS] or JOINTS in self.ignored
+        had_others = {POINT, POSE} & (self.received.keys() | self.ignored.keys())
+        if not had_joints:
+            words = f"no joint states received: does the robot's driver publish {JOINTS}?"
+        elif JOINTS not in self.newest_ns:
+            words = "no joint state could be used"
+        elif not had_others:
+            words = f"no measurement received: does the sensor publish {POINT} or {POSE}?"
+        else:
+            words = "no measurement with the robot at standstill since the last command"
+        waiting = len(self._pending)
+        parts = [words, f"{waiting} wait for later joint states" if waiting else ""]
+        return "; ".join(part for part in (*parts, self.ignored.words()) if part)
 
     def add_joints(self, sample: JointSample) -> None:
         """Take a joint reading; a clock that jumps back begins everything anew."""
         self.received[JOINTS] += 1
         if sample.stamp_ns <= 0:
-            self.ignore(JOINTS, "no time stamp")
+            self.ignored.add(JOINTS, "no time stamp")
             return
         left = self.stream.newest_ns
         try:
             added = self.stream.add(sample, int(self.rule.gap_s * 1e9))
         except InputError as error:
-            self.ignore(JOINTS, str(error))
+            self.ignored.add(JOINTS, str(error))
             return
         if added.lone_ns is not None:
             away = "" if left is None else f", {(added.lone_ns - left) * 1e-9:.3f} s off"
-            self.ignore(JOINTS, f"a stamp that no other reading follows{away}")
+            self.ignored.add(JOINTS, f"a stamp that no other reading follows{away}")
         if added.began_ns is not None:
             self._begin(added.began_ns, left)
         if self.stream.newest_ns is not None:
@@ -150,7 +158,7 @@ class ObservationDesk:
         known = {id(sample) for sample in early}
         lost = [o.source for o in self._observed if id(o.source) not in known] + self._pending
         for topic, count in Counter(map(_topic, lost)).items():
-            self.ignore(topic, "the clock jumped back", count)
+            self.ignored.add(topic, "the clock jumped back", count)
         self._observed.clear()
         self._behind.clear()
         self.newest_ns.clear()
@@ -163,13 +171,13 @@ class ObservationDesk:
         topic = _topic(sample)
         self.received[topic] += 1
         if sample.stamp_ns <= 0:
-            self.ignore(topic, "no time stamp")
+            self.ignored.add(topic, "no time stamp")
             return
         if self.frame is not None and sample.frame != self.frame:
             self._ignore_frame(topic, sample.frame)
             return
         if self._of_the_clock_left(sample.stamp_ns):
-            self.ignore(topic, "the clock jumped back")
+            self.ignored.add(topic, "the clock jumped back")
             return
         newest = self.newest_ns.get(JOINTS)
         if newest is not None and sample.stamp_ns < newest - LEAD_NS:
@@ -178,7 +186,7 @@ class ObservationDesk:
             insort(self._pending, sample, key=lambda waiting: waiting.stamp_ns)
         if len(self._pending) > MOST_WAITING:
             # The latest: one stamped far ahead must not displace those whose joints come next.
-            self.ignore(_topic(self._pending.pop()), "no joint readings came")
+            self.ignored.add(_topic(self._pending.pop()), "no joint readings came")
 
     def _of_the_clock_left(self, stamp_ns: int) -> bool:
         """Whether a late stamp is from just before the clock jumped back."""
@@ -188,7 +196,7 @@ class ObservationDesk:
         return abs(stamp_ns - left) <= LEAD_NS
 
     def _ignore_frame(self, topic: str, frame: str) -> None:
-        self.ignore(topic, f"frame '{frame}' is not the measuring frame '{self.frame}'")
+        self.ignored.add(topic, f"frame '{frame}' is not the measuring frame '{self.frame}'")
 
     def _pair(self, sample: PointSample | PoseSample) -> bool:
         """Settle a measurement; False while its joints are to come."""
@@ -197,7 +205,7 @@ class ObservationDesk:
             reading = self.stream.standstill(sample.stamp_ns, self.rule)
         except NotStillError as error:
             self._came(topic, sample.stamp_ns)
-            self.ignore(topic, str(error))
+            self.ignored.add(topic, str(error))
             return True
         if reading is None:
             return False
@@ -214,7 +222,7 @@ class ObservationDesk:
             )
         )  # fmt: skip
         if len(self._observed) > MOST_KEPT:
-            self.ignore(self._observed.pop(0).topic, "no command used it")
+            self.ignored.add(self._observed.pop(0).topic, "no command used it")
         return True
 
     def _came(self, topic: str, stamp_ns: int) -> None:
@@ -228,7 +236,9 @@ class ObservationDesk:
             if ahead_ns < FAR_AHEAD_NS:
                 return
             topic = _topic(self._pending.pop())
-            self.ignore(topic, f"stamped {ahead_ns * 1e-9:.0f} s after the newest joint reading")
+            self.ignored.add(
+                topic, f"stamped {ahead_ns * 1e-9:.0f} s after the newest joint reading"
+            )
 
     def window(self, after_ns: int, until_ns: int, marks: Mapping[str, int]) -> list[Observation]:
         """Observations with ``after_ns < stamp <= until_ns`` made of samples up to ``marks``.

@@ -5,10 +5,10 @@ import pytest
 
 from robocal_ros.core.samples import JointSample, PointSample, PoseSample
 from robocal_ros.core.streams import JointStream, Reading, StandstillRule
+from robocal_ros.sessions.ignored import MOST_REASONS
 from robocal_ros.sessions.observations import (
     JOINTS,
     JUMPS,
-    MOST_REASONS,
     MOST_WAITING,
     POINT,
     POSE,
@@ -214,7 +214,7 @@ def test_nothing_grows_without_bound():
         d.add_measurement(point(ms))
     assert d.ignored[POINT] == {"no joint readings came": 10}
     for number in range(3 * MOST_REASONS):
-        d.ignore(POSE, f"frame 'f{number}' is unknown")
+        d.ignored.add(POSE, f"frame 'f{number}' is unknown")
     assert len(d.ignored[POSE]) == MOST_REASONS + 1
     assert sum(d.ignored[POSE].values()) == 3 * MOST_REASONS
 
