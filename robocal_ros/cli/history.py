@@ -14,6 +14,7 @@ from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.parsing import count, text
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import THERMAL, Decision, Entry
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from robocal_ros.storage.calibrations import CalibrationHistory
@@ -254,5 +255,5 @@ def _target(value: str) -> int | None:
         return count(value)
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(
-            f"{value!r} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
+            f"{quoted(value)} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
         ) from error
