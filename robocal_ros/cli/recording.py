@@ -31,7 +31,14 @@ class Recording:
     configured: Command | None
     commands: list[tuple[Command, dict[str, Any]]]
     start_ns: int
-    warnings: tuple[str, ...]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is wrong with the bag, as far as it was read, and what it lacks."""
+        info = self.reader.info
+        lacking = not {POINT, POSE} & set(self.inputs.values())
+        words = f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}"
+        return [*info.notes, words] if lacking else list(info.notes)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -64,10 +71,7 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
     inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
     start_ns = _first_joint_stamp(reader, inputs)
     configured, commands = _events(reader, event_topic, start_ns)
-    warnings = list(info.notes)
-    if not {POINT, POSE} & set(inputs.values()):
-        warnings.append(f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}")
-    return Recording(reader, inputs, configured, commands, start_ns, tuple(warnings))
+    return Recording(reader, inputs, configured, commands, start_ns)
 
 
 def _has(topics: Mapping[str, Any]) -> str:

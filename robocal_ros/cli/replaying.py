@@ -146,7 +146,7 @@ def _document(report: ReplayReport, session: ThermalSession, recording: Recordin
     head = session.in_force
     topic = {kind: name for name, kind in recording.inputs.items()}
     ignored = {topic.get(kind, kind): dict(why) for kind, why in session.desk.ignored.items()}
-    stream = session.desk.stream
+    stream, damaged = session.desk.stream, recording.reader.info.lost
     return _failure(report, made) | {
         "robot": session.nominal.name,
         "model_hash": session.nominal.model_hash,
@@ -161,10 +161,14 @@ def _document(report: ReplayReport, session: ThermalSession, recording: Recordin
         "final_model": model_document(session.arm) | {"revision": head.revision},
         "ignored": {name: sum(why.values()) for name, why in ignored.items()},
         "ignored_reasons": ignored,
-        "gaps": {"count": stream.gap_count, "longest_s": stream.longest_gap_ns * 1e-9},
+        "gaps": {
+            "count": stream.gap_count,
+            "longest_s": stream.longest_gap_ns * 1e-9,
+            "damaged": [{"from_ns": part.from_ns, "to_ns": part.to_ns} for part in damaged],
+        },
         "commands": [_command(outcome) for outcome in report.outcomes],
         "differs": report.differs,
-        "warnings": list(recording.warnings),
+        "warnings": recording.warnings,
     }
 
 

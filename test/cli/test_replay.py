@@ -307,6 +307,25 @@ class TestDamage:
         assert whole["warnings"] == []
         assert any(str(path) in words for words in document["warnings"])
 
+    def test_a_damaged_chunk_is_a_gap(self, folder, visits, replay) -> None:
+        """It lies where the robot only stands: every figure is that of the whole bag."""
+        path = long_bag(folder / "damaged.mcap", visits[:3], 20_000)
+        _, whole = replay(path, "--robot", ROBOT, "--auto")
+        content = bytearray(path.read_bytes())
+        content[int(0.7 * len(content))] ^= 0x10
+        path.write_bytes(content)
+        status, document = replay(path, "--robot", ROBOT, "--auto")
+        assert status == 0
+        assert document["candidates"] == whole["candidates"]
+        assert whole["gaps"]["damaged"] == []
+        (gap,) = document["gaps"]["damaged"]
+        end_ns = visits[2][-1].stamp_ns
+        assert end_ns < gap["from_ns"] < gap["to_ns"] < end_ns + 200 * NS
+        assert document["gaps"]["count"] == whole["gaps"]["count"] + 1
+        assert document["gaps"]["longest_s"] > (gap["to_ns"] - gap["from_ns"]) * 1e-9
+        (words,) = document["warnings"]
+        assert f"{path}: a damaged chunk is left out" in words
+
     @pytest.mark.parametrize(
         ("content", "words"),
         [(b"", "empty"), (b"not a bag at all, but text", "not an MCAP"), (None, "no such bag")],
