@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from typing import Any
 
 from robocal_ros.core.errors import InputError
@@ -111,7 +112,11 @@ def _first_joint_stamp(reader: BagReader, inputs: Mapping[str, str]) -> int:
             f"no joint states; {_has(reader.info.topics)}; choose with --topic {JOINTS}:=TOPIC",
             file=reader.info.path,
         )
-    first = next(iter(reader.messages(topics)), None)
+    stamps = (stamp_ns(recorded.message.header.stamp) for recorded in reader.messages(topics))
+    first = next(stamps, None)
     if first is None:
         raise InputError(f"topic {topics[0]} has no messages", file=reader.info.path)
-    return stamp_ns(first.message.header.stamp)
+    for stamp, following in pairwise(chain([first], stamps)):
+        if following > stamp:  # as the session, which believes no stamp that none goes on from
+            return stamp
+    return first

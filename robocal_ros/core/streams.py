@@ -54,6 +54,17 @@ class NotStillError(InputError):
     """The joints cannot be given at that instant; the message says why."""
 
 
+def _goes_on(stamp_ns: int, held_ns: int, newest_ns: int | None, near_ns: int) -> bool:
+    """Whether a stamp goes on from one that leapt, and not from the newest before the leap."""
+    if stamp_ns <= held_ns:
+        return False
+    if newest_ns is None or held_ns > newest_ns:
+        return True
+    if stamp_ns > newest_ns:
+        return False
+    return stamp_ns - held_ns <= near_ns or newest_ns - stamp_ns >= CLOCK_JUMP_NS
+
+
 class JointStream:
     """The latest joint readings of one arm, in its joint order, oldest first.
 
@@ -80,9 +91,9 @@ class JointStream:
         """Append a reading; joints may come in any order and beside others.
 
         A leap of the stamps, back by a second or more or ahead by more than that and ``gap_ns``,
-        is believed when a second reading follows the first from there: one wrong stamp must not
-        move the clock. So is the beginning. A leap ahead is a pause; a leap back starts the
-        stream anew. Pauses longer than ``gap_ns`` are counted.
+        is believed when the next reading goes on from there: one wrong stamp must not move the
+        clock. So is the beginning. A leap ahead is a pause; a leap back starts the stream anew.
+        Pauses longer than ``gap_ns`` are counted.
 
         Raises
         ------
@@ -92,26 +103,24 @@ class JointStream:
         order = self._order.get(sample.names)
         if order is None:
             order = self._order[sample.names] = self._column_order(sample.names)
-        near_ns = max(CLOCK_JUMP_NS, gap_ns)
-        reading = sample.stamp_ns, sample.position[order]
+        stamp_ns, near_ns = sample.stamp_ns, max(CLOCK_JUMP_NS, gap_ns)
         held, newest = self._held, self.newest_ns
-        lone_ns = None if held is None else held[0]
-        if newest is not None and 0 < sample.stamp_ns - newest <= near_ns:
-            self._held = None
-            self._append(reading, gap_ns)
-            return Added(lone_ns=lone_ns)
-        if held is not None and 0 < sample.stamp_ns - held[0] <= near_ns:
-            self._held = None
-            began = newest is None or held[0] < newest
-            if began:
-                self._size = 0
+        began_ns = lone_ns = None
+        if held is not None and _goes_on(stamp_ns, held[0], newest, near_ns):
+            if newest is None or held[0] < newest:
+                self._size, began_ns = 0, held[0]
             self._append(held, gap_ns)
+            newest = held[0]
+        elif newest is not None and -CLOCK_JUMP_NS < stamp_ns - newest <= 0:
+            raise InputError(f"joint state at {stamp_ns} ns is not after {newest} ns")
+        elif held is not None:
+            lone_ns = held[0]
+        reading = stamp_ns, sample.position[order]
+        leaps = newest is None or not 0 < stamp_ns - newest <= near_ns
+        self._held = reading if leaps else None
+        if not leaps:
             self._append(reading, gap_ns)
-            return Added(began_ns=held[0] if began else None)
-        if newest is not None and -CLOCK_JUMP_NS < sample.stamp_ns - newest <= 0:
-            raise InputError(f"joint state at {sample.stamp_ns} ns is not after {newest} ns")
-        self._held = reading
-        return Added(lone_ns=lone_ns)
+        return Added(began_ns, lone_ns)
 
     def _append(self, reading: tuple[int, Array], gap_ns: int) -> None:
         """Append a reading, and count the pause before it."""

@@ -167,7 +167,11 @@ class ThermalNode(HouseNode):
     # ---- outputs --------------------------------------------------------------------------------
 
     def _show(self, outcome: Outcome) -> None:
-        self.get_logger().info(f"{outcome.command.name}: {outcome.status.name} {outcome.message}")
+        words = f"{outcome.command.name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
         try:
             self._publish_event(outcome.command, outcome)
             if outcome.command.name == IDENTIFY:

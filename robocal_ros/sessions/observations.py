@@ -133,7 +133,7 @@ class ObservationDesk:
             return
         if added.lone_ns is not None:
             away = "" if left is None else f", {(added.lone_ns - left) * 1e-9:.3f} s off"
-            self.ignored.add(JOINTS, f"a stamp that no other reading follows{away}")
+            self.ignored.add(JOINTS, f"a stamp that no reading goes on from{away}")
         if added.began_ns is not None:
             self._begin(added.began_ns, left)
         if self.stream.newest_ns is not None:

@@ -134,3 +134,24 @@ def test_a_short_jump_back_at_a_low_rate_is_believed():
     stream = JointStream(("a", "b"))
     fill(stream, [*range(1000, 3001, 100), 1950, 2050])
     assert stream.newest_ns == 2050 * MS
+
+
+def test_readings_minutes_apart_are_all_taken():
+    """A recorder may keep readings only about the measurements, and few between them."""
+    stream = JointStream(("a", "b"))
+    fill(stream, [*range(0, 600_000, 60_000), *range(600_000, 601_001, 50)])
+    assert stream.newest_ns == 601_000 * MS
+    assert stream.gap_count == 10
+    assert stream.standstill(600_500 * MS, RULE) is not None
+    fill(stream, [*range(60_000, 300_000, 60_000)])  # and the same again
+    assert stream.newest_ns == 180_000 * MS  # the last is believed by the next
+
+
+def test_a_wrong_stamp_among_readings_minutes_apart_is_told():
+    stream = JointStream(("a", "b"))
+    told = [
+        stream.add(JointSample(ms * MS, ("a", "b"), np.zeros(2)), 150 * MS).lone_ns
+        for ms in (60_000, 120_000, 9_000_000, 180_000, 240_000)
+    ]
+    assert told == [None, None, None, 9_000_000 * MS, None]
+    assert stream.newest_ns == 180_000 * MS

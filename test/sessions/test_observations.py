@@ -257,7 +257,7 @@ def test_one_wrong_joint_stamp_costs_that_reading_only(off_ms):
     assert [o.stamp_ns // MS for o in everything(d)] == [2500, 3500]
     assert d.marks == {JOINTS: 4000 * MS, POINT: 3500 * MS, JUMPS: 0}
     assert d.from_ns == 2300 * MS + 1
-    assert d.ignored == {JOINTS: {"a stamp that no other reading follows, # s off": 1}}
+    assert d.ignored == {JOINTS: {"a stamp that no reading goes on from, # s off": 1}}
 
 
 def test_a_wrong_first_joint_stamp_begins_nothing():
