@@ -1,4 +1,4 @@
-# make demo | test | bench | lint | test-floor: each does all the set-up that it needs.
+# make demo | test | bench | soak | lint | test-floor: each does all the set-up that it needs.
 # A step's stamp is written only after the step succeeded; an interrupted one is simply done again.
 
 SHELL := /bin/bash
@@ -24,7 +24,7 @@ $(shell rm -rf $(VENV) $(VENV)-* build install log)
 endif
 endif
 
-.PHONY: help demo test bench figures lint test-floor setup clean
+.PHONY: help demo test bench figures soak lint test-floor setup clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 14
@@ -40,6 +40,9 @@ bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed besid
 
 figures: setup $(VENV)-bench/.stamp  ## bench, kept as the figures of docs/
 	$(ROS) $(VENV)-bench/bin/python -m bench --keep
+
+soak: setup  ## hours: kills, random work, a live graph under load, more simulated robots
+	$(ROS) python -m bench.soak $(SOAK)
 
 lint: setup-python  ## style and strict types
 	$(VENV)/bin/ruff check .
@@ -76,9 +79,8 @@ $(STAMPS)/editable: $(STAMPS)/wheels $(PYTHON_FILES)
 	touch $@
 
 # Compiled kernels are kept beside their source; nodes start 1.5 s sooner with them.
-$(STAMPS)/kernels: $(STAMPS)/editable $(shell grep -rls '^from numba\|^import numba' robocal_ros)
-	@# Numba notices a change in a kernel's own file only, not in one that it was built from.
-	find robocal_ros -name '*.nb[ic]' -delete
+$(STAMPS)/kernels: $(STAMPS)/editable \
+		$(shell grep -rls --include='*.py' 'robocal_ros.core.compiled import' robocal_ros) tools/warm_kernels.py
 	$(VENV)/bin/python tools/warm_kernels.py
 	touch $@
 

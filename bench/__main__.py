@@ -53,7 +53,8 @@ def _commit() -> str:
     return (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
 
 
-def _about(seconds: float) -> dict[str, str]:
+def about(seconds: float) -> dict[str, str]:
+    """Where and when figures were made."""
     import numpy
     import scipy
 
@@ -101,9 +102,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         show(made)
         tables += made
     if not chosen:
-        about = _about(time.monotonic() - start)
+        made_by = about(time.monotonic() - start)
         for folder in (OUT, KEPT) if given.keep else (OUT,):
-            _write(folder, tables, about)
+            _write(folder, tables, made_by)
             print(f"written: {folder / 'bench_core.json'}, {folder / 'bench_core.md'}")
     missed += [table.title for table in tables if not table.met]
     for title in missed:

@@ -1,8 +1,14 @@
 """The package says the same of itself in every place."""
 
+import os
 import re
+import subprocess
+import sys
+from importlib import metadata
 from pathlib import Path
 from xml.etree import ElementTree
+
+import pytest
 
 import robocal_ros
 from robocal_ros.core.codes import Code
@@ -29,3 +35,21 @@ def test_every_interface_is_built() -> None:
     folders = (ROOT / "msg_defs" / "msg", ROOT / "msg_defs" / "srv")
     present = {f"{folder.name}/{path.name}" for folder in folders for path in folder.iterdir()}
     assert built == present
+
+
+def test_a_folder_called_like_the_package_does_not_hide_it(tmp_path: Path) -> None:
+    """As beside a clone: git names its folder robocal_ros too."""
+    try:
+        metadata.distribution("robocal-ros")
+    except metadata.PackageNotFoundError:
+        pytest.skip("robocal_ros is not installed here")
+    (tmp_path / "robocal_ros" / "robocal_ros").mkdir(parents=True)
+    found = subprocess.run(
+        [sys.executable, "-c", "import robocal_ros; print(robocal_ros.__version__)"],
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (found.stdout.strip(), found.stderr) == (robocal_ros.__version__, "")

@@ -5,6 +5,8 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from robocal_ros.storage.files import quoted
+
 if TYPE_CHECKING:
     from robocal_ros.storage.robots import RobotDescription
 
@@ -23,9 +25,9 @@ def parts(value: str) -> tuple[str, ...]:
     names = [name.strip() for name in value.split(",")]
     for name in names:
         if name not in PARTS:
-            raise argparse.ArgumentTypeError(f"'{name}' is not one of {', '.join(PARTS)}")
+            raise argparse.ArgumentTypeError(f"{quoted(name)} is not one of {', '.join(PARTS)}")
     if len(set(names)) != len(names):
-        raise argparse.ArgumentTypeError(f"'{value}' names a part twice")
+        raise argparse.ArgumentTypeError(f"{quoted(value)} names a part twice")
     return tuple(name for name in PARTS if name in names)
 
 
@@ -42,7 +44,7 @@ def share(value: str) -> float:
     except ValueError:
         number = 0.0
     if not 0.0 < number < 1.0:
-        raise argparse.ArgumentTypeError(f"'{value}' is not a share between 0 and 1")
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a share between 0 and 1")
     return number
 
 
@@ -55,7 +57,7 @@ def seed(value: str) -> int:
         For anything else.
     """
     if not (value.isascii() and value.isdigit()):
-        raise argparse.ArgumentTypeError(f"'{value}' is not a whole number from 0")
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a whole number from 0")
     return int(value)
 
 

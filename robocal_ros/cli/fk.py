@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -87,19 +88,19 @@ def _value(cell: str, unit: str, option: str, arm: "SerialArm", joint: int) -> f
     except ValueError:
         number, given = float("nan"), ""
     if number != number or abs(number) == float("inf"):
-        raise InputError(f"{option}: '{cell.strip()}' of joint {joint + 1} is not a number")
+        raise InputError(f"{option}: {quoted(cell)} of joint {joint + 1} is not a number")
     if unit and given:
-        raise InputError(f"{option}: '{cell.strip()}' has a unit; use --joints for values with one")
+        raise InputError(f"{option}: {quoted(cell)} has a unit; use --joints for values with one")
     if not unit and given not in units:
         kind = "prismatic" if arm.prismatic[joint] else "revolute"
         raise InputError(
-            f"{option}: '{cell.strip()}' needs the unit {' or '.join(units)}; joint {joint + 1} "
+            f"{option}: {quoted(cell)} needs the unit {' or '.join(units)}; joint {joint + 1} "
             f"of {arm.name} is {kind}"
         )
     value = number * _TO_SI[unit or given]
     if not arm.prismatic[joint] and abs(value) > _MOST_DEG * _TO_SI["deg"]:
         raise InputError(
-            f"{option}: '{cell.strip()}' of joint {joint + 1} is beyond {_MOST_DEG:g} deg; no "
+            f"{option}: {quoted(cell)} of joint {joint + 1} is beyond {_MOST_DEG:g} deg; no "
             "joint turns that far"
         )
     return value

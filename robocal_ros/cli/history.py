@@ -14,6 +14,7 @@ from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.parsing import count, text
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import THERMAL, Decision, Entry
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from robocal_ros.storage.calibrations import CalibrationHistory
@@ -32,18 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
         action = actions.add_parser(name, help=words, description=words)
-        action.add_argument(
-            "--robot-serial",
-            type=text,
-            metavar="S",
-            help="robot serial; may be left out where only one robot has a history",
-        )
-        action.add_argument(
-            "--state",
-            type=Path,
-            metavar="DIR",
-            help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-        )
+        _add_history(action)
         return action
 
     listing = add("list", "the latest calibrations, newest first")
@@ -69,6 +59,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
         if name == "rollback":
             _add_rollback_target(action)
+
+
+def _add_history(action: argparse.ArgumentParser) -> None:
+    action.add_argument(
+        "--robot-serial",
+        type=text,
+        metavar="S",
+        help="robot serial; may be left out where only one robot has a history",
+    )
+    action.add_argument(
+        "--state",
+        type=Path,
+        metavar="DIR",
+        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
+    )
 
 
 def _add_rollback_target(action: argparse.ArgumentParser) -> None:
@@ -250,5 +255,5 @@ def _target(value: str) -> int | None:
         return count(value)
     except argparse.ArgumentTypeError as error:
         raise argparse.ArgumentTypeError(
-            f"{value!r} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
+            f"{quoted(value)} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
         ) from error

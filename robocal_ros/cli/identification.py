@@ -19,6 +19,7 @@ from robocal_ros.core.identification import (
 from robocal_ros.core.identification.mismatch import explain_mismatch, require_match
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
+from robocal_ros.storage.files import quoted
 from robocal_ros.storage.tables import beyond_limits, read_measurements
 
 Document = dict[str, Any]
@@ -145,7 +146,7 @@ def _require_known_targets(train: Measurements, check: Measurements, request: Re
     unknown = [name for name in check.targets if name not in train.targets]
     if unknown and "tool" not in request.check_refit:
         raise InputError(
-            f"target '{unknown[0]}' is not in {request.data_file} (it has "
+            f"target {quoted(unknown[0])} is not in {request.data_file} (it has "
             f"{', '.join(train.targets)}): use the same name, or --check-refit tool (or "
             "base,tool) to place it anew from the check data",
             file=str(request.check_file),

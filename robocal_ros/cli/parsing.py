@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.files import quoted
 
 _NEGATIVE = re.compile(r"-\.?\d")
 
@@ -95,7 +96,7 @@ def count(value: str) -> int:
         It is none.
     """
     if not value.isdecimal() or int(value) < 1:
-        raise argparse.ArgumentTypeError(f"{value!r} is not a whole number from 1")
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a whole number from 1")
     return int(value)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from typing import Any
 
 from robocal_ros.core.errors import InputError
@@ -31,7 +32,14 @@ class Recording:
     configured: Command | None
     commands: list[tuple[Command, dict[str, Any]]]
     start_ns: int
-    warnings: tuple[str, ...]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is wrong with the bag, as far as it was read, and what it lacks."""
+        info = self.reader.info
+        lacking = not {POINT, POSE} & set(self.inputs.values())
+        words = f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}"
+        return [*info.notes, words] if lacking else list(info.notes)
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -64,10 +72,7 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
     inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
     start_ns = _first_joint_stamp(reader, inputs)
     configured, commands = _events(reader, event_topic, start_ns)
-    warnings = list(info.notes)
-    if not {POINT, POSE} & set(inputs.values()):
-        warnings.append(f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}")
-    return Recording(reader, inputs, configured, commands, start_ns, tuple(warnings))
+    return Recording(reader, inputs, configured, commands, start_ns)
 
 
 def _has(topics: Mapping[str, Any]) -> str:
@@ -107,7 +112,11 @@ def _first_joint_stamp(reader: BagReader, inputs: Mapping[str, str]) -> int:
             f"no joint states; {_has(reader.info.topics)}; choose with --topic {JOINTS}:=TOPIC",
             file=reader.info.path,
         )
-    first = next(iter(reader.messages(topics)), None)
+    stamps = (stamp_ns(recorded.message.header.stamp) for recorded in reader.messages(topics))
+    first = next(stamps, None)
     if first is None:
         raise InputError(f"topic {topics[0]} has no messages", file=reader.info.path)
-    return stamp_ns(first.message.header.stamp)
+    for stamp, following in pairwise(chain([first], stamps)):
+        if following > stamp:  # as the session, which believes no stamp that none goes on from
+            return stamp
+    return first

@@ -127,13 +127,11 @@ def _commands(
     scout = _session(recording, arm, history)
     for sample in watch("looking for cycles", recording):
         feed(scout, sample, recording.inputs)
-    newest = max(scout.desk.newest_ns.values(), default=0)
-    observed = scout.desk.window(-1, newest, scout.desk.marks)
+    observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:
-        raise InputError(
-            f"no measurement at standstill in this recording{_ignored_words(scout)}",
-            file=str(request.bag),
-        )
+        lost = scout.desk.ignored.words()
+        words = "no measurement at standstill in this recording" + (f"; {lost}" if lost else "")
+        raise InputError(words, file=str(request.bag))
     return automatic_commands(observed)
 
 
@@ -142,22 +140,13 @@ def _stamps(window: Window, recording: Recording) -> tuple[int, int]:
     return start, end
 
 
-def _ignored_words(session: ThermalSession) -> str:
-    worst = [
-        f"{topic}: {reason} ({count} times)"
-        for topic, reasons in session.desk.ignored.items()
-        for reason, count in reasons.most_common(1)
-    ]
-    return f"; ignored: {'; '.join(worst)}" if worst else ""
-
-
 def _document(report: ReplayReport, session: ThermalSession, recording: Recording) -> Document:
     made = [outcome for outcome in report.outcomes if outcome.document is not None]
     place = {outcome.calibration_id: index for index, outcome in enumerate(made)}
     head = session.in_force
     topic = {kind: name for name, kind in recording.inputs.items()}
     ignored = {topic.get(kind, kind): dict(why) for kind, why in session.desk.ignored.items()}
-    stream = session.desk.stream
+    stream, damaged = session.desk.stream, recording.reader.info.lost
     return _failure(report, made) | {
         "robot": session.nominal.name,
         "model_hash": session.nominal.model_hash,
@@ -172,10 +161,14 @@ def _document(report: ReplayReport, session: ThermalSession, recording: Recordin
         "final_model": model_document(session.arm) | {"revision": head.revision},
         "ignored": {name: sum(why.values()) for name, why in ignored.items()},
         "ignored_reasons": ignored,
-        "gaps": {"count": stream.gap_count, "longest_s": stream.longest_gap_ns * 1e-9},
+        "gaps": {
+            "count": stream.gap_count,
+            "longest_s": stream.longest_gap_ns * 1e-9,
+            "damaged": [{"from_ns": part.from_ns, "to_ns": part.to_ns} for part in damaged],
+        },
         "commands": [_command(outcome) for outcome in report.outcomes],
         "differs": report.differs,
-        "warnings": list(recording.warnings),
+        "warnings": recording.warnings,
     }
 
 

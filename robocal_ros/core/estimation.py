@@ -81,14 +81,12 @@ def solve(
         When the residuals at the start are not finite.
     """
     residual, jacobian = problem.linearise(start)
-    m, c, k = jacobian.shape
+    k = jacobian.shape[2]
     if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
         raise ValueError("the residuals at the start are not finite")
     flat = prior_information is None
     if flat:
-        if m * c < k:
-            raise TooFewSamplesError(f"{m} samples give {m * c} equations for {k} unknowns")
-        _require_full_rank(observability(jacobian.reshape(-1, k)), problem.names)
+        _require_enough(jacobian, problem.names)
     prior = np.zeros((k, k)) if prior_information is None else prior_information
     descent = Descent(problem, prior, 0 if noise_known else problem.scale_components)
     run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
@@ -99,12 +97,7 @@ def solve(
     scale = descent.final_scale(run.residual, keep, information)
     covariance = descent.posterior(information, scale)
     if not np.all(np.diag(covariance) > 0.0):
-        words = [describe(column, problem.names) for column in seen.null.T]
-        raise RankDeficientError(
-            f"the data determine {seen.rank} of {k} unknowns, and the prior not the rest: measure "
-            "at more and different poses",
-            words,
-        )
+        raise _not_determined(seen, problem.names)
     return Estimate(
         state=run.state,
         names=problem.names,
@@ -140,6 +133,21 @@ def _settle(
             break
         keep = update
     return run, keep
+
+
+def _require_enough(jacobian: Array, names: tuple[str, ...]) -> None:
+    m, c, k = jacobian.shape
+    if m * c < k:
+        raise TooFewSamplesError(f"{m} samples give {m * c} equations for {k} unknowns")
+    _require_full_rank(observability(jacobian.reshape(-1, k)), names)
+
+
+def _not_determined(seen: Observability, names: tuple[str, ...]) -> RankDeficientError:
+    return RankDeficientError(
+        f"the data determine {seen.rank} of {len(names)} unknowns, and the prior not the rest: "
+        "measure at more and different poses",
+        [describe(column, names) for column in seen.null.T],
+    )
 
 
 def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:

@@ -1,6 +1,7 @@
 """Joint readings by time stamp: interpolation and the standstill check."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,8 +39,30 @@ class Reading:
     ready_ns: int
 
 
+class Added(NamedTuple):
+    """What a reading did to a stream.
+
+    ``began_ns``: stamp at which the stream begins, or begins anew; ``lone_ns``: stamp of an
+    earlier reading that no other followed and that is not used. None: it did no such thing.
+    """
+
+    began_ns: int | None = None
+    lone_ns: int | None = None
+
+
 class NotStillError(InputError):
     """The joints cannot be given at that instant; the message says why."""
+
+
+def _goes_on(stamp_ns: int, held_ns: int, newest_ns: int | None, near_ns: int) -> bool:
+    """Whether a stamp goes on from one that leapt, and not from the newest before the leap."""
+    if stamp_ns <= held_ns:
+        return False
+    if newest_ns is None or held_ns > newest_ns:
+        return True
+    if stamp_ns > newest_ns:
+        return False
+    return stamp_ns - held_ns <= near_ns or newest_ns - stamp_ns >= CLOCK_JUMP_NS
 
 
 class JointStream:
@@ -55,6 +78,7 @@ class JointStream:
         self._capacity = capacity
         self._size = 0
         self._order: dict[tuple[str, ...], NDArray[np.int64]] = {}
+        self._held: tuple[int, Array] | None = None  # a reading that leapt, not yet believed
         self.gap_count = 0
         self.longest_gap_ns = 0
 
@@ -63,11 +87,13 @@ class JointStream:
         """Stamp of the newest reading."""
         return int(self._stamp[self._size - 1]) if self._size else None
 
-    def add(self, sample: JointSample, gap_ns: int) -> None:
+    def add(self, sample: JointSample, gap_ns: int) -> Added:
         """Append a reading; joints may come in any order and beside others.
 
-        A pause longer than ``gap_ns`` is counted. A clock that jumps back by a second or more
-        starts the stream anew.
+        A leap of the stamps, back by a second or more or ahead by more than that and ``gap_ns``,
+        is believed when the next reading goes on from there: one wrong stamp must not move the
+        clock. So is the beginning. A leap ahead is a pause; a leap back starts the stream anew.
+        Pauses longer than ``gap_ns`` are counted.
 
         Raises
         ------
@@ -77,20 +103,37 @@ class JointStream:
         order = self._order.get(sample.names)
         if order is None:
             order = self._order[sample.names] = self._column_order(sample.names)
+        stamp_ns, near_ns = sample.stamp_ns, max(CLOCK_JUMP_NS, gap_ns)
+        held, newest = self._held, self.newest_ns
+        began_ns = lone_ns = None
+        if held is not None and _goes_on(stamp_ns, held[0], newest, near_ns):
+            if newest is None or held[0] < newest:
+                self._size, began_ns = 0, held[0]
+            self._append(held, gap_ns)
+            newest = held[0]
+        elif newest is not None and -CLOCK_JUMP_NS < stamp_ns - newest <= 0:
+            raise InputError(f"joint state at {stamp_ns} ns is not after {newest} ns")
+        elif held is not None:
+            lone_ns = held[0]
+        reading = stamp_ns, sample.position[order]
+        leaps = newest is None or not 0 < stamp_ns - newest <= near_ns
+        self._held = reading if leaps else None
+        if not leaps:
+            self._append(reading, gap_ns)
+        return Added(began_ns, lone_ns)
+
+    def _append(self, reading: tuple[int, Array], gap_ns: int) -> None:
+        """Append a reading, and count the pause before it."""
+        stamp_ns, q = reading
         newest = self.newest_ns
-        if newest is not None and sample.stamp_ns <= newest:
-            if newest - sample.stamp_ns < CLOCK_JUMP_NS:
-                raise InputError(f"joint state at {sample.stamp_ns} ns is not after {newest} ns")
-            self._size = 0
-        elif newest is not None and sample.stamp_ns - newest > gap_ns:
+        if newest is not None and stamp_ns - newest > gap_ns:
             self.gap_count += 1
-            self.longest_gap_ns = max(self.longest_gap_ns, sample.stamp_ns - newest)
+            self.longest_gap_ns = max(self.longest_gap_ns, stamp_ns - newest)
         if self._size == len(self._stamp):
             self._stamp[: self._capacity] = self._stamp[self._capacity :]
             self._q[: self._capacity] = self._q[self._capacity :]
             self._size = self._capacity
-        self._stamp[self._size] = sample.stamp_ns
-        self._q[self._size] = sample.position[order]
+        self._stamp[self._size], self._q[self._size] = stamp_ns, q
         self._size += 1
 
     def _column_order(self, names: tuple[str, ...]) -> NDArray[np.int64]:

@@ -234,7 +234,7 @@ class ReplayNode(HouseNode):
         self._report()
 
     def _report(self) -> None:
-        if self._topics is None:
+        if self._topics is None or self._reader is None:
             self._status.publish(String(data=json.dumps({"state": self._play_state})))
             return
         self._topics.look()
@@ -242,7 +242,7 @@ class ReplayNode(HouseNode):
             "state": self._play_state,
             "bag": self._info.path,
             "position_s": (self._position_ns - self._first_ns) * 1e-9,
-            "notes": list(self._info.notes),
+            "notes": list(self._reader.info.notes),
             "fault": self._fault,
             **self._topics.report(),
         }

@@ -119,7 +119,7 @@ class ThermalNode(HouseNode):
             if kind == JOINTS and not session.desk.received[JOINTS]:
                 self._guard.look()
             if kind == JOINTS and self._guard.fault:
-                session.desk.ignore(JOINTS, self._guard.fault)
+                session.desk.ignored.add(JOINTS, self._guard.fault)
                 return
             take_message(session, kind, message)
             if session.waiting:
@@ -167,7 +167,11 @@ class ThermalNode(HouseNode):
     # ---- outputs --------------------------------------------------------------------------------
 
     def _show(self, outcome: Outcome) -> None:
-        self.get_logger().info(f"{outcome.command.name}: {outcome.status.name} {outcome.message}")
+        words = f"{outcome.command.name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
         try:
             self._publish_event(outcome.command, outcome)
             if outcome.command.name == IDENTIFY:
@@ -234,9 +238,11 @@ class ThermalNode(HouseNode):
             health.worsen(ERROR, str(error))
         values["cold reference"] = "captured" if session.reference_id else "none"
         values["joint gaps"] = session.desk.stream.gap_count
-        for topic, reasons in session.desk.ignored.items():
+        ignored = session.desk.ignored
+        for topic, reasons in ignored.items():
             for reason, count in reasons.items():
-                values[f"{topic} ignored: {reason}"] = count
+                last = ignored.last(topic, reason)
+                values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
         if self._guard.fault:
             health.worsen(ERROR, self._guard.fault)
         if session.fault:

@@ -1,15 +1,16 @@
 """The services of the thermal node: each call becomes a command, its outcome the answer."""
 
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
 from robocal_msgs.srv import CaptureReference, Decide, Identify, ListCalibrations
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.nodes.conversions import summary_message, trigger_text
+from robocal_ros.sessions.decisions import NEWEST, ONLY
 from robocal_ros.sessions.events import (
     ACCEPT,
     CAPTURE_REFERENCE,
@@ -43,14 +44,14 @@ class ThermalServices:
         add(CaptureReference, "~/capture_reference", self._capture_reference)
         add(Identify, "~/identify", self._identify)
         add(ListCalibrations, "~/list", self._list)
-        add(Trigger, "~/capture_reference_trigger", self._twin(CAPTURE_REFERENCE, dict))
-        add(Trigger, "~/identify_trigger", self._twin(IDENTIFY, dict))
+        add(Trigger, "~/capture_reference_trigger", self._twin(CAPTURE_REFERENCE, {}))
+        add(Trigger, "~/identify_trigger", self._twin(IDENTIFY, {}))
         add(Trigger, "~/list_trigger", self._list_twin)
         for name in (ACCEPT, REJECT, ROLLBACK):
             add(Decide, f"~/{name}", self._decide(name))
-        add(Trigger, "~/accept_trigger", self._twin(ACCEPT, self._only_candidate))
+        add(Trigger, "~/accept_trigger", self._twin(ACCEPT, {"choose": ONLY}))
         add(Trigger, "~/reject_trigger", self._reject_twin)
-        add(Trigger, "~/rollback_trigger", self._twin(ROLLBACK, lambda: {"previous": True}))
+        add(Trigger, "~/rollback_trigger", self._twin(ROLLBACK, {"previous": True}))
 
     async def _capture_reference(self, request: Any, response: Any) -> Any:
         outcome = await self._ask(Command(CAPTURE_REFERENCE, {}))
@@ -102,11 +103,11 @@ class ThermalServices:
         response.success, response.message = True, json.dumps(lines, allow_nan=False)
         return response
 
-    def _twin(self, name: str, arguments: Callable[[], dict[str, Any]]) -> Callable[..., Any]:
+    def _twin(self, name: str, arguments: Mapping[str, Any]) -> Callable[..., Any]:
         async def trigger(request: Any, response: Any) -> Any:
             try:
-                outcome = await self._ask(Command(name, {"by": TWIN, **arguments()}))
-            except RobocalError as error:
+                outcome = await self._ask(Command(name, {"by": TWIN, **arguments}))
+            except RobocalError as error:  # deactivated meanwhile
                 response.message = trigger_text(0, error.code, str(error))
                 return response
             response.success = outcome.done
@@ -117,28 +118,11 @@ class ThermalServices:
 
     async def _reject_twin(self, request: Any, response: Any) -> Any:
         """Reject all that is pending: a PLC's way out when the accept twin may not choose."""
-        reject_one = self._twin(REJECT, self._newest_candidate)
+        reject_one = self._twin(REJECT, {"choose": NEWEST})
         await reject_one(request, response)
         while response.success and self._history.pending():
             await reject_one(request, response)
         return response
-
-    def _newest_candidate(self) -> dict[str, Any]:
-        pending = self._history.pending()
-        if not pending:
-            raise ConflictError("no fresh candidate is pending, found none: identify first")
-        return {"id": pending[0].id}
-
-    def _only_candidate(self) -> dict[str, Any]:
-        """The candidate that a twin decides about, when there is no doubt which."""
-        pending = [entry.id for entry in self._history.pending()]
-        if len(pending) != 1:
-            found = ", ".join(map(str, pending)) or "none"
-            raise ConflictError(
-                f"exactly one fresh candidate must be pending, found {found}: "
-                + ("decide by id" if pending else "identify first")
-            )
-        return {"id": pending[0]}
 
 
 def _answer(response: Any, outcome: Outcome) -> Any:

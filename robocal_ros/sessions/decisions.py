@@ -1,36 +1,70 @@
 """Decisions about calibrations: a command to the history."""
 
+from dataclasses import replace
+
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 
+ONLY, NEWEST = "only", "newest"  # which pending candidate a command without an id is about
+
 
 def decide(history: History, command: Command, expected: int, wall_ns: int) -> Outcome:
     """Accept, reject or roll back, where revision ``expected`` is in force.
+
+    A command with ``choose`` (`ONLY`, `NEWEST`) in place of an id is about a candidate that is
+    pending now, not when it was given. The outcome's command says which: replay obeys that.
 
     Raises
     ------
     RobocalError
         When the history refuses.
     """
+    if "choose" in command.arguments:
+        command = _named(history, command)
     arguments = command.arguments
+    if "refused" in arguments:
+        return Outcome(command, Code.CONFLICT, str(arguments["refused"]))
     chosen = int(arguments.get("id", 0))
     by, why = str(arguments.get("by", "")), str(arguments.get("reason", ""))
-    if command.name == events.REJECT:
-        history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
-        return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
-    if command.name == events.ACCEPT:
-        head = history.accept(chosen, by=by, reason=why, expected_head=expected, wall_ns=wall_ns)
-    else:
-        head = history.rollback(
-            None if arguments.get("previous", False) else chosen,
-            by=by,
-            reason=why,
-            expected_head=expected,
-            wall_ns=wall_ns,
-        )
+    try:
+        if command.name == events.REJECT:
+            history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
+            return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
+        if command.name == events.ACCEPT:
+            head = history.accept(
+                chosen, by=by, reason=why, expected_head=expected, wall_ns=wall_ns
+            )
+        else:
+            head = history.rollback(
+                None if arguments.get("previous", False) else chosen,
+                by=by,
+                reason=why,
+                expected_head=expected,
+                wall_ns=wall_ns,
+            )
+    except RobocalError as error:
+        return Outcome(command, error.code, str(error))
     chosen = head.calibration_id or 0
     what = f"calibration {chosen}" if chosen else "the nominal model"
     message = f"revision {head.revision}: {what} in force"
     return Outcome(command, Code.ACCEPT, message, None, chosen)
+
+
+def _named(history: History, command: Command) -> Command:
+    """Put the candidate's id, or why there is none to choose, in place of ``choose``."""
+    arguments = dict(command.arguments)
+    pending = [entry.id for entry in history.pending()]
+    choose = arguments.pop("choose")
+    if not pending:
+        arguments["refused"] = "no fresh candidate is pending: identify first"
+    elif choose == ONLY and len(pending) > 1:
+        found = ", ".join(map(str, pending))
+        arguments["refused"] = (
+            f"exactly one fresh candidate must be pending, found {found}: decide by id"
+        )
+    else:
+        arguments["id"] = pending[0]
+    return replace(command, arguments=arguments)

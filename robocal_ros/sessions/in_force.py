@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import reference_of
+from robocal_ros.core.documents import arm_of, reference_of
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Decision, Head
@@ -34,6 +34,12 @@ class InForce:
         self.head: Head = history.head(THERMAL)
         self.reference, self.reference_id = self._stored_reference()
         self.fault = ""
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the model in force."""
+        model = self.head.model
+        return self._nominal if model is None else arm_of(model, self._nominal)
 
     def look(self, own_wall_ns: int | None = None) -> list[Decision]:
         """Take over what was decided since the last look.

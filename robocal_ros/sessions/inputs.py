@@ -21,4 +21,4 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
         elif kind == POSE:
             session.add(pose_sample(message, session.config.target))
     except InputError as error:
-        session.desk.ignore(kind, str(error))
+        session.desk.ignored.add(kind, str(error))

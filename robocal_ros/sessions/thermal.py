@@ -7,37 +7,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict, summarise
-from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import (
-    arm_of,
-    identification_document,
-    identified_model_document,
-    reference_document,
-)
+from robocal_ros.core.documents import reference_document
 from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
-from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_hold_out
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, Head, Proposal
+from robocal_ros.core.proposals import Head
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
-from robocal_ros.core.thermal.identification import (
-    ColdReference,
-    capture_reference,
-    identify_drift,
-)
+from robocal_ros.core.thermal.identification import ColdReference
 from robocal_ros.sessions import events
 from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.in_force import REFERENCE, InForce, outside_decision
-from robocal_ros.sessions.observations import (
-    JOINTS,
-    JUMPS,
-    Observation,
-    ObservationDesk,
-    as_measurements,
-)
-from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig, expected_drift
+from robocal_ros.sessions.in_force import InForce, outside_decision
+from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk, as_measurements
+from robocal_ros.sessions.proposing import Proposer
+from robocal_ros.sessions.thermal_config import ThermalConfig, expected_drift
 
 __all__ = ["ThermalConfig", "ThermalSession"]
 
@@ -69,10 +52,10 @@ class ThermalSession:
             nominal.joint_names, config.standstill, config.measuring_frame or None
         )
         self._history = history
-        self._software = software
         self._queue: list[Command] = []
         self._current = InForce(history, nominal)
         self.prior = expected_drift(nominal, history, config) if prior is None else prior
+        self._proposer = Proposer(nominal, history, config, software, self._current, self.prior)
 
     @property
     def in_force(self) -> Head:
@@ -97,8 +80,7 @@ class ThermalSession:
     @property
     def arm(self) -> SerialArm:
         """The arm with the model in force."""
-        model = self.in_force.model
-        return self.nominal if model is None else arm_of(model, self.nominal)
+        return self._current.arm
 
     @property
     def reference_model(self) -> dict[str, Any] | None:
@@ -119,7 +101,7 @@ class ThermalSession:
         a second after the newest of them), else the newest stamp known.
         """
         if command.stamp_ns is None:
-            newest = max(self.desk.newest_ns.values(), default=0)
+            newest = self.desk.clock_ns
             near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
             command = replace(command, stamp_ns=clock_ns if near else newest)
         if command.name == events.IDENTIFY and not command.arguments.get("cycle_id"):
@@ -191,125 +173,25 @@ class ThermalSession:
         except RobocalError as error:
             return Outcome(command, error.code, str(error))
 
-    def _window(self, command: Command) -> list[Observation]:
+    def _window(self, command: Command) -> Measurements:
+        self.desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", self.desk.from_ns)) - 1
         found = self.desk.window(after, command.stamp_ns or 0, command.marks or {})
         last = int(command.arguments.get("samples", 0))
         if not found:
-            lost = {topic: dict(why) for topic, why in self.desk.ignored.items()}
-            raise TooFewSamplesError(
-                "no measurement with the robot at standstill since the last command"
-                + (f"; ignored: {lost}" if lost else "")
-            )
-        return found[-last:] if last else found
+            raise TooFewSamplesError(self.desk.why_nothing())
+        return as_measurements(found[-last:] if last else found)
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
-        data = as_measurements(self._window(command))
-        reference = capture_reference(self.arm, data)
-        model = reference_document(reference)
-        rms_mm = summarise(reference.cell.residual(reference.data)).rms_m * 1e3
-        left_out = f", not fitting: {', '.join(reference.rejected)}" if reference.rejected else ""
-        message = (
-            f"cold reference of {len(reference.data)} measurements captured, residual "
-            f"{rms_mm:.3f} mm rms{left_out}"
-        )
-        document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
-        calibration_id = self._propose(
-            REFERENCE,
-            command,
-            wall_ns,
-            "lsq",
-            Verdict(Code.ACCEPT, message),
-            document,
-            model,
-            data,
-        )
-        self._history.accept(
-            calibration_id,
-            by=str(command.arguments.get("by", "")),
-            reason="captured",
-            expected_head=None,
-            wall_ns=wall_ns,
-        )
+        outcome = self._proposer.capture(command, self._window(command), wall_ns)
         self.desk.use(command.stamp_ns or 0)
-        return Outcome(
-            command, Code.ACCEPT, message, calibration_id=calibration_id, samples=len(data)
-        )
+        return outcome
 
     def _identify(self, command: Command, wall_ns: int) -> Outcome:
-        method = str(command.arguments.get("method") or self.config.method)
-        if method not in METHODS:
-            raise InputError(f"method '{method}' is not one of {', '.join(METHODS)}")
-        data = as_measurements(self._window(command))
-        judged = self._solve(data, "lsq" if method == "lsq" else "map")
-        document = identification_document(judged)
-        cycle_id = str(command.arguments.get("cycle_id", ""))
-        document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
-        verdict = judged.verdict
-        model = identified_model_document(judged.identification)
-        if self.reference is not None:
-            model["reference_mdh"] = self.reference.cell.arm.mdh.tolist()
-        calibration_id = self._propose(
-            THERMAL, command, wall_ns, method, verdict, document, model, data
-        )
+        method = self._proposer.method(command)
+        outcome = self._proposer.identify(command, self._window(command), method, wall_ns)
         self.desk.use(command.stamp_ns or 0)
-        return Outcome(
-            command, verdict.code, verdict.reason, document, calibration_id, samples=len(data)
-        )
-
-    def _solve(self, data: Measurements, method: Method) -> JudgedIdentification:
-        if self.reference is not None:
-            return identify_drift(
-                self.nominal,
-                self.reference,
-                data,
-                sigma_m=self.config.sigma_m,
-                in_force=self.arm,
-                prior_covariance=self.prior,
-                method=method,
-            )
-        return identify_and_hold_out(
-            self.nominal,
-            data,
-            share=self.config.hold_out,
-            seed=self.config.seed,
-            method=method,
-            in_force=self.arm if self.in_force.model is not None else None,
-        )
-
-    def _propose(
-        self,
-        kind: str,
-        command: Command,
-        wall_ns: int,
-        method: str,
-        verdict: Verdict,
-        document: dict[str, Any],
-        model: dict[str, Any],
-        data: Measurements,
-    ) -> int:
-        # What it was solved against, though another process may have decided meanwhile.
-        thermal = kind == THERMAL
-        based_on = self.in_force.revision if thermal else self._history.head(kind).revision
-        held_out = document.get("calibrated", {}).get("held_out", {})
-        return self._history.propose(
-            Proposal(
-                kind=kind,
-                model_hash=self.nominal.model_hash,
-                based_on=based_on,
-                cycle_id=str(command.arguments.get("cycle_id", "")),
-                stamp_ns=command.stamp_ns or 0,
-                created_ns=wall_ns,
-                software=self._software,
-                method=method,
-                code=verdict.code,
-                reason=verdict.reason,
-                candidate_rms_mm=held_out.get("rms_mm"),
-                document=document,
-                model=model,
-                inputs=data.arrays(),
-            )
-        )
+        return outcome
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
         return decide(self._history, command, self.in_force.revision, wall_ns)

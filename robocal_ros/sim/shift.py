@@ -152,8 +152,7 @@ def simulate(
             level = plan.level(course.time_s - start)
             pose = plan.check[rng.integers(len(plan.check))] if level > 0.0 else course.q[-1]
             course.move(pose, 0.0, level)
-        level = plan.level(course.time_s - start)
-        cycles.append(measure(f"cycle-{number:02d}", plan.cycle, level))
+        cycles.append(measure(f"cycle-{number:02d}", plan.cycle, plan.level(course.time_s - start)))
     time_s, temperatures = zip(*course.log, strict=True)
     return Shift(
         tuple(cycles),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self
 
+import numpy as np
 import yaml
 from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_typestore
@@ -20,7 +21,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.storage import bag_types
 from robocal_ros.storage.bag_writer import BagWriter
 from robocal_ros.storage.files import read_text
-from robocal_ros.storage.mcap_files import McapFile, Raw, open_file, read_block
+from robocal_ros.storage.mcap_files import Lost, McapFile, Raw, open_file, read_block
 
 __all__ = ["BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "read_bag"]
 
@@ -46,7 +47,8 @@ class BagInfo:
     """Content of a bag.
 
     ``start_ns`` and ``end_ns`` (log time) are None when it holds no message. ``notes`` tell what
-    is wrong with it; ``truncated``: the recording broke off.
+    is wrong with it; ``truncated``: the recording broke off; ``lost``: damaged chunks, known when
+    they were met in reading.
     """
 
     path: str
@@ -55,6 +57,7 @@ class BagInfo:
     end_ns: int | None
     truncated: bool
     notes: tuple[str, ...]
+    lost: tuple[Lost, ...] = ()
 
     @property
     def messages(self) -> int:
@@ -107,18 +110,30 @@ class BagReader:
             start_ns=min(starts, default=None),
             end_ns=max(ends, default=None),
             truncated=any(file.notes for file in self._files),
-            notes=self._notes,
+            notes=(*self._notes, *self._losses()),
+            lost=tuple(lost for file in self._files for lost in file.lost.values()),
         )
+
+    def _losses(self) -> Iterator[str]:
+        for file in self._files:
+            for lost in file.lost.values():
+                start, end = (_utc(ns) for ns in (lost.from_ns, lost.to_ns))
+                yield (
+                    f"{file.path}: a damaged chunk is left out, with all messages recorded from "
+                    f"{start} to {end} ({lost.why})"
+                )
 
     def messages(
         self, topics: Collection[str] | None = None, *, raw: bool = False
     ) -> Iterator[BagMessage]:
         """Messages of all topics, or of ``topics``, by log time, ties as they were recorded.
 
+        A damaged chunk is left out; afterwards ``info`` tells of it.
+
         Raises
         ------
         InputError
-            When a message or a part of the file cannot be decoded.
+            When a message cannot be decoded, or every chunk is damaged.
         """
         wanted = [
             {
@@ -135,6 +150,14 @@ class BagReader:
             topic, msgtype = wanted[index][message.channel]
             content = bytes(message.data) if raw else self._decode(index, topic, msgtype, message)
             yield BagMessage(topic, msgtype, message.log_time_ns, content)
+        if (lost := self.info.lost) and all(
+            block.offset in file.lost for file in self._files for block in file.blocks
+        ):
+            told = "; ".join([f"damaged {lost[0].why}", *self._notes])
+            raise InputError(
+                f"nothing in this bag can be read; damaged chunks: {len(lost)} ({told})",
+                file=str(self._path),
+            )
 
     def _learn_types(self, index: int, channels: Collection[int]) -> None:
         file = self._files[index]
@@ -238,17 +261,27 @@ def _bag_files(path: Path) -> tuple[list[Path], list[str]]:
     return [path / name for name in names], []
 
 
+def _utc(stamp_ns: int | None) -> str:
+    """A log time for people."""
+    return "an unknown time" if stamp_ns is None else f"{np.datetime64(stamp_ns, 'ns')} UTC"
+
+
 def read_bag(
     path: str | Path, topics: Collection[str] | None = None, *, raw: bool = False
 ) -> Iterator[BagMessage]:
     """Messages of a bag by log time; see ``BagReader``, which also tells what is wrong with it.
 
-    A recording that broke off is read as far as it goes, with a warning.
+    A recording that broke off is read as far as it goes, a damaged one around the damage, with a
+    warning.
     """
     with BagReader(path) as bag:
-        for note in bag.info.notes:
+        known = bag.info.notes
+        for note in known:
             warnings.warn(note, stacklevel=2)
         yield from bag.messages(topics, raw=raw)
+        for note in bag.info.notes:
+            if note not in known:
+                warnings.warn(note, stacklevel=2)
 
 
 def bag_info(path: str | Path) -> BagInfo:

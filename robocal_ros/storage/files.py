@@ -12,8 +12,13 @@ MOST_QUOTED = 60
 
 def quoted(value: object) -> str:
     """A user's text for a message: in quotes, on one line, cut where it is long."""
+    return f"'{shortened(value)}'"
+
+
+def shortened(value: object) -> str:
+    """A user's text on one line, cut where it is long."""
     text = " ".join(str(value).split())
-    return f"'{text}'" if len(text) <= MOST_QUOTED else f"'{text[:MOST_QUOTED]}…'"
+    return text if len(text) <= MOST_QUOTED else f"{text[:MOST_QUOTED]}…"
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -1,7 +1,7 @@
 """One MCAP file as blocks of messages, found by its index or, without one, by a scan.
 
 A file without an index is what a recorder that was killed leaves behind. Everything up to the
-first incomplete record is read, and what was found wrong is told.
+first incomplete record is read. A damaged chunk is left out. What was found wrong is told.
 """
 
 import struct
@@ -46,6 +46,14 @@ class Block(NamedTuple):
     chunked: bool
 
 
+class Lost(NamedTuple):
+    """A damaged chunk: what is missing, by log time, and why; None where that is lost too."""
+
+    from_ns: int | None
+    to_ns: int | None
+    why: str
+
+
 class Raw(NamedTuple):
     """A message as stored; ``position`` in its block makes the order of equal times certain."""
 
@@ -57,7 +65,11 @@ class Raw(NamedTuple):
 
 @dataclass
 class McapFile:
-    """Content of a file: channels, schemas and blocks; ``notes`` say what is damaged."""
+    """Content of a file: channels, schemas and blocks; ``notes`` say where it breaks off.
+
+    ``nameless``: messages whose channel was described in what is damaged. ``lost``: damaged
+    chunks by their place in the file, as far as they were met in reading.
+    """
 
     path: Path
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -67,6 +79,8 @@ class McapFile:
     start_ns: int | None = None
     end_ns: int | None = None
     notes: list[str] = field(default_factory=list)
+    nameless: int = 0
+    lost: dict[int, Lost] = field(default_factory=dict)
 
 
 def open_file(path: Path) -> McapFile:
@@ -93,23 +107,28 @@ def read_block(
 ) -> list[Raw]:
     """Messages of a block on the ``wanted`` channels, in order of log time.
 
-    Raises
-    ------
-    InputError
-        When the block is damaged.
+    A damaged block has none, and is added to what the file has lost.
     """
-    stream.seek(block.offset)
-    data = stream.read(block.size)
+    data = b""
     try:
+        stream.seek(block.offset)
+        data = stream.read(block.size)
         found = _messages(_unpacked(data) if block.chunked else memoryview(data), wanted)
-    except DAMAGE as error:
-        raise InputError(
-            f"the chunk at byte {block.offset} is damaged ({error}); 'mcap recover' saves the "
-            f"others into a new file",
-            file=str(file.path),
-        ) from error
+    except (*DAMAGE, OSError) as error:
+        _lose(file, block, data, error)
+        return []
     found.sort()
     return found
+
+
+def _lose(file: McapFile, block: Block, data: bytes, error: Exception) -> None:
+    """Note a damaged block with the times that stand before its content."""
+    start_ns = end_ns = None
+    if block.chunked and len(data) >= HEAD.size + TIMES.size:
+        start_ns, end_ns = TIMES.unpack_from(data, HEAD.size)
+        if not start_ns <= end_ns:
+            start_ns = end_ns = None
+    file.lost[block.offset] = Lost(start_ns, end_ns, f"at byte {block.offset}: {error}")
 
 
 def _check_magic(stream: IO[bytes], path: Path) -> None:
@@ -159,21 +178,22 @@ def _scanned(stream: IO[bytes], path: Path) -> McapFile:
     file = McapFile(path)
     loose = len(MAGIC)  # where the records begin that are in no block yet
     damage = ""
-    for opcode, start, end, damage in _records(stream):
+    for opcode, start, end, words in _records(stream):
+        damage = damage or words
         if opcode == Opcode.CHUNK or end - loose > LOOSE_BLOCK or opcode is None:
             _add_block(stream, file, Block(0, loose, start - loose, False))
             loose = start
         if opcode == Opcode.CHUNK:
-            try:
-                _add_block(stream, file, Block(0, start, end - start, True))
-            except DAMAGE as error:
-                damage = f"in the damaged chunk at byte {start} ({error})"
-                break
+            _add_block(stream, file, Block(0, start, end - start, True))
             loose = end
     if damage:
         file.notes.append(
             f"{path}: the recording broke off {damage}; the {file.counts.total()} messages "
             f"before that are read"
+        )
+    if file.nameless:
+        file.notes.append(
+            f"{path}: {file.nameless} messages are left out: the names of their topics are lost"
         )
     return file
 
@@ -202,12 +222,18 @@ def _records(stream: IO[bytes]) -> Iterator[tuple[int | None, int, int, str]]:
 
 
 def _add_block(stream: IO[bytes], file: McapFile, block: Block) -> None:
-    """Take in a block's schemas, channels and messages; a block without messages is left out."""
+    """Take in a block's schemas, channels and messages; one without, or damaged, is left out."""
     stream.seek(block.offset)
     data = stream.read(block.size)
-    content = _unpacked(data) if block.chunked else memoryview(data)
-    _definitions(content, file)
-    messages = _messages(content, file.channels)
+    try:
+        content = _unpacked(data) if block.chunked else memoryview(data)
+        _definitions(content, file)
+        found = _messages(content, None)
+    except DAMAGE as error:
+        _lose(file, block, data, error)
+        return
+    messages = [message for message in found if message.channel in file.channels]
+    file.nameless += len(found) - len(messages)
     if not messages:
         return
     first, last = min(messages).log_time_ns, max(messages).log_time_ns
@@ -239,7 +265,7 @@ def _definitions(content: memoryview, file: McapFile) -> None:
         at += HEAD.size + length
 
 
-def _messages(content: memoryview, wanted: Collection[int]) -> list[Raw]:
+def _messages(content: memoryview, wanted: Collection[int] | None) -> list[Raw]:
     found = []
     at, size = 0, len(content)
     head, message, skip = HEAD.unpack_from, MESSAGE.unpack_from, HEAD.size + MESSAGE.size
@@ -248,7 +274,7 @@ def _messages(content: memoryview, wanted: Collection[int]) -> list[Raw]:
         end = at + HEAD.size + length
         if opcode == Opcode.MESSAGE:
             channel, _, log_time, _ = message(content, at + HEAD.size)
-            if channel in wanted:
+            if wanted is None or channel in wanted:
                 found.append(Raw(log_time, at, channel, content[at + skip : end]))
         at = end
     return found

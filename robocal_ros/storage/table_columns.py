@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.storage.files import nearest
+from robocal_ros.storage.files import nearest, shortened
 
 Array = NDArray[np.float64]
 
@@ -81,7 +81,9 @@ def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> Layout:
 
 
 def _fail(message: str, file: str, column: str | None = None) -> NoReturn:
-    raise InputError(message, file=file, row=1, column=column)
+    raise InputError(
+        message, file=file, row=1, column=None if column is None else shortened(column)
+    )
 
 
 def _check_separator(names: list[str], file: str) -> None:

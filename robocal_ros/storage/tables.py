@@ -15,7 +15,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import DEFAULT_TARGET, Measurements
-from robocal_ros.storage.files import read_text, write_text
+from robocal_ros.storage.files import quoted, read_text, write_text
 from robocal_ros.storage.table_columns import (
     EULER,
     QUATERNION,
@@ -165,12 +165,12 @@ def _numbers(table: _Table) -> Array:
     if len(bad):
         name = table.layout.numeric[bad[0, 1]]
         text = table.column(name)[bad[0, 0]]
-        table.fail(f"'{text.strip()}' is not a finite number", int(bad[0, 0]), name)
+        table.fail(f"{quoted(text)} is not a finite number", int(bad[0, 0]), name)
     bad = np.argwhere(np.abs(numbers) > LARGEST)
     if len(bad):
         name = table.layout.numeric[bad[0, 1]]
         text = table.column(name)[bad[0, 0]]
-        table.fail(f"{text.strip()} is no measurement", int(bad[0, 0]), name)
+        table.fail(f"{quoted(text)} is no measurement", int(bad[0, 0]), name)
     return numbers
 
 
@@ -182,7 +182,7 @@ def _column(table: _Table, name: str) -> list[float]:
         _fail_at_text(table, name, float)
     if "_" in "".join(cells):  # Python reads 1_000 as a thousand; a table must not mean that
         index = next(i for i, cell in enumerate(cells) if "_" in cell)
-        table.fail(f"'{cells[index].strip()}' is not a number", index, name)
+        table.fail(f"{quoted(cells[index])} is not a number", index, name)
     return values
 
 
@@ -197,7 +197,7 @@ def _fail_at_text(table: _Table, name: str, convert: Callable[[str], object]) ->
                 table.fail("the cell is empty", index, name)
             comma = text.count(",") == 1 and text.replace(",", "").lstrip("+-").isdigit()
             hint = "; the decimal mark must be a point" if comma else ""
-            table.fail(f"'{text}' is not a number{hint}", index, name)
+            table.fail(f"{quoted(text)} is not a number{hint}", index, name)
     raise AssertionError(f"every cell of {name} is a number")
 
 
@@ -210,9 +210,11 @@ def _stamps(table: _Table) -> NDArray[np.int64]:
         _fail_at_text(table, "stamp_s", Decimal)
     for index, value in enumerate(seconds):
         if not value.is_finite():
-            table.fail(f"'{value}' is not a finite number", index, "stamp_s")
+            table.fail(f"{quoted(value)} is not a finite number", index, "stamp_s")
         if abs(value) > LARGEST_STAMP_S:
-            table.fail(f"{value} is beyond any date; the unit is the second", index, "stamp_s")
+            table.fail(
+                f"{quoted(value)} is beyond any date; the unit is the second", index, "stamp_s"
+            )
         stamps.append(int(value.scaleb(9).to_integral_value()))
     return np.array(stamps, dtype=np.int64)
 
@@ -233,7 +235,7 @@ def _samples(table: _Table) -> tuple[str, ...]:
         for index, name in enumerate(samples):
             if first.setdefault(name, index) != index:
                 row = table.rows[first[name]]
-                table.fail(f"sample '{name}' is already in row {row}", index, "sample")
+                table.fail(f"sample {quoted(name)} is already in row {row}", index, "sample")
     return samples
 
 

@@ -96,6 +96,28 @@ def test_refusals(
     assert words in document["error"]["message"]
 
 
+@pytest.mark.parametrize("value", ["x" * 10_000, "9" * 10_000, "9" * 300, "1" * 9_000 + "deg"])
+@pytest.mark.parametrize("option", ["--joints-deg", "--joints"])
+def test_a_huge_value_is_cut_in_the_message(
+    option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, document = answer(["fk", "--robot", "ur10", option, f"{value},2,3,4,5,6"], capsys)
+    assert status == 2
+    assert "…" in document["error"]["message"]
+    assert len(document["error"]["message"]) < 300
+
+
+@pytest.mark.parametrize("option", ["--fit", "--check-refit", "--hold-out", "--seed"])
+def test_a_huge_argument_is_cut_in_the_message(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["identify", "--robot", "ur10", "--data", "none.csv", option, "x" * 10_000]
+    status, document = answer(command, capsys)
+    assert status == 2
+    assert "…" in document["error"]["message"]
+    assert len(document["error"]["message"]) < 300
+
+
 def test_a_bad_robot_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text("robot: a\nconvention: dh\njoints: [\n")

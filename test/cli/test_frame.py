@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from command import COMMAND, ROOT, SCHEMAS, conforms, environment, robocal
+from command import COMMAND, ROOT, SCHEMAS, conforms, environment, robocal, robocal_json
 from jsonschema import Draft202012Validator
 
 from robocal_ros import __version__
@@ -72,11 +72,18 @@ class TestUsage:
             assert "--json" in robocal(name, "--help").stdout
         assert "bring a pending" in robocal("history", "accept", "--help").stdout
 
-    def test_help_and_version_as_json(self):
-        assert json.loads(robocal("--version", "--json").stdout)["version"].endswith(__version__)
-        done = robocal("history", "accept", "--json", "--help")
-        assert done.returncode == 0
-        assert json.loads(done.stdout)["help"].startswith("usage: robocal history accept")
+    @pytest.mark.parametrize(
+        "command", [(), *((name,) for name in frame.COMMANDS), ("history", "accept")], ids=" ".join
+    )
+    def test_help_as_json_is_one_document(self, command):
+        document = robocal_json("information.json", *command, "--help")
+        assert document == {"help": robocal(*command, "--help").stdout.rstrip("\n") + "\n"}
+        assert document["help"].startswith(" ".join(("usage: robocal", *command)))
+        assert robocal_json("information.json", "--json", *command, "-h") == document
+
+    def test_version_as_json_is_one_document(self):
+        document = robocal_json("information.json", "--version")
+        assert document == {"version": f"robocal {__version__}"}
 
 
 class TestStart:

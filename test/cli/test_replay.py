@@ -1,5 +1,6 @@
 """``robocal replay`` on bags: the live session's results, windows, --auto, and bad recordings."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from recordings import (
     POSES,
     START_NS,
     TYPES,
+    message,
     plain_bag,
     recorded_bag,
     shift,
@@ -306,6 +308,52 @@ class TestDamage:
         assert document["candidates"] == whole["candidates"]
         assert whole["warnings"] == []
         assert any(str(path) in words for words in document["warnings"])
+
+    @pytest.mark.parametrize("where", [0, 40])
+    def test_a_stamp_an_hour_ahead_changes_nothing(self, folder, visits, replay, where) -> None:
+        path = folder / f"hour_{where}.mcap"
+        samples = [sample for part in visits[:3] for sample in part]
+        ahead = [
+            dataclasses.replace(sample, stamp_ns=sample.stamp_ns + 3600 * NS)
+            for sample in (samples[where], samples[6])  # joints and a point
+        ]
+        with BagWriter(path) as bag:
+            write_samples(bag, samples[:where])
+            for sample in ahead:
+                topic, content = message(sample)
+                bag.write(topic, TYPES[topic], content, samples[where].stamp_ns)
+            write_samples(bag, samples[where:])
+        plain = plain_bag(folder / f"right_{where}.mcap", visits[:3])
+        windows = ("--robot", ROBOT, "--cold", "0:12", "--warm", "12:24")
+        _, right = replay(plain, *windows)
+        status, document = replay(path, *windows)
+        assert status == 0
+        assert document["start_ns"] == right["start_ns"] == START_NS
+        assert document["candidates"] == right["candidates"]
+        assert right["ignored"] == {}
+        assert document["ignored"] == {JOINTS: 1, POINT: 1}
+        _, found = replay(path, "--robot", ROBOT, "--auto")
+        _, also = replay(plain, "--robot", ROBOT, "--auto")
+        assert found["candidates"] == also["candidates"]
+
+    def test_a_damaged_chunk_is_a_gap(self, folder, visits, replay) -> None:
+        """It lies where the robot only stands: every figure is that of the whole bag."""
+        path = long_bag(folder / "damaged.mcap", visits[:3], 20_000)
+        _, whole = replay(path, "--robot", ROBOT, "--auto")
+        content = bytearray(path.read_bytes())
+        content[int(0.7 * len(content))] ^= 0x10
+        path.write_bytes(content)
+        status, document = replay(path, "--robot", ROBOT, "--auto")
+        assert status == 0
+        assert document["candidates"] == whole["candidates"]
+        assert whole["gaps"]["damaged"] == []
+        (gap,) = document["gaps"]["damaged"]
+        end_ns = visits[2][-1].stamp_ns
+        assert end_ns < gap["from_ns"] < gap["to_ns"] < end_ns + 200 * NS
+        assert document["gaps"]["count"] == whole["gaps"]["count"] + 1
+        assert document["gaps"]["longest_s"] > (gap["to_ns"] - gap["from_ns"]) * 1e-9
+        (words,) = document["warnings"]
+        assert f"{path}: a damaged chunk is left out" in words
 
     @pytest.mark.parametrize(
         ("content", "words"),

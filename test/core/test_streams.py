@@ -104,3 +104,54 @@ def test_only_the_latest_readings_are_kept():
     assert reading.q[0] == pytest.approx(1e-7 * (newest - 500), abs=1e-15)
     with pytest.raises(NotStillError, match="from before"):
         stream.standstill(1500 * MS, RULE)
+
+
+def test_a_leap_is_believed_when_a_second_reading_follows_it():
+    stream = JointStream(("a", "b"))
+    fill(stream, [*range(1000, 2001, 50), 9000, 9050])
+    assert stream.newest_ns == 9050 * MS
+    assert (stream.gap_count, stream.longest_gap_ns) == (1, 7000 * MS)
+    assert stream.standstill(1500 * MS, RULE) is not None  # a leap ahead forgets nothing
+    fill(stream, [500])
+    assert stream.newest_ns == 9050 * MS
+    fill(stream, [550])
+    assert stream.newest_ns == 550 * MS
+    with pytest.raises(NotStillError, match="before the measurement"):
+        stream.standstill(400 * MS, RULE)
+
+
+def test_two_clocks_in_turn_leave_the_first_in_charge():
+    stream = JointStream(("a", "b"))
+    fill(stream, [1000, 1050])
+    fill(stream, [ms + away for ms in range(1100, 2001, 50) for away in (0, 3_600_000)])
+    assert stream.newest_ns == 2000 * MS
+    assert stream.gap_count == 0
+    assert stream.standstill(1500 * MS, RULE) is not None
+
+
+def test_a_short_jump_back_at_a_low_rate_is_believed():
+    """The second reading is less than a second behind the clock that was left."""
+    stream = JointStream(("a", "b"))
+    fill(stream, [*range(1000, 3001, 100), 1950, 2050])
+    assert stream.newest_ns == 2050 * MS
+
+
+def test_readings_minutes_apart_are_all_taken():
+    """A recorder may keep readings only about the measurements, and few between them."""
+    stream = JointStream(("a", "b"))
+    fill(stream, [*range(0, 600_000, 60_000), *range(600_000, 601_001, 50)])
+    assert stream.newest_ns == 601_000 * MS
+    assert stream.gap_count == 10
+    assert stream.standstill(600_500 * MS, RULE) is not None
+    fill(stream, [*range(60_000, 300_000, 60_000)])  # and the same again
+    assert stream.newest_ns == 180_000 * MS  # the last is believed by the next
+
+
+def test_a_wrong_stamp_among_readings_minutes_apart_is_told():
+    stream = JointStream(("a", "b"))
+    told = [
+        stream.add(JointSample(ms * MS, ("a", "b"), np.zeros(2)), 150 * MS).lone_ns
+        for ms in (60_000, 120_000, 9_000_000, 180_000, 240_000)
+    ]
+    assert told == [None, None, None, 9_000_000 * MS, None]
+    assert stream.newest_ns == 180_000 * MS

@@ -147,9 +147,9 @@ def test_a_twin_does_not_choose_between_candidates(graph, visits):
 
 
 REFUSALS = [
-    ("identify", {}, Code.TOO_FEW_SAMPLES, "no measurement"),
+    ("identify", {}, Code.TOO_FEW_SAMPLES, "no joint states received"),
     ("identify", {"method": "magic"}, Code.BAD_INPUT, "map, lsq"),
-    ("capture_reference", {}, Code.TOO_FEW_SAMPLES, "no measurement"),
+    ("capture_reference", {}, Code.TOO_FEW_SAMPLES, "no joint states received"),
     ("accept", {"id": 99}, Code.BAD_INPUT, "no calibration has the id 99"),
     ("accept", {}, Code.BAD_INPUT, "needs the id"),
     ("reject", {"id": 99}, Code.BAD_INPUT, "no calibration has the id 99"),

@@ -5,9 +5,10 @@ import pytest
 
 from robocal_ros.core.samples import JointSample, PointSample, PoseSample
 from robocal_ros.core.streams import JointStream, Reading, StandstillRule
+from robocal_ros.sessions.ignored import MOST_REASONS
 from robocal_ros.sessions.observations import (
     JOINTS,
-    MOST_REASONS,
+    JUMPS,
     MOST_WAITING,
     POINT,
     POSE,
@@ -136,7 +137,7 @@ def test_a_clock_that_jumps_back_begins_anew():
     d.add_measurement(point(12_000))  # waits for joints that never come
     d.use(10_200 * MS)
     stand(d, 1000, 2000)
-    assert d.ignored[POINT] == {"the clock jumped back": 1}
+    assert d.ignored[POINT] == {"the clock jumped back": 2}
     assert d.newest_ns == {JOINTS: 2000 * MS}
     d.add_measurement(point(1500))
     assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
@@ -213,7 +214,7 @@ def test_nothing_grows_without_bound():
         d.add_measurement(point(ms))
     assert d.ignored[POINT] == {"no joint readings came": 10}
     for number in range(3 * MOST_REASONS):
-        d.ignore(POSE, f"frame 'f{number}' is unknown")
+        d.ignored.add(POSE, f"frame 'f{number}' is unknown")
     assert len(d.ignored[POSE]) == MOST_REASONS + 1
     assert sum(d.ignored[POSE].values()) == 3 * MOST_REASONS
 
@@ -238,4 +239,68 @@ def test_measurements_whose_joints_are_far_off_cost_nothing_and_displace_none():
     stream.asked = 0
     stand(d, 1000, 2000)
     assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
-    assert stream.asked == 11 + 1
+    assert stream.asked == 10 + 1  # the first reading alone begins nothing
+
+
+HOUR_MS = 3_600_000
+
+
+@pytest.mark.parametrize("off_ms", [HOUR_MS, -1900])
+def test_one_wrong_joint_stamp_costs_that_reading_only(off_ms):
+    d = desk()
+    stand(d, 2000, 3000)
+    d.add_measurement(point(2500))
+    d.use(2300 * MS)
+    d.add_joints(joints(3050 + off_ms))
+    stand(d, 3100, 4000)
+    d.add_measurement(point(3500))
+    assert [o.stamp_ns // MS for o in everything(d)] == [2500, 3500]
+    assert d.marks == {JOINTS: 4000 * MS, POINT: 3500 * MS, JUMPS: 0}
+    assert d.from_ns == 2300 * MS + 1
+    assert d.ignored == {JOINTS: {"a stamp that no reading goes on from, # s off": 1}}
+
+
+def test_a_wrong_first_joint_stamp_begins_nothing():
+    d = desk()
+    d.add_measurement(point(1500))
+    d.add_joints(joints(1000 + HOUR_MS))
+    stand(d, 1000, 2000)
+    assert [o.stamp_ns // MS for o in everything(d)] == [1500]
+    assert d.jumps == 0
+
+
+def test_one_measurement_from_the_future_moves_no_mark():
+    d = desk()
+    d.add_measurement(point(HOUR_MS))
+    stand(d, 1000, 2000)
+    d.add_measurement(point(1500))
+    assert d.clock_ns == 2000 * MS
+    assert d.marks == {JOINTS: 2000 * MS, POINT: 1500 * MS, JUMPS: 0}
+    d.add_measurement(point(2300))  # a little ahead of its joints: it is of now
+    assert d.clock_ns == 2300 * MS
+    d.drop_far_ahead()
+    assert d.ignored[POINT] == {"stamped # s after the newest joint reading": 1}
+    stand(d, 2100, 3000)
+    assert [o.stamp_ns // MS for o in everything(d)] == [1500, 2300]
+
+
+@pytest.mark.parametrize("jump_ms", [-60_000, -3_000, 5_000])
+def test_where_the_clock_jumps_the_order_of_arrival_does_not_matter(jump_ms):
+    """Points up to 0.8 s before or after their joints, the topics each in their own order."""
+    before, after = range(100_000, 102_000, 100), range(102_000, 106_000, 100)
+    arrivals = [(ms, joints(ms)) for ms in before]
+    arrivals += [(ms, joints(ms + jump_ms)) for ms in after]
+    measured = [(ms, point(ms)) for ms in (100_650, 101_650, 101_850)]
+    measured += [(ms, point(ms + jump_ms)) for ms in (102_050, 102_350, 102_650, 103_650)]
+    found = set()
+    for lag_ms in range(-800, 801, 50):
+        d = desk()
+        late = [(ms + lag_ms, sample) for ms, sample in measured]
+        for _, sample in sorted([*arrivals, *late], key=lambda item: item[0]):
+            d.add_joints(sample) if isinstance(sample, JointSample) else d.add_measurement(sample)
+        assert d.jumps == (jump_ms < 0)
+        found.add((tuple(o.stamp_ns // MS for o in everything(d)), *d.marks.values()))
+    assert len(found) == 1
+    stamps = found.pop()[0]
+    on_new_clock = tuple(ms + jump_ms for ms in (102_350, 102_650, 103_650))
+    assert stamps == (on_new_clock if jump_ms < 0 else (100_650, 101_650, *on_new_clock))

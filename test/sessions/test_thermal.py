@@ -1,6 +1,8 @@
 """The thermal session: what it proposes, and that only stamps and commands decide it."""
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from robocal_ros.core.proposals import Proposal
 from robocal_ros.core.samples import JointSample, PointSample
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions import events
+from robocal_ros.sessions.decisions import NEWEST, ONLY
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.observations import JOINTS, POINT
 from robocal_ros.sessions.records import digest
@@ -187,8 +190,12 @@ def test_a_cycle_without_a_name_is_named_by_its_time(nominal, visits, tmp_path):
     ("command", "status", "words"),
     [
         (Command(events.IDENTIFY, {"method": "magic"}, 10**15), Code.BAD_INPUT, "map, lsq"),
-        (Command(events.IDENTIFY, {}, 0), Code.TOO_FEW_SAMPLES, "no measurement"),
-        (Command(events.CAPTURE_REFERENCE, {}, 0), Code.TOO_FEW_SAMPLES, "no measurement"),
+        (Command(events.IDENTIFY, {}, 0), Code.TOO_FEW_SAMPLES, "no joint states received"),
+        (
+            Command(events.CAPTURE_REFERENCE, {}, 0),
+            Code.TOO_FEW_SAMPLES,
+            "no joint states received",
+        ),
         (Command(events.ACCEPT, {"id": 4711}, 0), Code.BAD_INPUT, "4711"),
         (Command(events.REJECT, {"id": 4711}, 0), Code.BAD_INPUT, "4711"),
         (Command(events.ROLLBACK, {"previous": True}, 0), Code.CONFLICT, "nothing to roll back"),
@@ -286,3 +293,105 @@ def test_what_was_rolled_back_teaches_nothing(nominal, tmp_path):
         assert expected_drift(nominal, history, config)[0, 0] > 2.0 * before[0, 0]
         history.rollback(None, by="", reason="wrong", wall_ns=3)
         np.testing.assert_array_equal(expected_drift(nominal, history, config), before)
+
+
+@pytest.mark.parametrize("wrong", [JointSample, PointSample])
+def test_one_stamp_from_the_future_changes_no_bit_of_a_cycle(
+    nominal, visits, expected, tmp_path, wrong
+):
+    """Nor does it stamp the commands, which would blind the session for an hour."""
+    first, second, tail = visits
+    session = session_in(tmp_path, nominal)
+    todo = {
+        id(second[0]): Command(events.CAPTURE_REFERENCE, {"by": "test"}),
+        id(tail[0]): Command(events.IDENTIFY, {"cycle_id": "warm"}),
+    }
+    outliers = [id(of_kind(part, wrong)[3]) for part in (first, second)]
+    outcomes = []
+    for sample in [*first, *second, *tail]:
+        if id(sample) in todo:
+            session.submit(todo[id(sample)])
+        if id(sample) in outliers:
+            session.add(replace(sample, stamp_ns=sample.stamp_ns + 3600 * NS))
+        session.add(sample)
+        outcomes += session.advance(wall_ns=7)
+    assert [o.status for o in outcomes] == [Code.ACCEPT, Code.ACCEPT]
+    assert [digest(o.document) for o in outcomes] == expected[0]
+    kind = JOINTS if wrong is JointSample else POINT
+    assert session.desk.ignored[kind].total() == 2
+
+
+def test_a_refusal_says_what_came_and_what_was_lost(nominal, visits, tmp_path):
+    """In words with figures, for the one who stands before the robot."""
+    joints, points = (of_kind(visits[0], kind) for kind in (JointSample, PointSample))
+    moving = replace(points[0], stamp_ns=joints[100].stamp_ns)
+    identify = Command(events.IDENTIFY, {}, 10**15)
+    said = []
+    session = session_in(tmp_path, nominal)
+    for samples in ([moving], joints[:20], joints[20:160]):
+        (outcome,) = run(session, samples, [identify])
+        assert outcome.status is Code.TOO_FEW_SAMPLES
+        said.append(outcome.message)
+    assert said[0].startswith("no joint states received")
+    assert "1 wait for later joint states" in said[0]
+    assert said[1].startswith("no measurement with the robot at standstill")
+    assert re.search(r"ignored: 1 of measured_point \(joint_a\d moved by \d+\.\d+ deg", said[2])
+    assert not set("#{}") & set("".join(said))
+    silent = session_in(tmp_path / "silent", nominal)
+    (outcome,) = run(silent, joints[:20], [identify])
+    assert outcome.message.startswith("no measurement received")
+
+
+def test_a_sample_that_does_not_fit_is_not_in_the_residual(nominal, visits, tmp_path):
+    """20 mm off at one of 8 poses would make an rms of 7 mm; the noise is 0.03 mm."""
+    first, second, _ = visits
+    bad = of_kind(first, PointSample)[4]
+    off = replace(bad, position_m=np.add(bad.position_m, [0.02, 0.0, 0.0]))
+    samples = [off if sample is bad else sample for sample in first]
+    (plain,) = run(session_in(tmp_path / "plain", nominal), first, commands(first, second)[:1])
+    (captured,) = run(session_in(tmp_path, nominal), samples, commands(first, second)[:1])
+    assert captured.done
+    assert f"of the 7 that fit; not fitting: {bad.stamp_ns}" in captured.message
+    rms = [float(re.search(r"([\d.]+) mm rms", o.message)[1]) for o in (plain, captured)]
+    assert rms[1] == pytest.approx(rms[0], rel=0.5)
+
+
+def candidates(session: ThermalSession, nominal, count: int) -> list[Command]:
+    """Identify commands, none carried out, each of its own warm visit."""
+    shift = Shift(nominal.joint_names)
+    cold, q = built(nominal), postures(nominal, POSES)
+    run(session, shift.visit(cold, q), [Command(events.CAPTURE_REFERENCE, {}, 10**13)])
+    todo = []
+    for _ in range(count):
+        begun_ns = shift.now_ns
+        run(session, shift.visit(warmed(cold), q), [])
+        todo.append(Command(events.IDENTIFY, {"from_ns": begun_ns}, shift.now_ns))
+    return todo
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_the_candidate_is_chosen_when_the_command_is_carried_out(nominal, tmp_path, count):
+    session = session_in(tmp_path, nominal)
+    todo = candidates(session, nominal, count)
+    accept = Command(events.ACCEPT, {"by": "trigger", "choose": ONLY})
+    *identified, accepted = run(session, [], [*todo, accept])
+    ids = [o.calibration_id for o in identified]
+    assert len(set(ids)) == count
+    if count == 1:
+        assert (accepted.status, accepted.calibration_id, accepted.revision) == (
+            Code.ACCEPT, ids[0], 1,
+        )  # fmt: skip
+        assert accepted.command.arguments == {"by": "trigger", "id": ids[0]}
+        return
+    assert (accepted.status, accepted.revision) == (Code.CONFLICT, 0)
+    found = f"found {ids[1]}, {ids[0]}" if ids else "identify first"
+    assert found in accepted.message
+    # What was refused for two stays refused in a replay whose history holds one of them.
+    with CalibrationHistory.open("s1", state_dir=tmp_path) as other:
+        for chosen in ids[1:]:
+            other.reject(chosen, by="other", reason="", wall_ns=1)
+    again = run(session, [], [accepted.command])[-1]
+    assert (again.status, again.message) == (Code.CONFLICT, accepted.message)
+    newest = run(session, [], [Command(events.REJECT, {"choose": NEWEST})])[-1]
+    assert newest.calibration_id == (ids[0] if ids else 0)
+    assert newest.done == bool(ids)

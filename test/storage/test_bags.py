@@ -195,12 +195,85 @@ def test_a_recorder_that_is_killed_loses_little(tmp_path: Path) -> None:
     assert len(found) > 15_000
 
 
-def test_a_damaged_chunk_is_not_decoded(small_bag: Path) -> None:
-    data = bytearray(small_bag.read_bytes())
-    data[len(data) // 4] ^= 0xFF
-    small_bag.write_bytes(data)
-    with pytest.raises(InputError, match=r"damaged.*mcap recover"):
-        list(read_bag(small_bag))
+def damage(path: Path, which: slice) -> list[tuple[int, int]]:
+    """Turn one bit in the content of the chunks ``which``; return their first and last times."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    data = bytearray(path.read_bytes())
+    chunks = summary.chunk_indexes[which]
+    for chunk in chunks:
+        data[chunk.chunk_start_offset + chunk.chunk_length - 20] ^= 0x10
+    path.write_bytes(data)
+    return [(chunk.message_start_time, chunk.message_end_time) for chunk in chunks]
+
+
+@pytest.mark.filterwarnings("ignore:.*the recording broke off")
+@pytest.mark.parametrize("cut", [False, True], ids=["with index", "broken off"])
+@pytest.mark.parametrize("which", [slice(3, 5), slice(-1, None)])
+def test_a_damaged_chunk_is_left_out_and_told(
+    small_bag: Path, tmp_path: Path, which: slice, cut: bool
+) -> None:
+    path = tmp_path / "damaged.mcap"
+    write_with_mcap(small_bag, path)
+    whole = list(read_bag(path, raw=True))
+    lost = damage(path, which)
+    if cut:
+        path.write_bytes(path.read_bytes()[:-300])
+    with BagReader(path) as bag:
+        found = list(bag.messages(raw=True))
+        again = list(bag.messages(raw=True))
+        info = bag.info
+    assert found == again
+    missing = [message for message in whole if message not in found]
+    assert len(found) + len(missing) == len(whole)
+    assert 0 < len(missing) < 20 * len(lost) < len(found)
+    assert [(gap.from_ns, gap.to_ns) for gap in info.lost] == lost
+    times = {m.log_time_ns for m in missing}
+    assert min(times) == min(start for start, _ in lost)
+    assert max(times) == max(end for _, end in lost)
+    assert info.truncated == cut
+    told = [note for note in info.notes if "damaged chunk is left out" in note]
+    assert len(told) == len(lost)
+    assert "1970-01-01T00:00:00." in told[0]
+    with pytest.warns(UserWarning, match="damaged chunk is left out"):
+        assert list(read_bag(path, raw=True)) == found
+
+
+def test_messages_whose_topic_is_lost_are_told(tmp_path: Path) -> None:
+    """A chunk describes a topic that begins in it; the index repeats that, but is cut off."""
+    source, path = tmp_path / "source.mcap", tmp_path / "damaged.mcap"
+    with BagWriter(source) as bag:
+        for i in range(200):
+            bag.write("/joint_states", JOINTS, joint_state(i * MS, i, -i), i * MS)
+            if i >= 100:
+                bag.write("/measured_pose", POSE, pose(i * MS, i), i * MS)
+    write_with_mcap(source, path)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    topics = [len(chunk.message_index_offsets) for chunk in summary.chunk_indexes]
+    first = topics.index(2)
+    ((start_ns, end_ns),) = damage(path, slice(first, first + 1))
+    path.write_bytes(path.read_bytes()[:-300])
+    with BagReader(path) as bag:
+        found = list(bag.messages())
+        (note,) = [note for note in bag.info.notes if "names of their topics" in note]
+    joints = range(start_ns // MS), range(end_ns // MS, 200)
+    assert {message.topic for message in found} == {"/joint_states"}
+    assert abs(len(found) - sum(map(len, joints))) <= 1  # the two topics share a time
+    assert abs(int(note.split()[1]) - len(joints[1])) <= 1
+
+
+@pytest.mark.filterwarnings("ignore:.*the recording broke off")
+@pytest.mark.parametrize("cut", [0, 300], ids=["with index", "broken off"])
+def test_a_bag_of_nothing_but_damage_is_refused(small_bag: Path, tmp_path: Path, cut: int) -> None:
+    path = tmp_path / "damaged.mcap"
+    write_with_mcap(small_bag, path)
+    count = len(damage(path, slice(None)))
+    path.write_bytes(path.read_bytes()[: -cut or None])
+    with pytest.raises(InputError, match=rf"nothing in this bag .* chunks: {count} \("):
+        list(read_bag(path))
 
 
 @pytest.mark.parametrize(

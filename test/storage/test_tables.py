@@ -188,6 +188,31 @@ def test_options_are_checked(
     assert (error.row, error.column) == (row, column)
 
 
+HUGE = "9" * 10_000
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("b,tool,0.1", f"b,tool,{HUGE}"),
+        ("b,tool,0.1", f"b,tool,{HUGE}x"),
+        ("b,tool,0.1", f"b,tool,{'1_' * 5000}1"),
+        ("b,tool,0.1", f"b,tool,1{'0' * 200}"),
+        (",11,", f",{HUGE},"),
+        (",11,", f",x{HUGE},"),
+        (",a,", f",{HUGE},"),
+        ("y_mm", HUGE),
+        ("sigma_mm,stamp_s", f"{HUGE},{HUGE}"),
+    ],
+)
+def test_a_huge_cell_is_cut_in_the_message(tmp_path: Path, old: str, new: str) -> None:
+    text = WITH_OPTIONS.replace(old, new).replace(",b,", f",{HUGE},")
+    error = refusal(tmp_path, text)
+    assert "…" in str(error)
+    assert len(str(error)) < 300 + len(str(tmp_path))
+    assert error.row in (1, 3)
+
+
 def test_rows_are_counted_as_an_editor_shows_them(tmp_path: Path) -> None:
     error = refusal(tmp_path, GOOD.replace("\n0,1", "\n\n\n0,one"))
     assert error.row == 5

@@ -95,12 +95,8 @@ def identify_and_judge(
     sound = ~gross(before, after)
     doubt = doubt or uninformative(result, summarise(before[sound]).rms_m, in_force or arm)
     verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
-    if "geometry" not in fit and verdict.code in (
-        Code.WORSE_THAN_CURRENT,
-        Code.NO_SIGNIFICANT_GAIN,
-    ):
-        why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
-        verdict = Verdict(Code.NO_SIGNIFICANT_GAIN, why)
+    if "geometry" not in fit:
+        verdict = _of_placement(verdict)
     return JudgedIdentification(
         identification=result,
         nominal=summarise(plain[sound]),
@@ -178,6 +174,14 @@ def uninformative(result: Identification, current_rms_m: float, in_force: Serial
 def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:
     """Base and targets for a given geometry."""
     return identify(arm, train, fit=fit).cell if fit else linear_start(arm, train)
+
+
+def _of_placement(verdict: Verdict) -> Verdict:
+    """The verdict where base and targets alone were fitted: the model cannot have changed."""
+    if verdict.code not in (Code.WORSE_THAN_CURRENT, Code.NO_SIGNIFICANT_GAIN):
+        return verdict
+    why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
+    return Verdict(Code.NO_SIGNIFICANT_GAIN, why)
 
 
 def _check_error(cell: CellModel, check: Measurements, refit: Collection[Part]) -> Array:

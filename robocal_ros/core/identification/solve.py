@@ -148,9 +148,7 @@ def identify(
         )
 
     complete = layout_of(names)
-    held: tuple[str, ...] = ()
-    if method == "lsq":
-        held = _redundant(complete, initial, arm, len(names))
+    held = _redundant(complete, initial, arm, len(names)) if method == "lsq" else ()
     layout = layout_of(tuple(n for n in names if n not in held)) if held else complete
     by_prior = method == "map" and bool(names)
     covariance = prior_covariance if by_prior else None
@@ -159,9 +157,7 @@ def identify(
     try:
         estimate, lever = _solve(arm, data, layout, initial, covariance, robust)
         if by_prior and prior_covariance is None:
-            found = arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
-            known = estimate.covariance[: len(names), : len(names)]
-            covariance = np.diag(fitted_prior(arm, found, known))
+            covariance = _learned_prior(arm, estimate)
             estimate, lever = _solve(arm, data, layout, estimate.state, covariance, robust)
     except RankDeficientError as error:
         still = still_joints(arm, data)
@@ -232,6 +228,13 @@ def random_postures(arm: SerialArm, count: int = 60) -> Array:
     lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
     upper = np.where(np.isfinite(arm.upper), arm.upper, span)
     return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
+
+
+def _learned_prior(arm: SerialArm, estimate: estimation.Estimate[CellModel]) -> Array:
+    """Covariance of a prior whose widths are what this robot's deviations show."""
+    count = len(arm.parameters.names)
+    found = arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
+    return np.diag(fitted_prior(arm, found, estimate.covariance[:count, :count]))
 
 
 def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> tuple[str, ...]:

@@ -6,8 +6,9 @@ the translation). Angles in rad, lengths in m, twists [v; w] in base axes at the
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from robocal_ros.core.compiled import kernel
 
 Array = NDArray[np.float64]
 
@@ -17,7 +18,7 @@ SINGULAR_PIVOT = 1e-13
 REDUNDANT = 1e-9
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def copy(source: Array, target: Array) -> None:
     """Copy a matrix: element by element, which compiles in a tenth of an assignment's time."""
     for i in range(source.shape[0]):
@@ -25,7 +26,7 @@ def copy(source: Array, target: Array) -> None:
             target[i, j] = source[i, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def blend(a: Array, b: Array, s: float, out: Array) -> None:
     """Model between two packed ones: lengths and angles linear, rotations along the chord."""
     n = a.shape[0] - 2
@@ -57,7 +58,7 @@ def blend(a: Array, b: Array, s: float, out: Array) -> None:
         out[i, 7], out[i, 8] = 0.0, 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pose(row: Array, T: Array) -> None:
     """Transform (4, 4) of a packed pose."""
     x, y, z, w = row[0], row[1], row[2], row[3]
@@ -68,7 +69,7 @@ def pose(row: Array, T: Array) -> None:
     T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def at_tool(T: Array, tool: Array) -> None:
     """Move the origin of a flange pose to the tool's; the flange's axes are kept."""
     x, y, z = tool[0, 3], tool[1, 3], tool[2, 3]
@@ -76,7 +77,7 @@ def at_tool(T: Array, tool: Array) -> None:
         T[r, 3] += T[r, 0] * x + T[r, 1] * y + T[r, 2] * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def swap_tool(T: Array, old: Array, new: Array) -> None:
     """Turn the axes of a flange pose with tool ``old`` to those of the flange with tool ``new``."""
     for r in range(3):
@@ -89,7 +90,7 @@ def swap_tool(T: Array, old: Array, new: Array) -> None:
         T[r, 0], T[r, 1], T[r, 2] = x0, x1, x2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def largest_of(values: Array) -> float:
     """Largest magnitude of some numbers."""
     largest = 0.0
@@ -98,7 +99,7 @@ def largest_of(values: Array) -> float:
     return largest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def residual(goal: Array, T: Array, e: Array) -> float:
     """Twist ``e`` from ``T`` to ``goal``; returns its largest component."""
     for r in range(3):
@@ -121,7 +122,7 @@ def residual(goal: Array, T: Array, e: Array) -> float:
     return largest_of(e)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def columns(links: Array, frames: Array, T: Array, J: Array) -> None:
     """Columns of the geometric Jacobian at the origin of ``T``, as rows of ``J`` (n, 6)."""
     p0, p1, p2 = T[0, 3], T[1, 3], T[2, 3]
@@ -140,7 +141,7 @@ def columns(links: Array, frames: Array, T: Array, J: Array) -> None:
         J[i, 3], J[i, 4], J[i, 5] = z0, z1, z2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def factor(J: Array, L: Array) -> bool:
     """Cholesky factor of J^T J (with 1 / diagonal on the diagonal); False where singular."""
     n = J.shape[0]
@@ -169,7 +170,7 @@ def factor(J: Array, L: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
     """Joint step for the twist ``e``; of a redundant arm, the one that shortens ``x`` too."""
     n = J.shape[0]
@@ -187,13 +188,13 @@ def solve(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
         step[i] = value * L[i, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def length(e: Array, first: int) -> float:
     """Length of a twist's translation (``first`` 0) or rotation (3)."""
     return float(np.sqrt(e[first] ** 2 + e[first + 1] ** 2 + e[first + 2] ** 2))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def part_of_the_way(T: Array, e: Array, share: float, goal: Array) -> None:
     """Pose ``goal``: ``T`` moved by a share of the twist ``e``."""
     turn = length(e, 3)
@@ -210,7 +211,7 @@ def part_of_the_way(T: Array, e: Array, share: float, goal: Array) -> None:
         goal[r, 3] = T[r, 3] + share * e[r]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def share(step: Array, largest: Array) -> float:
     """How much of the correction is made: all of it while the first step is within bounds.
 

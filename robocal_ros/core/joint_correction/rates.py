@@ -1,16 +1,16 @@
 """Compiled rates of the joint correction: velocities and accelerations by the chain rule."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from robocal_ros.core.compiled import kernel
 from robocal_ros.core.joint_correction import kernels as k
 from robocal_ros.core.kinematics.kernels import walk
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _bias(links: Array, frames: Array, T: Array, qd: Array, rate: Array, out: Array) -> None:
     """Twist ``rate`` (6,) at the origin of ``T``, and its derivative ``out`` at constant ``qd``."""
     w0, w1, w2 = 0.0, 0.0, 0.0
@@ -46,7 +46,7 @@ def _bias(links: Array, frames: Array, T: Array, qd: Array, rate: Array, out: Ar
     out[0], out[1], out[2], out[3], out[4], out[5] = a0, a1, a2, b0, b1, b2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _twist(
     q: Array,
     qd: Array,
@@ -72,7 +72,7 @@ def _twist(
             a[r] += J[i, r] * qdd[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def rates_batch(
     q: Array,
     qd: Array,

@@ -5,9 +5,9 @@ end of a blend. ``work`` is scratch of `work_size` numbers, so that a point allo
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from robocal_ros.core.compiled import kernel
 from robocal_ros.core.joint_correction import kernels as k
 from robocal_ros.core.kinematics.kernels import walk
 
@@ -34,7 +34,7 @@ def work_size(n: int) -> int:
     return 18 * (n + 2) + 15 * n + 96 + 6 + 6 * n + n * n + 3 * max(n, 6)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _models(work: Array, n: int) -> tuple[Array, Array, Array, int]:
     """Places of the blended reference and actual model and of the joints' frames in ``work``."""
     m = 9 * (n + 2)
@@ -42,7 +42,7 @@ def _models(work: Array, n: int) -> tuple[Array, Array, Array, int]:
     return reference, actual, work[2 * m : 2 * m + 15 * n].reshape(n, 5, 3), 2 * m + 15 * n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _aim(
     q: Array,
     reference: Array,
@@ -64,7 +64,7 @@ def _aim(
     k.pose(actual[n], root)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _residual_at(
     q: Array, x: Array, links: Array, ends: Array, frames: Array, out: Array, e: Array
 ) -> float:
@@ -76,7 +76,7 @@ def _residual_at(
     return k.residual(ends[2], ends[3], e)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _first_steps(
     q: Array,
     links: Array,
@@ -125,7 +125,7 @@ def _first_steps(
     return share
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _add_step(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
     """One step with a factored matrix."""
     k.solve(J, L, e, x, step)
@@ -133,7 +133,18 @@ def _add_step(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
         x[i] += step[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
+def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bool:
+    """Joints ``q + x``; where that is no solution within reach, the point stays as it came."""
+    n = q.shape[0]
+    for i in range(n):
+        converged = converged and abs(x[i]) <= MOST_OVER * largest[i]
+    for i in range(n):
+        out[i] = q[i] + x[i] if converged else q[i]
+    return converged
+
+
+@kernel
 def _newton(
     q: Array,
     links: Array,
@@ -175,16 +186,12 @@ def _newton(
         if converged or (iterations > 1 and k.largest_of(step) <= SMALL_STEP):
             _add_step(J, L, e, x, step)
             converged = True
-    for i in range(n):
-        converged = converged and abs(x[i]) <= MOST_OVER * largest[i]
-    for i in range(n):
-        # never a half-solved pose: such a point stays as it came
-        out[i] = q[i] + x[i] if converged else q[i]
-    out[n + ITERATIONS], out[n + CONVERGED] = iterations, converged
-    out[n + SHARE] = share if converged else 0.0
+    out[n + CONVERGED] = _take(q, x, largest, converged, out)
+    out[n + ITERATIONS] = iterations
+    out[n + SHARE] = share if out[n + CONVERGED] else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def correct_point(
     q: Array, models: Array, s: float, largest: Array, work: Array, out: Array
 ) -> None:
@@ -219,7 +226,7 @@ def correct_point(
     out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = k.length(e, 0), k.length(e, 3)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def correct_batch(
     q: Array, models: Array, s: Array, largest: Array, work: Array, out: Array
 ) -> None:

@@ -7,9 +7,15 @@ form) column by column, so that no matrix product is formed. Angles in rad, leng
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from robocal_ros.core.compiled import inlined, kernel
+from robocal_ros.core.kinematics.columns import (
+    base_columns,
+    joint_columns,
+    model_columns,
+    tool_columns,
+)
 from robocal_ros.core.kinematics.sines import LARGEST_ANGLE, cos_sin, reduced_cos_sin
 
 Array = NDArray[np.float64]
@@ -27,12 +33,12 @@ def pack_links(mdh: Array, sign: Array, prismatic: NDArray[np.bool_]) -> Array:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _theta(links: Array, i: int, q: float) -> float:
     return float(links[i, 1] if links[i, 8] > 0.5 else links[i, 1] + links[i, 7] * q)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _turn_block(q: Array, first: int, last: int, links: Array, turns: Array) -> None:
     """Rows cos, sin of ``turns`` (3, block * n): of each theta of poses ``first`` to ``last``."""
     n = links.shape[0]
@@ -56,7 +62,7 @@ Frame = tuple[
 ]  # columns x, y, z and origin p
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _root(T: Array) -> Frame:
     """The columns of a transform."""
     # fmt: off
@@ -67,7 +73,7 @@ def _root(T: Array) -> Frame:
     # fmt: on
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _link(links: Array, i: int, q: float, c: float, s: float, frame: Frame) -> Frame:
     """One link but for beta: Trans(z, d) Rot(z, theta) Trans(x, a) Rot(x, alpha).
 
@@ -89,7 +95,7 @@ def _link(links: Array, i: int, q: float, c: float, s: float, frame: Frame) -> F
     # fmt: on
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _bend(links: Array, i: int, frame: Frame) -> Frame:
     """The rest of a link: Rot(y, beta)."""
     cb, sb = links[i, 5], links[i, 6]
@@ -104,7 +110,7 @@ def _bend(links: Array, i: int, frame: Frame) -> Frame:
     # fmt: on
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _store(frame: Frame, T: Array) -> None:
     x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = frame
     T[0, 0], T[0, 1], T[0, 2], T[0, 3] = x0, y0, z0, p0
@@ -113,20 +119,20 @@ def _store(frame: Frame, T: Array) -> None:
     T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _keep_axis(frame: Frame, frames: Array, i: int) -> None:
     frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2] = frame[6], frame[7], frame[8]
     frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2] = frame[9], frame[10], frame[11]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _keep_link(frame: Frame, frames: Array, i: int) -> None:
     frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2] = frame[0], frame[1], frame[2]
     frames[i, 3, 0], frames[i, 3, 1], frames[i, 3, 2] = frame[9], frame[10], frame[11]
     frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = frame[3], frame[4], frame[5]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> None:
     """Forward kinematics that keeps each joint's axes.
 
@@ -143,7 +149,7 @@ def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> 
     _store(frame, T_out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def fk_batch(q: Array, links: Array, T_root: Array, T_out: Array) -> None:
     """Flange poses (m, 4, 4) of joint vectors (m, n)."""
     n = links.shape[0]
@@ -160,7 +166,7 @@ def fk_batch(q: Array, links: Array, T_root: Array, T_out: Array) -> None:
             _store(frame, T_out[k])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def jacobian_batch(q: Array, links: Array, T_root: Array, J: Array) -> None:
     """Geometric Jacobians (m, 6, n) of joint vectors (m, n): [v; w] of the flange in base."""
     n = links.shape[0]
@@ -176,48 +182,10 @@ def jacobian_batch(q: Array, links: Array, T_root: Array, J: Array) -> None:
                 j = (k - first) * n + i
                 frame = _link(links, i, q[k, i], turns[1, j], turns[2, j], frame)
                 frame = _bend(links, i, frame)
-            _joint_columns(links, axes, frame[9], frame[10], frame[11], J, k)
+            joint_columns(links, axes, frame[9], frame[10], frame[11], J, k)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _joint_columns(
-    links: Array, axes: Array, p0: float, p1: float, p2: float, J: Array, k: int
-) -> None:
-    for i in range(links.shape[0]):
-        s = links[i, 7]
-        a0, a1, a2 = s * axes[i, 0], s * axes[i, 1], s * axes[i, 2]
-        if links[i, 8] > 0.5:
-            J[k, 0, i], J[k, 1, i], J[k, 2, i] = a0, a1, a2
-            J[k, 3, i], J[k, 4, i], J[k, 5, i] = 0.0, 0.0, 0.0
-        else:
-            r0, r1, r2 = p0 - axes[i, 3], p1 - axes[i, 4], p2 - axes[i, 5]
-            J[k, 0, i], J[k, 1, i] = a1 * r2 - a2 * r1, a2 * r0 - a0 * r2
-            J[k, 2, i] = a0 * r1 - a1 * r0
-            J[k, 3, i], J[k, 4, i], J[k, 5, i] = a0, a1, a2
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _turn(
-    f: Array, i: int, axis: int, centre: int, p0: float, p1: float, p2: float,
-    J: Array, k: int, c: int,
-) -> None:  # fmt: skip
-    """Column ``c`` of ``J[k]``: velocity of p (and, in six rows, the turn) about an axis."""
-    a0, a1, a2 = f[i, axis, 0], f[i, axis, 1], f[i, axis, 2]
-    r0, r1, r2 = p0 - f[i, centre, 0], p1 - f[i, centre, 1], p2 - f[i, centre, 2]
-    J[k, 0, c] = a1 * r2 - a2 * r1
-    J[k, 1, c] = a2 * r0 - a0 * r2
-    J[k, 2, c] = a0 * r1 - a1 * r0
-    if J.shape[1] == 6:
-        J[k, 3, c], J[k, 4, c], J[k, 5, c] = a0, a1, a2
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _slide(f: Array, i: int, axis: int, J: Array, k: int, c: int) -> None:
-    """Column ``c`` of ``J[k]``, zeroed before: translation along an axis."""
-    J[k, 0, c], J[k, 1, c], J[k, 2, c] = f[i, axis, 0], f[i, axis, 1], f[i, axis, 2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def _carry(T: Array, tools: Array, t: int, T_out: Array, k: int) -> None:
     """``T_out[k]`` = T tools[t]."""
     for r in range(3):
@@ -229,43 +197,7 @@ def _carry(T: Array, tools: Array, t: int, T_out: Array, k: int) -> None:
     T_out[k, 3, 0], T_out[k, 3, 1], T_out[k, 3, 2], T_out[k, 3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _model_columns(slot: Index, frames: Array, T: Array, J: Array, k: int) -> None:
-    p0, p1, p2 = T[k, 0, 3], T[k, 1, 3], T[k, 2, 3]
-    for i in range(slot.shape[0]):
-        if slot[i, 0] >= 0:
-            _slide(frames, i, 0, J, k, slot[i, 0])
-        if slot[i, 1] >= 0:
-            _turn(frames, i, 0, 1, p0, p1, p2, J, k, slot[i, 1])
-        if slot[i, 2] >= 0:
-            _slide(frames, i, 2, J, k, slot[i, 2])
-        if slot[i, 3] >= 0:
-            _turn(frames, i, 2, 3, p0, p1, p2, J, k, slot[i, 3])
-        if slot[i, 4] >= 0:
-            _turn(frames, i, 4, 3, p0, p1, p2, J, k, slot[i, 4])
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _base_columns(T_root: Array, b: int, T: Array, J: Array, k: int) -> None:
-    r0, r1, r2 = T[k, 0, 3] - T_root[0, 3], T[k, 1, 3] - T_root[1, 3], T[k, 2, 3] - T_root[2, 3]
-    J[k, 0, b], J[k, 1, b + 1], J[k, 2, b + 2] = 1.0, 1.0, 1.0
-    J[k, 1, b + 3], J[k, 2, b + 3] = -r2, r1
-    J[k, 0, b + 4], J[k, 2, b + 4] = r2, -r0
-    J[k, 0, b + 5], J[k, 1, b + 5] = -r1, r0
-    if J.shape[1] == 6:
-        J[k, 3, b + 3], J[k, 4, b + 4], J[k, 5, b + 5] = 1.0, 1.0, 1.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _tool_columns(T_flange: Array, t: int, J: Array, k: int) -> None:
-    for r in range(3):
-        for c in range(3):
-            J[k, r, t + c] = T_flange[r, c]
-            if J.shape[1] == 6:
-                J[k, 3 + r, t + 3 + c] = T_flange[r, c]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def parameter_batch(
     q: Array,
     links: Array,
@@ -302,8 +234,8 @@ def parameter_batch(
                 frame = _bend(links, i, frame)
             _store(frame, T_flange)
             _carry(T_flange, tools, target[k], T_out, k)
-            _model_columns(slot, frames, T_out, J, k)
+            model_columns(slot, frames, T_out, J, k)
             if base_column >= 0:
-                _base_columns(T_root, base_column, T_out, J, k)
+                base_columns(T_root, base_column, T_out, J, k)
             if tool_column[target[k]] >= 0:
-                _tool_columns(T_flange, tool_column[target[k]], J, k)
+                tool_columns(T_flange, tool_column[target[k]], J, k)

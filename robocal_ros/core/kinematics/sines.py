@@ -1,12 +1,10 @@
-"""Cosine and sine, compiled: to 2 ulp, in vector registers, the same bits on every machine.
-
-It is built into the kernels: numba notices a change here only after theirs (``make clean``).
-"""
+"""Cosine and sine, compiled: to 2 ulp, in vector registers, the same bits on every machine."""
 
 import math
 
 import numpy as np
-from numba import njit
+
+from robocal_ros.core.compiled import inlined
 
 # pi/2 in three parts: the first two have 33 bits, so that n times them is exact for n < 2^20.
 _HALF_PI = (
@@ -19,7 +17,7 @@ _S = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(1, 9))
 _C = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(2, 9))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def reduced_cos_sin(angle: float) -> tuple[float, float]:
     """Cosine and sine to 2 ulp, without a branch, for angles up to 1e6.
 
@@ -42,7 +40,7 @@ def reduced_cos_sin(angle: float) -> tuple[float, float]:
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@inlined
 def cos_sin(angle: float) -> tuple[float, float]:
     """Cosine and sine of any angle."""
     if abs(angle) > LARGEST_ANGLE:

@@ -36,6 +36,11 @@ class ColdReference:
     data: Measurements
     rejected: tuple[str, ...] = ()
 
+    @property
+    def used(self) -> Measurements:
+        """The measurements that placed base and targets."""
+        return self.data.take(~np.isin(self.data.sample, self.rejected))
+
 
 def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
     """Place base and targets from a cold visit with the cold model ``arm``.
@@ -52,15 +57,15 @@ def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
     """
     require_match(arm, data, base=True, tool=True)
     placed = identify(arm, data, fit=("base", "tool"), method="lsq")
-    used = data.take(~placed.estimate.rejected)
-    rms = summarise(placed.cell.residual(used)).rms_m
+    reference = ColdReference(placed.cell, data, placed.rejected)
+    rms = summarise(placed.cell.residual(reference.used)).rms_m
     if rms > LARGEST_RMS_M:
         raise ResidualError(
             f"the cold visit misses the model by {rms * 1e3:.1f} mm rms, more than any robot's "
             f"static error ({LARGEST_RMS_M * 1e3:.0f} mm): check robot file, units, joint signs "
             "and target names"
         )
-    return ColdReference(placed.cell, data, placed.rejected)
+    return reference
 
 
 def against_reference(reference: ColdReference, warm: Measurements, sigma_m: float) -> Measurements:

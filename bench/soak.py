@@ -1,0 +1,186 @@
+"""The long form of what the tests show briefly: ``make soak``, or ``python -m bench.soak --short``.
+
+Kills at random moments, other random examples in each round, hours of a live graph, more simulated
+robots. Writes out/soak/soak.md, with ``--keep`` docs/figures/soak.md too.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from bench import monte_carlo
+from bench.__main__ import about
+from bench.tables import Goal, Table, show
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT, KEPT = ROOT / "out" / "soak", ROOT / "docs" / "figures"
+
+ROBOTS = 4  # nodes that one round of the test of kills kills
+MOST_GROWTH_MB = 10.0
+
+
+@dataclass(frozen=True)
+class Amount:
+    """How much of each."""
+
+    history_kills: int
+    node_kills: int
+    history_runs: int
+    seeds: int
+    live_s: float
+    robots: int
+
+
+LONG = Amount(2000, 80, 1000, 40, 3600.0, 6000)
+SHORT = Amount(300, 60, 50, 2, 120.0, 600)
+
+
+def _pytest(*words: str, **variables: str) -> bool:
+    """Whether these tests pass; what they say goes to the terminal."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *words]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | variables, check=False)
+    return done.returncode == 0
+
+
+def endurance(amount: Amount) -> Table:
+    """Kills, random work on a history, properties with other examples."""
+    table = Table(
+        "endurance",
+        "Endurance",
+        ("what", "how often", "failed", "goal", "took, s"),
+        "After a kill the old or the new state is in force, whole; properties hold for other "
+        "random examples in each round.",
+    )
+
+    def add(what: str, count: int, work: Callable[[], int]) -> None:
+        start = time.monotonic()
+        failed = work()
+        table.add(what, count, int(failed), Goal(failed, 0), round(time.monotonic() - start))
+
+    add("history killed while it accepts, kill -9", amount.history_kills,
+        lambda: _history_kills(amount.history_kills))  # fmt: skip
+    rounds = -(-amount.node_kills // ROBOTS)
+    kills = ("test/nodes/test_thermal_node.py", "-k", "kill_during_accept")
+    add("thermal_node killed during ~/accept, kill -9", rounds * ROBOTS,
+        lambda: not _pytest(*kills, ROBOCAL_KILL_ROUNDS=str(rounds)))  # fmt: skip
+    add("random work of several users on one history, 100 steps each", amount.history_runs,
+        lambda: _history_runs(amount.history_runs))  # fmt: skip
+    properties = ("-m", "hypothesis and not ros", "test/core", "test/storage", "test/sessions")
+    add("all property tests, each time with other examples", amount.seeds,
+        lambda: sum(not _pytest(*properties, f"--hypothesis-seed={seed}")
+                    for seed in range(amount.seeds)))  # fmt: skip
+    return table
+
+
+def _history_kills(count: int) -> int:
+    """How many kills left neither the old nor the new state."""
+    worker = ROOT / "test" / "storage" / "history_workers.py"
+    with tempfile.TemporaryDirectory() as folder:
+        command = [sys.executable, worker, "kill_while_accepting", folder, count, time.time_ns()]
+        done = subprocess.run([str(w) for w in command], stdout=subprocess.PIPE, check=True)
+    failed = before = 0
+    for killed, told, found in json.loads(done.stdout):
+        old = before if told < 0 else told
+        failed += not (killed and found in (old, old + 1))
+        before = found
+    return failed
+
+
+def _history_runs(count: int) -> int:
+    from hypothesis import settings
+    from hypothesis.stateful import run_state_machine_as_test
+
+    sys.path.insert(0, str(ROOT / "test" / "storage"))
+    from test_history_rules import History
+
+    plan = settings(max_examples=count, stateful_step_count=100, deadline=None, database=None)
+    try:
+        run_state_machine_as_test(History, settings=plan)
+    except AssertionError as error:
+        print(error, file=sys.stderr)
+        return 1
+    return 0
+
+
+def live(seconds: float) -> Table:
+    """thermal_node and joint_correction_node under load: latency, loss and memory."""
+    from bench.soak_graph import LoadedGraph
+
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    with tempfile.TemporaryDirectory() as folder, closing(LoadedGraph(Path(folder))) as graph:
+        graph.run(min(60.0, seconds / 2))  # until caches are full
+        begin = graph.memory_mb()
+        graph.forget()
+        graph.run(seconds)
+        end, lost = graph.memory_mb(), graph.lost()
+    table = Table(
+        "live",
+        f"Live graph under load for {seconds:.0f} s",
+        (
+            "node",
+            "answer",
+            "n",
+            "median, ms",
+            "99 %, ms",
+            "longest, ms",
+            "memory, MB",
+            "grew, MB",
+            "goal",
+        ),
+        f"{graph.RATE_HZ} joint states and {graph.RATE_HZ} joint targets per second, a correction "
+        f"in force; {lost} of them had no answer. Latency from one Python process to the node and "
+        "back. Memory: resident; growth after the first minute.",
+    )
+    for name, what, times in graph.latencies():
+        ms = np.array(times) * 1e3
+        grew = end[name] - begin[name]
+        table.add(
+            name, what, len(ms), float(np.median(ms)), float(np.quantile(ms, 0.99)),
+            float(ms.max()), end[name], grew, Goal(grew, MOST_GROWTH_MB),
+        )  # fmt: skip
+    return table
+
+
+def simulated(robots: int) -> Sequence[Table]:
+    """The simulated truth of ``make bench``, with more robots and so with narrower bounds."""
+    monte_carlo.RUNS = robots
+    return [monte_carlo.efficiency_table(), monte_carlo.sigma_table()]
+
+
+def _write(folder: Path, tables: Sequence[Table], words: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    body = "\n".join(table.markdown() for table in tables)
+    (folder / "soak.md").write_text(f"Made by {words}.\n\n{body}")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Do all of it; 1 when something failed or a goal is missed."""
+    parser = argparse.ArgumentParser(prog="python -m bench.soak", description=__doc__)
+    parser.add_argument("--short", action="store_true", help="minutes, to see that it works")
+    parser.add_argument("--keep", action="store_true", help="write docs/figures too")
+    given = parser.parse_args(arguments)
+    amount = SHORT if given.short else LONG
+    start = time.monotonic()
+    tables = [live(amount.live_s), *simulated(amount.robots), endurance(amount)]
+    show(tables)
+    facts = about(time.monotonic() - start) | {"cpus": str(os.cpu_count())}
+    command = "make soak SOAK=--short" if given.short else "make soak"
+    words = f"`{command}`: " + ", ".join(f"{name} {value}" for name, value in facts.items())
+    for folder in (OUT, KEPT) if given.keep else (OUT,):
+        _write(folder, tables, words)
+        print(f"written: {folder / 'soak.md'}")
+    return 0 if all(table.met for table in tables) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""What a session did not use, by topic and reason."""
+
+import re
+from collections import Counter
+
+MOST_REASONS = 30
+_NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
+
+
+class Ignored(dict[str, Counter[str]]):
+    """Counts by topic and reason; numbers (put as '#') do not tell reasons apart."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: dict[tuple[str, str], str] = {}
+
+    def add(self, topic: str, reason: str, count: int = 1) -> None:
+        """Count samples that are not used."""
+        counter = self.setdefault(topic, Counter())
+        key = _NUMBER.sub("#", reason)
+        key = key if key in counter or len(counter) < MOST_REASONS else "other"
+        counter[key] += count
+        self._last[topic, key] = reason
+
+    def last(self, topic: str, key: str) -> str:
+        """The latest reason that was counted under a key, with its numbers."""
+        return self._last[topic, key]
+
+    def words(self) -> str:
+        """Tell the most frequent reason of each topic; empty when nothing was ignored."""
+        parts = [
+            f"{counter.total()} of {topic} ({self._last[topic, counter.most_common(1)[0][0]]})"
+            for topic, counter in self.items()
+        ]
+        return f"ignored: {', '.join(parts)}" if parts else ""

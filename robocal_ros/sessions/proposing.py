@@ -1,0 +1,170 @@
+"""From the measurements of a command to a proposal in the history."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.assessment import Verdict, summarise
+from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import (
+    identification_document,
+    identified_model_document,
+    reference_document,
+)
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_hold_out
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import THERMAL, Proposal
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.identification import capture_reference, identify_drift
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.in_force import REFERENCE, InForce
+from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig
+
+
+class Proposer:
+    """Solves what a command asks for, against what is in force, and keeps the result.
+
+    Parameters
+    ----------
+    current : what is in force, followed by the session.
+    prior : (k, k) covariance of the expected drift, SI.
+    """
+
+    def __init__(
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: ThermalConfig,
+        software: str,
+        current: InForce,
+        prior: NDArray[np.float64],
+    ) -> None:
+        self._nominal = nominal
+        self._history = history
+        self._config = config
+        self._software = software
+        self._current = current
+        self._prior = prior
+
+    def capture(self, command: Command, data: Measurements, wall_ns: int) -> Outcome:
+        """Make the cold reference of these measurements and bring it into force.
+
+        Raises
+        ------
+        RobocalError
+            When they cannot be one, or the history refuses.
+        """
+        reference = capture_reference(self._current.arm, data)
+        rms_mm = summarise(reference.cell.residual(reference.used)).rms_m * 1e3
+        message = (
+            f"cold reference of {len(data)} measurements captured, residual {rms_mm:.3f} mm rms"
+        )
+        if reference.rejected:
+            message += (
+                f" of the {len(reference.used)} that fit; not fitting: "
+                f"{', '.join(reference.rejected)}"
+            )
+        document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
+        verdict = Verdict(Code.ACCEPT, message)
+        model = reference_document(reference)
+        chosen = self._propose(REFERENCE, command, wall_ns, "lsq", verdict, document, model, data)
+        self._history.accept(
+            chosen,
+            by=str(command.arguments.get("by", "")),
+            reason="captured",
+            expected_head=None,
+            wall_ns=wall_ns,
+        )
+        return Outcome(command, Code.ACCEPT, message, calibration_id=chosen, samples=len(data))
+
+    def method(self, command: Command) -> Method:
+        """Tell the estimator that a command names, else the configured one.
+
+        Raises
+        ------
+        InputError
+            When there is no such estimator.
+        """
+        named = str(command.arguments.get("method") or self._config.method)
+        for method in METHODS:
+            if method == named:
+                return method
+        raise InputError(f"method '{named}' is not one of {', '.join(METHODS)}")
+
+    def identify(
+        self, command: Command, data: Measurements, method: Method, wall_ns: int
+    ) -> Outcome:
+        """Identify a model from these measurements, judge it and propose it.
+
+        Raises
+        ------
+        RobocalError
+            When they cannot answer, or the history refuses.
+        """
+        judged = self._solve(data, method)
+        document = identification_document(judged)
+        cycle_id = str(command.arguments.get("cycle_id", ""))
+        document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
+        verdict = judged.verdict
+        model = identified_model_document(judged.identification)
+        if self._current.reference is not None:
+            model["reference_mdh"] = self._current.reference.cell.arm.mdh.tolist()
+        chosen = self._propose(THERMAL, command, wall_ns, method, verdict, document, model, data)
+        return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
+
+    def _solve(self, data: Measurements, method: Method) -> JudgedIdentification:
+        current = self._current
+        if current.reference is not None:
+            return identify_drift(
+                self._nominal,
+                current.reference,
+                data,
+                sigma_m=self._config.sigma_m,
+                in_force=current.arm,
+                prior_covariance=self._prior,
+                method=method,
+            )
+        return identify_and_hold_out(
+            self._nominal,
+            data,
+            share=self._config.hold_out,
+            seed=self._config.seed,
+            method=method,
+            in_force=current.arm if current.head.model is not None else None,
+        )
+
+    def _propose(
+        self,
+        kind: str,
+        command: Command,
+        wall_ns: int,
+        method: str,
+        verdict: Verdict,
+        document: dict[str, Any],
+        model: dict[str, Any],
+        data: Measurements,
+    ) -> int:
+        # What it was solved against, though another process may have decided meanwhile.
+        head = self._current.head if kind == THERMAL else self._history.head(kind)
+        held_out = document.get("calibrated", {}).get("held_out", {})
+        return self._history.propose(
+            Proposal(
+                kind=kind,
+                model_hash=self._nominal.model_hash,
+                based_on=head.revision,
+                cycle_id=str(command.arguments.get("cycle_id", "")),
+                stamp_ns=command.stamp_ns or 0,
+                created_ns=wall_ns,
+                software=self._software,
+                method=method,
+                code=verdict.code,
+                reason=verdict.reason,
+                candidate_rms_mm=held_out.get("rms_mm"),
+                document=document,
+                model=model,
+                inputs=data.arrays(),
+            )
+        )
