@@ -9,11 +9,14 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.flange_identification import (
+    identify_and_judge_flange_sensor,
+    identify_flange_sensor,
+)
 from robocal_ros.core.thermal.flange_sensor import (
     FlangeSensorProblem,
     MeasuringRobot,
     hand_eye_start,
-    identify_flange_sensor,
     in_sessions,
 )
 from robocal_ros.storage.robots import load_robot
@@ -143,6 +146,34 @@ def test_a_still_sphere_from_one_place_is_refused(nominal, built):
         identify_flange_sensor(nominal, still)
     with pytest.raises(TooFewSamplesError, match="4 measurements"):
         identify_flange_sensor(nominal, look(built, 4, 11, ("a",)))
+
+
+def test_a_calibration_is_judged_on_an_unseen_session(nominal, built):
+    train, check = look(built, 80, 3, sigma=SIGMA), look(built, 40, 4, sigma=SIGMA)
+    judged = identify_and_judge_flange_sensor(nominal, [train], check)
+    assert judged.verdict.accept, judged.verdict.reason
+    assert judged.candidate.mean_m < 0.3 * judged.nominal.mean_m
+    assert judged.candidate.rms_m < 1.2 * judged.predicted_total_rms_m
+    held_out = identify_and_judge_flange_sensor(nominal, [train])
+    assert held_out.candidate.n == 40
+
+
+def near(arm: SerialArm, data: Measurements, keep: int) -> Measurements:
+    """The samples whose wrist is turned least: a plausible and poor choice of poses."""
+    turn = np.sum(np.abs(data.q[:, 3:] - np.median(data.q[:, 3:], axis=0)), axis=1)
+    return data.take(np.sort(np.argsort(turn)[:keep]))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_makes_an_unseen_session_worse_is_never_accepted(nominal, built, seed):
+    """Training that does not cover what is checked, with an unmodelled bias of 0.3 mm."""
+    train = near(nominal, look(built, 150, 20 + seed, sigma=SIGMA), 16)
+    bias = 3e-4 * np.random.default_rng(seed).standard_normal(train.position.shape)
+    train.position[:] += bias
+    check = look(built, 80, 40 + seed, sigma=SIGMA)
+    judged = identify_and_judge_flange_sensor(nominal, [train], check)
+    if judged.candidate.rms_m >= judged.nominal.rms_m:
+        assert not judged.verdict.accept
 
 
 def test_sigma_must_be_given_in_all_sessions(built):

@@ -13,11 +13,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import estimation, frames
+from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.core.identification.priors import default_prior, fitted_prior
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.observability import describe
 from robocal_ros.core.samples import Measurements
 
 Array = NDArray[np.float64]
@@ -57,8 +55,14 @@ class MeasuringRobot:
 
     def scatter(self, data: Measurements) -> Array:
         """Measured centres less the mean of their sphere (m, 3), m: the centres are refitted."""
-        points = self.in_base(data)
-        return np.asarray(points - _means(data, points)[data.target_index(data.targets)])
+        means = self.means(data)
+        return np.asarray(self.in_base(data) - means[data.target_index(data.targets)])
+
+    def means(self, data: Measurements) -> Array:
+        """Mean (s, 3) in base, m, of the measured centres of each of the data's spheres."""
+        index, points = data.target_index(data.targets), self.in_base(data)
+        sums = np.stack([np.bincount(index, points[:, i]) for i in range(3)], axis=1)
+        return np.asarray(sums / np.bincount(index)[:, None])
 
 
 def in_sessions(sessions: Sequence[Measurements]) -> Measurements:
@@ -205,93 +209,4 @@ def hand_eye_start(arm: SerialArm, data: Measurements) -> MeasuringRobot:
         )
     R = frames.nearest_rotation(x[:9].reshape(3, 3).T)
     start = MeasuringRobot(arm, frames.transform(R, x[9:12]), spheres, np.zeros((len(spheres), 3)))
-    return replace(start, centres=_means(data, start.in_base(data)))
-
-
-def _means(data: Measurements, points: Array) -> Array:
-    """Mean (s, 3) of the points (m, 3) of each target."""
-    index = data.target_index(data.targets)
-    sums = np.stack([np.bincount(index, points[:, i]) for i in range(3)], axis=1)
-    return np.asarray(sums / np.bincount(index)[:, None])
-
-
-@dataclass(frozen=True)
-class FlangeSensorIdentification:
-    """An identified measuring robot with its uncertainty.
-
-    ``unobservable``: directions, in words, that the data leave to the prior. ``noise_m``: standard
-    deviation of a measured coordinate, as given or as found.
-    """
-
-    nominal: SerialArm
-    cell: MeasuringRobot
-    problem: FlangeSensorProblem
-    estimate: estimation.Estimate[MeasuringRobot]
-    unobservable: tuple[str, ...]
-    rejected: tuple[str, ...]
-    noise_m: float
-
-    def predicted_variance(self, data: Measurements) -> Array:
-        """Predicted variance (m,) of the distance from each sphere's mean, m^2, without noise."""
-        problem = replace(self.problem, data=data, spheres=data.targets, sigma=np.ones(len(data)))
-        index = data.target_index(data.targets)
-        centres = _means(data, self.cell.in_base(data))
-        _, J = problem.linearise(replace(self.cell, spheres=data.targets, centres=centres))
-        k = problem.count + 6
-        rows = J[:, :, :k]
-        for i in range(len(data.targets)):  # the centres are refitted: a common shift is not seen
-            rows[index == i] -= rows[index == i].mean(axis=0)
-        spread = self.estimate.covariance[:k, :k]
-        return np.asarray(np.einsum("mik,kl,mil->m", rows, spread, rows))
-
-
-def identify_flange_sensor(
-    arm: SerialArm, data: Measurements, *, geometry: bool = True, robust: bool = True
-) -> FlangeSensorIdentification:
-    """Solve hand-eye pose and centres, and with ``geometry`` all model parameters.
-
-    The parameters have building tolerances as prior, scaled to what the data show
-    (``priors.fitted_prior``).
-
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the data cannot answer.
-    """
-    start = hand_eye_start(arm, data)
-    sigma = np.ones(len(data)) if data.sigma is None else data.sigma
-    problem = FlangeSensorProblem(arm, data, start.spheres, geometry, sigma)
-
-    def solve(state: MeasuringRobot, variance: Array | None) -> estimation.Estimate[MeasuringRobot]:
-        prior = None
-        if variance is not None:
-            prior = np.zeros((len(problem.names),) * 2)
-            prior[: len(variance), : len(variance)] = np.diag(1.0 / variance)
-        return estimation.solve(
-            problem,
-            state,
-            prior_information=prior,
-            noise_known=data.sigma is not None,
-            robust=robust,
-        )
-
-    if geometry:
-        count = problem.count
-        first = solve(start, default_prior(arm))
-        found = arm.parameters.read(first.state.arm.mdh - arm.mdh)
-        estimate = solve(first.state, fitted_prior(arm, found, first.covariance[:count, :count]))
-    else:
-        estimate = solve(start, None)
-    known = 1.0 if data.sigma is None else float(np.sqrt(np.mean(data.sigma**2)))
-    return FlangeSensorIdentification(
-        nominal=arm,
-        cell=estimate.state,
-        problem=problem,
-        estimate=estimate,
-        unobservable=tuple(
-            describe(direction, problem.names, problem.to_display)
-            for direction in estimate.observability.null.T
-        ),
-        rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
-        noise_m=estimate.scale * known,
-    )
+    return replace(start, centres=start.means(data))
