@@ -74,6 +74,29 @@ class ColdSpots:
             )
         return np.asarray(spot, dtype=np.int64)
 
+    def average(self, warm: Measurements, sigma_m: float) -> Measurements:
+        """Average the visits of each spot; ``sigma`` is of the mean.
+
+        ``sigma_m``: of one visit, where the measurements have none of their own.
+
+        Raises
+        ------
+        InputError
+            When a measurement has no cold counterpart.
+        """
+        _, place, count = np.unique(self.match(warm), return_inverse=True, return_counts=True)
+        mean = np.zeros((len(count), len(warm)))
+        mean[place, np.arange(len(warm))] = 1.0 / count[place]
+        sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
+        rows = [np.flatnonzero(place == i) for i in range(len(count))]
+        return Measurements(
+            q=mean @ warm.q,
+            position=mean @ warm.position,
+            target=tuple(warm.target[row[0]] for row in rows),
+            sample=tuple("+".join(warm.sample[i] for i in row) for row in rows),
+            sigma=np.sqrt(mean**2 @ sigma**2),
+        )
+
     def drift(self, warm: Measurements) -> Array:
         """Displacement (m, 3) of the targets since the cold visit, m, measuring axes.
 

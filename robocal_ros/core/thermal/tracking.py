@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.errors import StaleError
 from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.agreement import agreeing
 from robocal_ros.core.thermal.process import DriftProcess
 from robocal_ros.core.thermal.spots import ColdSpots
 
 Array = NDArray[np.float64]
 
-FALSE_SAMPLE = 0.001  # chance that a sound cycle loses a sample
 FALSE_ALARM = 0.001  # chance that a sound cycle is not applied
 FEWEST_SHARE = 0.5  # of a cycle's samples that must agree
 SETUP = 6
@@ -129,7 +129,7 @@ class DriftTracker:
         """
         state = self.at(time_s)
         y, H, R = self._observation(cycle)
-        keep = _agreeing(y - H @ state.mean, H @ state.covariance @ H.T + R, len(cycle))
+        keep = agreeing(y - H @ state.mean, H @ state.covariance @ H.T + R, len(cycle))
         rows = np.repeat(keep, 3)
         v = (y - H @ state.mean)[rows]
         PH = state.covariance @ H[rows].T
@@ -165,26 +165,3 @@ class DriftTracker:
     def with_process(self, process: DriftProcess) -> "DriftTracker":
         """The tracker of the same reference, at its start, with another process."""
         return DriftTracker(self.spots, process, self.sigma_m, self.state.time_s)
-
-
-def _agreeing(innovation: Array, S: Array, count: int) -> NDArray[np.bool_]:
-    """Which samples (m,) fit what the others and the forecast say of them.
-
-    The worst is left out until all fit: its part of S^-1 v, in units of that part's own spread,
-    is the error of a forecast from everything else (leave-one-out).
-    """
-    keep = np.ones(count, dtype=np.bool_)
-    limit = chi2_quantile(1.0 - FALSE_SAMPLE / count, 3)
-    while np.sum(keep) > 1:
-        rows = np.repeat(keep, 3)
-        inverse = np.linalg.inv(S[np.ix_(rows, rows)])
-        pull = (inverse @ innovation[rows]).reshape(-1, 3)
-        own = inverse.reshape(len(pull), 3, len(pull), 3)[
-            np.arange(len(pull)), :, np.arange(len(pull))
-        ]
-        squared = np.einsum("mi,mi->m", pull, np.linalg.solve(own, pull[..., None])[..., 0])
-        worst = int(np.argmax(squared))
-        if squared[worst] <= limit:
-            break
-        keep[np.flatnonzero(keep)[worst]] = False
-    return keep

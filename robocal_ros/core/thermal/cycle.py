@@ -1,0 +1,175 @@
+"""The drift that one measuring cycle shows, and its judgement: maximum a posteriori, closed form.
+
+Drifts are so small that the model is linear in them (0.1 mrad over 3 m: the second order is
+30 nm). With y the displacement of the targets since the cold visit, ``y = A x + B s - b + v``:
+x the parameters' drift, s the set-up's shift, b the cold visit's noise and v the warm one's.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
+from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.observability import Observability, describe, observability
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.agreement import agreeing, left_out
+from robocal_ros.core.thermal.process import SETUP_SIGMA_M
+from robocal_ros.core.thermal.spots import ColdSpots
+
+Array = NDArray[np.float64]
+
+FEWEST_POSES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class CycleDrift:
+    """A drift identified from one cycle.
+
+    Attributes
+    ----------
+    drift, covariance : (k,) of the free parameters since the cold visit, and (k, k), SI.
+    arm : the cold arm with the drift added.
+    warm : the visits, those of one pose averaged; m of them.
+    left_out : (m, 3) displacement at each sample less what all other samples say of it, m.
+    left_out_sigma : (m,) rms length of the same that the covariances predict, m.
+    rejected : (m,) samples that the others contradict.
+    seen, unobservable : what the data alone determine, and what not, in words.
+    """
+
+    drift: Array
+    covariance: Array
+    arm: SerialArm
+    warm: Measurements
+    left_out: Array
+    left_out_sigma: Array
+    rejected: NDArray[np.bool_]
+    seen: Observability
+    unobservable: tuple[str, ...]
+
+
+def identify_cycle(
+    spots: ColdSpots,
+    warm: Measurements,
+    *,
+    prior_covariance: Array,
+    sigma_m: float,
+    setup_sigma_m: float = SETUP_SIGMA_M,
+) -> CycleDrift:
+    """Identify all free parameters from one cycle.
+
+    Visits of one pose are averaged first: they share the noise of its cold visit, and none may
+    judge another.
+
+    Parameters
+    ----------
+    prior_covariance : (k, k), SI, of the drift since the cold visit.
+    sigma_m : standard deviation of one coordinate of one visit, of the cold ones and of warm
+        ones without a sigma of their own.
+
+    Raises
+    ------
+    InputError
+        When a sample has no cold counterpart.
+    TooFewSamplesError
+        With fewer than two poses.
+    """
+    warm = spots.average(warm, sigma_m)
+    if len(warm) < FEWEST_POSES:
+        raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
+    spot = spots.match(warm)
+    y = spots.drift(warm).ravel()
+    parameters, setup = spots.rows(warm.q, spots.target[spot])
+    A, B = parameters.reshape(len(y), -1), setup.reshape(len(y), -1)
+    variance = _variance(spots, spot, warm, sigma_m)
+    R = np.diag(np.repeat(variance, 3)) + setup_sigma_m**2 * B @ B.T
+    S = A @ prior_covariance @ A.T + R
+    keep = agreeing(y, S, len(warm))
+    rows = np.repeat(keep, 3)
+    gain = np.linalg.solve(S[np.ix_(rows, rows)], A[rows] @ prior_covariance).T
+    drift = gain @ y[rows]
+    covariance = prior_covariance - gain @ A[rows] @ prior_covariance
+    miss, spread = left_out(y, S, keep)
+    arm = spots.cell.arm
+    seen = observability(A[rows])
+    chosen = arm.parameters
+    words = (describe(column, chosen.names, chosen.to_display) for column in seen.null.T)
+    return CycleDrift(
+        drift=drift,
+        covariance=0.5 * (covariance + covariance.T),
+        arm=arm.with_mdh(chosen.add(arm.mdh, drift)),
+        warm=warm,
+        left_out=miss,
+        left_out_sigma=spread,
+        rejected=~keep,
+        seen=seen,
+        unobservable=tuple(words),
+    )
+
+
+def _variance(
+    spots: ColdSpots, spot: NDArray[np.int64], warm: Measurements, sigma_m: float
+) -> Array:
+    """Variance (m,) of one coordinate of a displacement: warm and cold noise."""
+    sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
+    return np.asarray(sigma**2 + sigma_m**2 / spots.visits[spot])
+
+
+@dataclass(frozen=True)
+class JudgedCycle:
+    """A cycle's drift with its figures on measurements that were not used to solve.
+
+    Attributes
+    ----------
+    cold, current, candidate : errors of the cold model, of the one in force and of the
+        identified one.
+    predicted_total_rms_m : the candidate's error expected from its covariance and the noise.
+    """
+
+    cold: ErrorSummary
+    current: ErrorSummary
+    candidate: ErrorSummary
+    predicted_total_rms_m: float
+    held_out_rejected: tuple[str, ...]
+    verdict: Verdict
+
+
+def judge_cycle(
+    found: CycleDrift,
+    spots: ColdSpots,
+    *,
+    in_force: SerialArm,
+    check: Measurements | None = None,
+    doubt: str = "",
+    sigma_m: float,
+) -> JudgedCycle:
+    """Judge at the poses of ``check``, else at each pose of the cycle from the others.
+
+    ``in_force`` is an arm of the cold model's type; ``doubt`` says why the poses do not carry
+    over to the workspace (empty: they do).
+    """
+    data = found.warm if check is None else check
+    spot = spots.match(data)
+    y = spots.drift(data)
+    A = spots.rows(data.q, spots.target[spot])[0]
+    chosen, cold = spots.cell.arm.parameters, spots.cell.arm
+    current = np.linalg.norm(y - A @ chosen.read(in_force.mdh - cold.mdh), axis=1)
+    if check is None:
+        after, spread = np.linalg.norm(found.left_out, axis=1), found.left_out_sigma
+        usable = ~found.rejected
+    else:
+        after = np.linalg.norm(y - A @ found.drift, axis=1)
+        noise = 3.0 * _variance(spots, spot, data, sigma_m)
+        spread = np.sqrt(np.einsum("mik,kl,mil->m", A, found.covariance, A) + noise)
+        usable = np.ones(len(data), dtype=np.bool_)
+    sound = usable & ~gross(current, after)
+    return JudgedCycle(
+        cold=summarise(np.linalg.norm(y, axis=1)[sound]),
+        current=summarise(current[sound]),
+        candidate=summarise(after[sound]),
+        predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
+        held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
+        verdict=judge(current[sound], after[sound], spot[sound], doubt),
+    )
