@@ -99,7 +99,7 @@ def test_a_wrong_sample_is_named_and_does_no_harm(arm):
     data.position[4, 1] += 1e-3
     found = calibrate_sensor(arm, data)
     assert found.rejected == ("4",)
-    assert np.linalg.norm(found.sphere_in_flange - BALL) < 5.0 * np.linalg.norm(found.sigma_m[6:])
+    assert np.linalg.norm(found.sphere_in_flange - BALL) < 5.0 * np.linalg.norm(found.sigma[6:])
 
 
 @pytest.mark.parametrize("method", ["ml", "classic"])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
 from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.observability import Observability, describe, observability
 from robocal_ros.core.samples import Measurements
@@ -36,6 +37,7 @@ class CycleDrift:
     left_out : (m, 3) displacement at each sample less what all other samples say of it, m.
     left_out_sigma : (m,) rms length of the same that the covariances predict, m.
     rejected : (m,) samples that the others contradict.
+    noise_m : rms standard deviation of a coordinate of the visits.
     seen, unobservable : what the data alone determine, and what not, in words.
     """
 
@@ -46,6 +48,7 @@ class CycleDrift:
     left_out: Array
     left_out_sigma: Array
     rejected: NDArray[np.bool_]
+    noise_m: float
     seen: Observability
     unobservable: tuple[str, ...]
 
@@ -104,6 +107,7 @@ def identify_cycle(
         left_out=miss,
         left_out_sigma=spread,
         rejected=~keep,
+        noise_m=float(np.sqrt(variance.mean())),
         seen=seen,
         unobservable=tuple(words),
     )
@@ -125,13 +129,17 @@ class JudgedCycle:
     ----------
     cold, current, candidate : errors of the cold model, of the one in force and of the
         identified one.
-    predicted_total_rms_m : the candidate's error expected from its covariance and the noise.
+    predicted_rms_m, predicted_total_rms_m : the candidate's error expected from its covariance,
+        alone and with the noise of both visits.
+    workspace_rms_m : the same as the first over postures throughout the joint limits.
     """
 
     cold: ErrorSummary
     current: ErrorSummary
     candidate: ErrorSummary
+    predicted_rms_m: float
     predicted_total_rms_m: float
+    workspace_rms_m: float
     held_out_rejected: tuple[str, ...]
     verdict: Verdict
 
@@ -169,7 +177,19 @@ def judge_cycle(
         cold=summarise(np.linalg.norm(y, axis=1)[sound]),
         current=summarise(current[sound]),
         candidate=summarise(after[sound]),
+        predicted_rms_m=_rms(A, found.covariance),
         predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
+        workspace_rms_m=_rms(_workspace_rows(spots), found.covariance),
         held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
         verdict=judge(current[sound], after[sound], spot[sound], doubt),
     )
+
+
+def _rms(rows: Array, covariance: Array) -> float:
+    """Rms length, m, of what a covariance (k, k) does to points with rows (m, 3, k)."""
+    return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+
+
+def _workspace_rows(spots: ColdSpots) -> Array:
+    q = random_postures(spots.cell.arm)
+    return spots.rows(q, np.zeros(len(q), dtype=np.int64))[0]

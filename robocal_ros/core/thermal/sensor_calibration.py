@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.assessment import LARGEST_RMS_M, Verdict
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RankDeficientError, ResidualError, TooFewSamplesError
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.identification.mismatch import require_match
@@ -54,9 +56,33 @@ class SensorCalibration:
     rejected: tuple[str, ...]
 
     @property
-    def sigma_m(self) -> Array | None:
+    def sigma(self) -> Array | None:
         """Standard deviations (9,) of ``NAMES``, m and rad."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+
+def sensor_verdict(found: SensorCalibration) -> Verdict:
+    """Decide whether a placed sensor can be used.
+
+    Drifts are compared pose by pose, so that an arm's static errors of a millimetre or two do no
+    harm; a placement that misses its own poses by more belongs to another robot or mistake.
+    """
+    judged = found.left_out[np.isfinite(found.left_out)]
+    if len(judged) < len(found.left_out):
+        open_poses = len(found.left_out) - len(judged)
+        return Verdict(
+            Code.TOO_FEW_SAMPLES,
+            f"without any of {open_poses} poses the others place nothing: measure more poses",
+        )
+    rms_m = float(np.sqrt(np.mean(judged**2)))
+    words = f"each pose from the others: {rms_m * 1e3:.3f} mm rms"
+    if rms_m > LARGEST_RMS_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words}, more than any robot's static error ({LARGEST_RMS_M * 1e3:.0f} mm): check "
+            "robot file, units, joint signs and which sphere was measured",
+        )
+    return Verdict(Code.ACCEPT, words)
 
 
 def calibrate_sensor(
