@@ -8,9 +8,13 @@ from robocal_ros.cli.command import Command
 from robocal_ros.cli.output import Outcome
 
 NAME = "thermal"
-HELP = "place the sensor, identify a thermal drift"
+HELP = "place the sensor, identify a thermal drift, learn what drift to expect"
 
-ACTIONS = {"calibrate-sensor": "thermal_sensor", "identify": "thermal_identify"}
+ACTIONS = {
+    "calibrate-sensor": "thermal_sensor",
+    "identify": "thermal_identify",
+    "learn-prior": "thermal_prior",
+}
 """Name of each action and its module."""
 
 

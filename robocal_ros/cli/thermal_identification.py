@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.cli.output import Document
 from robocal_ros.core import frames
@@ -16,9 +17,9 @@ from robocal_ros.core.thermal.documents import cycle_document, flange_sensor_doc
 from robocal_ros.core.thermal.flange_identification import identify_and_judge_flange_sensor
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.spots import ColdSpots
-
 from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits, require_cold_counterparts
-from robocal_ros.storage.sensor_files import read_sensor
+from robocal_ros.storage.prior_files import read_prior
+from robocal_ros.storage.sensor_files import PlacedSensor, read_sensor
 from robocal_ros.storage.tables import read_measurements, read_visits
 
 
@@ -30,6 +31,7 @@ class FixedRequest:
     cold_file: Path
     warm_file: Path
     check_file: Path | None
+    prior_file: Path | None
     parameters: tuple[str, ...]
     sigma_m: float
 
@@ -45,21 +47,13 @@ def identify_fixed_files(arm: SerialArm, request: FixedRequest) -> Document:
         When the data cannot answer.
     """
     sensor = read_sensor(request.sensor_file, arm)
-    cold, warm = read_visits(request.cold_file, arm), read_visits(request.warm_file, arm)
-    require_cold_counterparts(cold, warm, str(request.warm_file))
+    cold, spots = cold_spots(arm, sensor, request.cold_file)
+    warm = warm_visits(request.warm_file, arm, cold)
     check = None if request.check_file is None else _check(request.check_file, arm, cold, warm)
-    targets = cold.data.targets
-    if len(targets) > 1:
-        raise InputError(
-            f"{len(targets)} targets ({', '.join(targets)}): the sensor file knows one sphere",
-            file=str(request.cold_file),
-            column="target",
-        )
-    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
-    spots = ColdSpots.of(CellModel(arm, sensor.T_sensor_base, targets, tool), cold.data)
+    prior = drift_prior(arm) if request.prior_file is None else read_prior(request.prior_file, arm)
     documents = []
     for name in warm.cycles:
-        found = _solve(spots, warm.of_cycle(name), request)
+        found = _solve(spots, warm.of_cycle(name), request, prior)
         own = None if check is None else _of_cycle(check, name, warm.cycles[-1])
         unseen = None if own is None else own.data
         judged = judge_cycle(found, spots, in_force=arm, check=unseen, sigma_m=request.sigma_m)
@@ -72,14 +66,40 @@ def identify_fixed_files(arm: SerialArm, request: FixedRequest) -> Document:
             "sensor": str(request.sensor_file),
             "cold": str(request.cold_file),
             "warm": str(request.warm_file),
-            "check": None if request.check_file is None else str(request.check_file),
+            "check": _name(request.check_file),
+            "prior": _name(request.prior_file),
         },
     }
 
 
+def _name(path: Path | None) -> str | None:
+    return None if path is None else str(path)
+
+
+def cold_spots(arm: SerialArm, sensor: PlacedSensor, path: Path) -> tuple[Visits, ColdSpots]:
+    """Read a table of cold visits and average those of each pose."""
+    cold = read_visits(path, arm)
+    targets = cold.data.targets
+    if len(targets) > 1:
+        raise InputError(
+            f"{len(targets)} targets ({', '.join(targets)}): the sensor file knows one sphere",
+            file=str(path),
+            column="target",
+        )
+    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
+    cell = CellModel(arm, sensor.T_sensor_base, targets, tool)
+    return cold, ColdSpots.of(cell, cold.data)
+
+
+def warm_visits(path: Path, arm: SerialArm, cold: Visits) -> Visits:
+    """Read a table of warm visits of poses that were visited cold."""
+    warm = read_visits(path, arm)
+    require_cold_counterparts(cold, warm, str(path))
+    return warm
+
+
 def _check(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visits:
-    check = read_visits(path, arm)
-    require_cold_counterparts(cold, check, str(path))
+    check = warm_visits(path, arm, cold)
     shared = sorted(set(check.pose) & set(warm.pose))
     if shared:
         raise InputError(
@@ -99,10 +119,11 @@ def _of_cycle(check: Visits, name: str, last: str) -> Visits | None:
     return own if len(own.data) else None
 
 
-def _solve(spots: ColdSpots, cycle: Visits, request: FixedRequest) -> CycleDrift:
+def _solve(
+    spots: ColdSpots, cycle: Visits, request: FixedRequest, prior: NDArray[np.float64]
+) -> CycleDrift:
     if request.parameters:
         return identify_subset(spots, cycle.data, request.parameters, sigma_m=request.sigma_m)
-    prior = drift_prior(spots.cell.arm)
     return identify_cycle(spots, cycle.data, prior_covariance=prior, sigma_m=request.sigma_m)
 
 
@@ -124,6 +145,6 @@ def identify_flange_files(
     return flange_sensor_document(judged) | {
         "data": {
             "sessions": [str(path) for path in data_files],
-            "check": None if check_file is None else str(check_file),
+            "check": _name(check_file),
         }
     }

@@ -14,7 +14,7 @@ NAME = "identify"
 HELP = "identify a thermal drift, or the geometry of a measuring robot, and judge it"
 
 FIXED, FLANGE = "fixed-sensor", "flange-sensor"
-_FIXED_ONLY = ("sensor", "cold", "warm", "parameters")
+_FIXED_ONLY = ("sensor", "cold", "warm", "prior", "parameters")
 SIGMA_MM = 0.03
 
 
@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     fixed.add_argument("--sensor", type=Path, metavar="S.yaml", help="from calibrate-sensor")
     fixed.add_argument("--cold", type=Path, metavar="CSV", help="visits of the cold robot")
     fixed.add_argument("--warm", type=Path, metavar="CSV", help="visits of the warm robot")
+    fixed.add_argument("--prior", type=Path, metavar="P.yaml", help="from learn-prior, for map")
     fixed.add_argument(
         "--method",
         choices=("map", "subset"),
@@ -80,6 +81,7 @@ def run(args: argparse.Namespace) -> Outcome:
             cold_file=args.cold,
             warm_file=args.warm,
             check_file=args.check,
+            prior_file=args.prior,
             parameters=chosen,
             sigma_m=args.sigma_mm * 1e-3,
         )
@@ -105,3 +107,5 @@ def _require_sense(args: argparse.Namespace) -> None:
         raise InputError(f"--{missing[0]} is missing: {FIXED} needs --sensor, --cold and --warm")
     if (args.method == "subset") != (args.parameters is not None):
         raise InputError("--method subset and --parameters NAMES belong together")
+    if args.method == "subset" and args.prior is not None:
+        raise InputError("--prior is for --method map: a subset is solved without one")
