@@ -7,9 +7,9 @@ import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.cycle import identify_cycle, judge_cycle
+from robocal_ros.core.thermal.cycle import identify_cycle, identify_subset, judge_cycle
 from robocal_ros.core.thermal.identification import ColdReference, identify_drift
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.spots import ColdSpots
@@ -125,3 +125,38 @@ def test_one_pose_is_too_few(arm):
     spots = ColdSpots.of(cell, visit(cell, q))
     with pytest.raises(TooFewSamplesError, match="one pose"):
         identify_cycle(spots, visit(cell, q), prior_covariance=drift_prior(arm), sigma_m=SIGMA)
+
+
+NAMES = ("a1_mm", "a2_mm", "d4_mm", "beta2_deg")
+
+
+def test_a_subset_is_exact_where_only_it_drifts(arm):
+    cell, q = cell_of(arm), postures(6)
+    drift = np.where([name in NAMES for name in arm.parameters.names], 1e-4, 0.0)
+    drift = np.where(arm.parameters.is_length, drift, drift * 0.1)
+    spots = ColdSpots.of(cell, visit(cell, q))
+    found = identify_subset(spots, visit(drifted(cell, drift), q), NAMES, sigma_m=SIGMA)
+    assert found.drift == pytest.approx(drift, abs=1e-7)
+
+
+def test_a_subset_forecasts_a_pose_as_its_fit_without_it(arm):
+    cell, q, rng = cell_of(arm), postures(8), np.random.default_rng(6)
+    spots = ColdSpots.of(cell, visit(cell, q, rng))
+    warm = visit(drifted(cell, draw(arm, rng)), q, rng)
+    whole = identify_subset(spots, warm, NAMES, sigma_m=SIGMA)
+    for i in range(8):
+        others = identify_subset(spots, warm.take(np.arange(8) != i), NAMES, sigma_m=SIGMA)
+        one = warm.take(np.array([i]))
+        A = spots.rows(one.q, spots.target[spots.match(one)])[0][0]
+        assert whole.left_out[i] == pytest.approx(spots.drift(one)[0] - A @ others.drift, abs=1e-12)
+
+
+def test_parameters_that_poses_do_not_show_are_refused(arm):
+    q = np.tile(postures(1), (6, 1))
+    q[:, 5] += np.linspace(-1.0, 1.0, 6)
+    cell = cell_of(arm)
+    spots = ColdSpots.of(cell, visit(cell, q))
+    with pytest.raises(RankDeficientError, match="not determined by these poses"):
+        identify_subset(
+            spots, visit(cell, q), ("d1_mm", "a1_mm", "a2_mm", "theta1_deg"), sigma_m=SIGMA
+        )

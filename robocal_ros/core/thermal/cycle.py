@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
-from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.observability import Observability, describe, observability
@@ -110,6 +110,70 @@ def identify_cycle(
         noise_m=float(np.sqrt(variance.mean())),
         seen=seen,
         unobservable=tuple(words),
+    )
+
+
+def identify_subset(
+    spots: ColdSpots, warm: Measurements, names: tuple[str, ...], *, sigma_m: float
+) -> CycleDrift:
+    """Identify some parameters by least squares and hold the others (thesis eq. 3-8 to 3-10).
+
+    Raises
+    ------
+    InputError
+        When a name is unknown, or a sample has no cold counterpart.
+    TooFewSamplesError, RankDeficientError
+        When the poses cannot answer.
+    """
+    warm = spots.average(warm, sigma_m)
+    spot, arm = spots.match(warm), spots.cell.arm
+    unknown = [name for name in names if name not in arm.parameters.names]
+    if unknown:
+        raise InputError(
+            f"unknown parameter '{unknown[0]}'; this model has {', '.join(arm.parameters.names)}"
+        )
+    chosen = np.array([name in names for name in arm.parameters.names], dtype=np.bool_)
+    A = spots.rows(warm.q, spots.target[spot])[0].reshape(3 * len(warm), -1)[:, chosen]
+    if len(A) < A.shape[1] + 3:
+        raise TooFewSamplesError(
+            f"{len(warm)} poses give {len(A)} equations for {A.shape[1]} parameters: measure more"
+        )
+    seen = observability(A)
+    if seen.null.shape[1]:
+        words = [describe(column, names) for column in seen.null.T]
+        raise RankDeficientError(f"not determined by these poses: {'; '.join(words)}", words)
+    variance = float(_variance(spots, spot, warm, sigma_m).mean())
+    return _least_squares(spots, warm, A, chosen, variance, seen)
+
+
+def _least_squares(
+    spots: ColdSpots,
+    warm: Measurements,
+    A: Array,
+    chosen: NDArray[np.bool_],
+    variance: float,
+    seen: Observability,
+) -> CycleDrift:
+    """By singular values; each pose is forecast from the others by its leverage."""
+    y, arm = spots.drift(warm).ravel(), spots.cell.arm
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    drift, covariance = np.zeros(len(chosen)), np.zeros((len(chosen),) * 2)
+    drift[chosen] = Vt.T @ ((U.T @ y) / s)
+    covariance[np.ix_(chosen, chosen)] = variance * (Vt.T / s**2) @ Vt
+    residual = (y - U @ (U.T @ y)).reshape(-1, 3)
+    rows = U.reshape(len(warm), 3, -1)
+    own = np.linalg.inv(np.eye(3) - rows @ np.swapaxes(rows, 1, 2))
+    return CycleDrift(
+        drift=drift,
+        covariance=covariance,
+        arm=arm.with_mdh(arm.parameters.add(arm.mdh, drift)),
+        warm=warm,
+        left_out=np.einsum("mij,mj->mi", own, residual),
+        left_out_sigma=np.sqrt(variance * np.trace(own, axis1=1, axis2=2)),
+        rejected=np.zeros(len(warm), dtype=np.bool_),
+        noise_m=float(np.sqrt(variance)),
+        seen=seen,
+        unobservable=(),
     )
 
 
