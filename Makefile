@@ -101,8 +101,8 @@ $(STAMPS)/robocal_msgs: $(STAMPS)/wheels $(shell find msg_defs -type f)
 	$(COLCON) robocal_msgs --cmake-args -GNinja -DBUILD_TESTING=OFF
 	touch $@
 
-# Python sources are linked, not copied: only new entry points and config files need this again.
-$(STAMPS)/robocal_ros: $(STAMPS)/robocal_msgs $(PYTHON_FILES) resource/robocal_ros $(shell find config)
+# Python sources are linked, not copied: only new entry points, config and launch files need this again.
+$(STAMPS)/robocal_ros: $(STAMPS)/robocal_msgs $(PYTHON_FILES) resource/robocal_ros $(shell find config launch)
 	@rm -rf build/robocal_ros install/robocal_ros
 	$(COLCON) robocal_ros
 	touch $@

@@ -9,10 +9,10 @@ NAME = "robocal_ros"
 SHARE = Path("share", NAME)
 
 
-def config_files() -> list[tuple[str, list[str]]]:
-    """List every file below config/, folder by folder, with its place in the share folder."""
+def shared_files() -> list[tuple[str, list[str]]]:
+    """List what lies in config/ and launch/, by folder, with its place in the share folder."""
     folders: dict[str, list[str]] = {}
-    for path in sorted(Path("config").rglob("*")):
+    for path in sorted([*Path("config").rglob("*"), *Path("launch").glob("*.launch.py")]):
         if path.is_file():
             folders.setdefault(str(SHARE / path.parent), []).append(str(path))
     return list(folders.items())
@@ -30,7 +30,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (str(SHARE), ["package.xml"]),
-        *config_files(),
+        *shared_files(),
     ],
     python_requires=">=3.11",
     install_requires=["setuptools"],

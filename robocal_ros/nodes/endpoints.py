@@ -1,6 +1,7 @@
 """Inputs, outputs, services and timers of a lifecycle node, with the manners of this house."""
 
 import inspect
+import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from rclpy.timer import Timer
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.nodes import qos
+from robocal_ros.sessions.ignored import MOST_REASONS, kind_of
 
 LOG_EVERY_S = 5.0
 
@@ -37,12 +39,30 @@ class InputCount:
     lost: int = 0
 
 
+class LogLimit:
+    """One log line per topic and reason in `LOG_EVERY_S`: a flood hides no other reason."""
+
+    def __init__(self) -> None:
+        self._next_s: dict[str, dict[str, float]] = {}
+
+    def allows(self, topic: str, reason: str, now_s: float) -> bool:
+        """Whether to log this reason now (monotonic time); beyond 30 a topic's reasons share."""
+        times = self._next_s.setdefault(topic, {})
+        kind = kind_of(reason)
+        kind = kind if kind in times or len(times) < MOST_REASONS else "other"
+        if now_s < times.get(kind, now_s):
+            return False
+        times[kind] = now_s + LOG_EVERY_S
+        return True
+
+
 class EndpointNode(LifecycleNode):
     """A lifecycle node whose endpoints act only while it is active and go at its cleanup."""
 
     def __init__(self, name: str, **options: Any) -> None:
         super().__init__(name, **options)
         self.inputs: dict[str, InputCount] = {}
+        self._log_limit = LogLimit()
         self._async_group = ReentrantCallbackGroup()
         self._release: list[Callable[[], object]] = []
 
@@ -75,7 +95,8 @@ class EndpointNode(LifecycleNode):
                 callback(message)
             except RobocalError as error:
                 count.invalid += 1
-                self.get_logger().warning(f"{topic}: {error}", throttle_duration_sec=LOG_EVERY_S)
+                if self._log_limit.allows(topic, str(error), time.monotonic()):
+                    self.get_logger().warning(f"{topic}: {error}")
 
         def lose(event: Any) -> None:
             count.lost += event.total_count_change

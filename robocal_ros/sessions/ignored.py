@@ -7,6 +7,11 @@ MOST_REASONS = 30
 _NUMBER = re.compile(r"(?<![\w.])-?\d[\d.]*(e[+-]?\d+)?")
 
 
+def kind_of(reason: str) -> str:
+    """The reason with '#' for its numbers, which do not tell reasons apart."""
+    return _NUMBER.sub("#", reason)
+
+
 class Ignored(dict[str, Counter[str]]):
     """Counts by topic and reason; numbers (put as '#') do not tell reasons apart."""
 
@@ -17,7 +22,7 @@ class Ignored(dict[str, Counter[str]]):
     def add(self, topic: str, reason: str, count: int = 1) -> None:
         """Count samples that are not used."""
         counter = self.setdefault(topic, Counter())
-        key = _NUMBER.sub("#", reason)
+        key = kind_of(reason)
         key = key if key in counter or len(counter) < MOST_REASONS else "other"
         counter[key] += count
         self._last[topic, key] = reason

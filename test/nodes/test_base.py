@@ -18,7 +18,9 @@ from robocal_ros.core.errors import InputError, StaleError
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import WARN, Health
+from robocal_ros.nodes.endpoints import LOG_EVERY_S, LogLimit
 from robocal_ros.nodes.parameters import Setting
+from robocal_ros.sessions.ignored import MOST_REASONS
 
 
 class Doubler(HouseNode):
@@ -53,6 +55,8 @@ class Doubler(HouseNode):
     def on_number(self, message: Float64) -> None:
         if message.data < 0:
             raise InputError(f"{message.data} is negative")
+        if message.data > 1e6:
+            raise InputError(f"{message.data} is too large")
         self.output.publish(Float64(data=self.factor * message.data))
 
     def on_decide(self, request: Decide.Request, response: Decide.Response) -> Decide.Response:
@@ -233,3 +237,30 @@ def test_no_attribute_of_the_house_hides_one_of_rclpy(graph: Any) -> None:
     assert not (house - overridden) & taken
     own = set(vars(graph.add(Doubler, {"autostart": False}))) - set(vars(bare))
     assert not own & taken
+
+
+def test_a_flood_of_one_reason_hides_no_other(graph: Any, capfd: Any) -> None:
+    node = graph.add(Doubler)
+    number = graph.publisher(Float64, "number")
+    for value in (-1.0, -2.0, 2e6):
+        number.publish(Float64(data=value))
+    graph.spin_until(lambda: node.inputs["number"].invalid == 3, "all are refused")
+    log = capfd.readouterr().err
+    assert "number: -1.0 is negative" in log
+    assert "number: 2000000.0 is too large" in log
+
+
+def test_each_reason_of_a_topic_is_logged_once_in_a_while() -> None:
+    limit = LogLimit()
+    assert limit.allows("a", "-1.0 is negative", 100.0)
+    assert not limit.allows("a", "-2.5 is negative", 100.0 + 0.9 * LOG_EVERY_S)
+    assert limit.allows("a", "7 is too large", 100.1)
+    assert limit.allows("b", "-1.0 is negative", 100.1)
+    assert limit.allows("a", "-3.0 is negative", 100.0 + LOG_EVERY_S)
+
+
+def test_endless_reasons_neither_flood_the_log_nor_the_memory() -> None:
+    limit = LogLimit()
+    names = [f"joint {chr(ord('a') + i % 26)}{chr(ord('a') + i // 26)} missing" for i in range(600)]
+    logged = sum(limit.allows("a", name, 100.0) for name in names)
+    assert logged == MOST_REASONS + 1

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 import yaml
 from lifecycle_msgs.srv import GetState
+from rclpy.qos import ReliabilityPolicy
 
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.replay_node import ReplayNode
-from robocal_ros.nodes.thermal_node import ThermalNode
+from robocal_ros.nodes.thermal_node import INPUTS, ThermalNode
 
 CONFIG = Path(__file__).parents[2] / "config"
 NODES = (ThermalNode, ReplayNode)
@@ -29,3 +30,23 @@ def test_a_node_takes_the_file(graph, tmp_path):
     state = graph.call(GetState, "/thermal_node/get_state")
     assert state.current_state.label == "active", process.output
     graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
+
+
+def test_with_the_file_for_replays_no_input_loses_anything(graph):
+    path = CONFIG / "thermal_node_replay.yaml"
+    given = yaml.safe_load(path.read_text())["/**/thermal_node"]["ros__parameters"]
+    inputs = {f"/{name}" for name in INPUTS}
+    assert set(given.pop("qos_overrides")) == inputs
+    assert given.pop("use_sim_time")
+    assert set(given) <= {s.name for s in ThermalNode.SETTINGS}
+    graph.start("thermal_node", None, None, "--ros-args", "--params-file", str(path))
+
+    def reliability(topic: str) -> list[ReliabilityPolicy]:
+        infos = graph.probe.get_subscriptions_info_by_topic(topic)
+        return [info.qos_profile.reliability for info in infos]
+
+    graph.spin_until(
+        lambda: all(reliability(t) == [ReliabilityPolicy.RELIABLE] for t in inputs),
+        "all inputs are reliable",
+    )
+    graph.spin_until(lambda: reliability("/clock"), "it follows the clock")
