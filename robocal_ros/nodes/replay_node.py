@@ -1,4 +1,4 @@
-"""Plays a bag into the graph with /clock, and reports what was not received (docs/replay.md)."""
+"""Plays a bag into the graph with /clock; tells what was not received (docs/replay_node.md)."""
 
 import json
 import os
@@ -202,7 +202,8 @@ class ReplayNode(HouseNode):
         if doubt:
             self.get_logger().error(f"{state}: loss cannot be excluded: {doubt}")
         else:
-            self.get_logger().info(f"{state}: nothing was lost")
+            alone = self._topics.alone() if self._topics is not None else ""
+            self.get_logger().info(f"{state}: nothing was lost{alone}")
         if self.settings["exit_at_end"]:
             lost = state == FAILED or bool(doubt)
             self._status.wait_for_all_acked(Duration(seconds=1))

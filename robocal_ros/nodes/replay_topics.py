@@ -136,6 +136,11 @@ class ReplayTopics:
         ]
         return "; ".join(words)
 
+    def alone(self) -> str:
+        """Tell what nobody heard, to go on from a sentence; empty when all had a subscriber."""
+        counts = [f"{p.unheard} of {p.topic}" for p in self.played.values() if p.unheard]
+        return f"; nobody listened to {', '.join(counts)}" if counts else ""
+
     def close(self) -> None:
         """Take the publishers down."""
         for played in self.played.values():

@@ -1,6 +1,10 @@
 """A bag through the replay node, over real DDS."""
 
 import json
+import os
+import re
+import shlex
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +26,7 @@ from robocal_ros.nodes.replay_topics import chosen_topics
 from robocal_ros.storage.bags import BagWriter
 from robocal_ros.storage.robots import load_robot
 
+ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
 START_NS = 100 * NS
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -215,6 +220,8 @@ def test_play_waits_for_its_subscribers_and_says_for_which(graph, tmp_path):
     graph.spin_until(lambda: len(notes) == 2, "nothing was sent before")
     status = json.loads(reports[-1].data)
     assert status["unheard"] == {"/joint_states": 20, "/odd": 1}
+    told = "nothing was lost; nobody listened to 20 of /joint_states, 1 of /odd"
+    graph.spin_until(lambda: told in process.output, "the end says so")
 
 
 def test_waiting_for_what_is_not_played_is_refused(graph, tmp_path):
@@ -222,3 +229,16 @@ def test_waiting_for_what_is_not_played_is_refused(graph, tmp_path):
     process = graph.start("replay_node", {"bag": bag, "wait_for_subscribers": "[/nothing]"})
     graph.spin_until(lambda: "cannot configure" in process.output, "it is refused")
     assert "/nothing, which is not played" in process.output
+
+
+def test_the_commands_of_the_page_run_as_typed(graph):
+    """In the repository's root; those with exit_at_end tell by their status how it went."""
+    page = (ROOT / "docs" / "replay_node.md").read_text().replace("\\\n", " ")
+    blocks = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines()]
+    typed = [shlex.split(line, comments=True) for line in lines if "exit_at_end" in line]
+    assert typed
+    environment = os.environ | {"ROS_DOMAIN_ID": str(graph.domain)}
+    for words in typed:
+        done = subprocess.run(words, cwd=ROOT, env=environment, timeout=60, check=False)
+        assert done.returncode == 0, words
