@@ -9,7 +9,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from robocal_msgs.msg import CalibrationQuality, KinematicModel, SessionEvent
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.core.documents import model_document
@@ -24,7 +24,7 @@ from robocal_ros.nodes.thermal_services import ThermalServices
 from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
 from robocal_ros.sessions.events import IDENTIFY, Command, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import JOINTS, POINT, POSE
+from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.sessions.records import configuration
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -32,7 +32,13 @@ from robocal_ros.storage.robots import load_robot
 
 NO_SERIAL = "unset"
 POLL_S = 0.5
-INPUTS = {JOINTS: JointState, POINT: PointStamped, POSE: PoseStamped}
+INPUTS = {
+    JOINTS: JointState,
+    POINT: PointStamped,
+    CENTRE: PointStamped,
+    CLOUD: PointCloud2,
+    POSE: PoseStamped,
+}
 
 # Deep enough for the seconds that a large identification takes.
 STREAM = QoSProfile(

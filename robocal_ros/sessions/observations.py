@@ -9,15 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
+from robocal_ros.core.samples import (
+    MEASURED_POINT,
+    SPHERE_CLOUD,
+    JointSample,
+    Measurements,
+    PointSample,
+    PoseSample,
+)
 from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.sessions.ignored import Ignored
 
 Array = NDArray[np.float64]
 
 JOINTS = "joint_states"
-POINT = "measured_point"
+POINT = MEASURED_POINT
+CENTRE = "sphere_center"
+CLOUD = SPHERE_CLOUD
 POSE = "measured_pose"
+MEASURING = (POINT, CENTRE, CLOUD, POSE)
 JUMPS = "clock_jumps"
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
@@ -43,9 +53,14 @@ class Observation:
     rotation: Array | None
     source: PointSample | PoseSample
 
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of a coordinate from the measurement itself; 0 where not known."""
+        return self.source.sigma_m if isinstance(self.source, PointSample) else 0.0
+
 
 def _topic(sample: PointSample | PoseSample) -> str:
-    return POINT if isinstance(sample, PointSample) else POSE
+    return sample.topic if isinstance(sample, PointSample) else POSE
 
 
 @dataclass
@@ -106,13 +121,13 @@ class ObservationDesk:
     def why_nothing(self) -> str:
         """Say why a window holds no observation."""
         had_joints = self.received[JOINTS] or JOINTS in self.ignored
-        had_others = {POINT, POSE} & (self.received.keys() | self.ignored.keys())
+        had_others = set(MEASURING) & (self.received.keys() | self.ignored.keys())
         if not had_joints:
             words = f"no joint states received: does the robot's driver publish {JOINTS}?"
         elif JOINTS not in self.newest_ns:
             words = "no joint state could be used"
         elif not had_others:
-            words = f"no measurement received: does the sensor publish {POINT} or {POSE}?"
+            words = f"no measurement received: does the sensor publish {' or '.join(MEASURING)}?"
         else:
             words = "no measurement with the robot at standstill since the last command"
         waiting = len(self._pending)
@@ -272,8 +287,14 @@ class ObservationDesk:
         self._observed = [o for o in self._observed if o.stamp_ns > until_ns]
 
 
-def as_measurements(observations: Sequence[Observation]) -> Measurements:
-    """Arrays of observations; orientations only where all have one."""
+def as_measurements(
+    observations: Sequence[Observation], sigma_m: float | None = None
+) -> Measurements:
+    """Arrays of observations; orientations only where all have one.
+
+    ``sigma_m``: standard deviation of a coordinate of one visit, to which each measurement's own
+    is added; None where the noise is to be found.
+    """
     rotations = [o.rotation for o in observations if o.rotation is not None]
     complete = bool(observations) and len(rotations) == len(observations)
     several = len({o.target for o in observations}) > 1
@@ -285,5 +306,6 @@ def as_measurements(observations: Sequence[Observation]) -> Measurements:
             f"{o.stamp_ns}/{o.target}" if several else str(o.stamp_ns) for o in observations
         ),
         rotation=np.array(rotations) if complete else None,
+        sigma=None if sigma_m is None else np.hypot(sigma_m, [o.sigma_m for o in observations]),
         stamp_ns=np.array([o.stamp_ns for o in observations], dtype=np.int64),
     )

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.identification import Method
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import State
@@ -19,6 +20,7 @@ Prior = Literal["default", "learned"]
 METHODS: tuple[Method, ...] = ("map", "lsq")
 PRIORS: tuple[Prior, ...] = ("default", "learned")
 LEARN_FROM = 500
+SPHERE_RADIUS_M = 0.01905  # 1.5 inches across, the usual reference sphere
 STOOD = (State.IN_FORCE, State.SUPERSEDED)  # what was rolled back was no drift
 
 
@@ -36,6 +38,7 @@ class ThermalConfig:
         under way still count.
     measuring_frame : frame of the measurements; empty: that of the first one used.
     target : name of the target where the measurement's frame_id gives none.
+    sphere : what a sphere in a cloud must be like.
     """
 
     method: Method = "map"
@@ -47,6 +50,7 @@ class ThermalConfig:
     measuring_frame: str = ""
     target: str = DEFAULT_TARGET
     standstill: StandstillRule = field(default_factory=StandstillRule)
+    sphere: SphereRule = field(default_factory=lambda: SphereRule(SPHERE_RADIUS_M))
 
 
 def expected_drift(
