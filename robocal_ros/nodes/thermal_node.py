@@ -14,6 +14,7 @@ from sensor_msgs.msg import JointState, PointCloud2
 from robocal_ros import __version__
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.thermal.identification import require_parameters
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -71,6 +72,7 @@ class ThermalNode(HouseNode):
         self._shown: tuple[Any, ...] = ()
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
+        require_parameters(self._nominal, settings["drift_parameters"])
         self._serial_in_use = settings["serial"] or NO_SERIAL
         folder = settings["state_dir"]
         self._history = CalibrationHistory.open(

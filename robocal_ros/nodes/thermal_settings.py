@@ -20,6 +20,11 @@ SETTINGS = (
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("prior", PRIORS[0], "Expected drift: by default or as learned", choices=PRIORS),
     Setting(
+        "drift_parameters",
+        [""],
+        "What lsq solves of a drift (a1_mm, beta2_deg, ...); empty: all, which takes many poses",
+    ),
+    Setting(
         "sigma_mm",
         0.03,
         "Standard deviation of one measured coordinate, sensor and repeatability",
@@ -109,6 +114,7 @@ def session_config(settings: Mapping[str, Any]) -> ThermalConfig:
         method=settings["method"],
         prior=settings["prior"],
         sigma_m=settings["sigma_mm"] * 1e-3,
+        drift_parameters=tuple(settings["drift_parameters"]),
         hold_out=settings["hold_out"],
         seed=settings["seed"],
         lateness_s=settings["lateness_s"],

@@ -103,6 +103,7 @@ def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
         values = dict(arguments["config"])
         rule = StandstillRule(**values.pop("standstill"))
         sphere = SphereRule(**values.pop("sphere"))
-        return ThermalConfig(standstill=rule, sphere=sphere, **values)
+        names = tuple(values.pop("drift_parameters"))
+        return ThermalConfig(standstill=rule, sphere=sphere, drift_parameters=names, **values)
     except (KeyError, TypeError) as error:
         raise InputError(f"the recorded configuration cannot be read: {error}") from error

@@ -9,7 +9,7 @@ import numpy as np
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import stamp_ns
-from robocal_ros.core.thermal.identification import SAME_VISIT_RAD
+from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.inputs import take_message

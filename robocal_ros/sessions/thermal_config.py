@@ -33,6 +33,7 @@ class ThermalConfig:
     method : estimator where a command names none.
     prior : ``default``, or ``learned`` from the drifts accepted and not rolled back so far.
     sigma_m : standard deviation of one measured coordinate in one visit of a pose.
+    drift_parameters : what ``lsq`` solves of a drift; empty: all, which takes many poses.
     hold_out, seed : share of the poses kept to judge a calibration without reference.
     lateness_s : a command waits for joint readings this much newer, so that measurements
         under way still count.
@@ -44,6 +45,7 @@ class ThermalConfig:
     method: Method = "map"
     prior: Prior = "default"
     sigma_m: float = 3e-5
+    drift_parameters: tuple[str, ...] = ()
     hold_out: float = 0.5
     seed: int = 0
     lateness_s: float = 0.2

@@ -1,4 +1,4 @@
-"""Spheres into the session: as a cloud or as a centre, the same drift; what is no sphere is said."""
+"""Spheres as clouds or centres: the same drift; what is no sphere is said."""
 
 from types import SimpleNamespace as Message
 from typing import Any

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import TooFewSamplesError
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.cycle import identify_cycle
+from robocal_ros.core.thermal.identification import identify_cycle
 from robocal_ros.core.thermal.priors import drift_prior, learned_prior
 from robocal_ros.core.thermal.spots import ColdSpots
 
