@@ -2,7 +2,7 @@
 
 from bisect import bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,12 +13,12 @@ from robocal_ros.core.samples import (
     MEASURED_POINT,
     SPHERE_CLOUD,
     JointSample,
-    Measurements,
     PointSample,
     PoseSample,
 )
 from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.sessions.ignored import Ignored
+from robocal_ros.sessions.observation import Observation
 
 Array = NDArray[np.float64]
 
@@ -34,29 +34,6 @@ MOST_WAITING = 5000  # measurements that wait for joints: more means that no joi
 MOST_KEPT = 20000  # observations that no command has used
 LEAD_NS = 1_000_000_000  # a topic is at most so far ahead of another where the clock jumps
 FAR_AHEAD_NS = 60_000_000_000  # a measurement stamped so much after the joints is an error
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """A measured target with the joints at that instant.
-
-    ``ready_ns``: stamp of the joint reading that completed it; ``rotation`` None for a point.
-    """
-
-    stamp_ns: int
-    ready_ns: int
-    topic: str
-    frame: str
-    target: str
-    q: Array
-    position: Array
-    rotation: Array | None
-    source: PointSample | PoseSample
-
-    @property
-    def sigma_m(self) -> float:
-        """Standard deviation of a coordinate from the measurement itself; 0 where not known."""
-        return self.source.sigma_m if isinstance(self.source, PointSample) else 0.0
 
 
 def _topic(sample: PointSample | PoseSample) -> str:
@@ -285,27 +262,3 @@ class ObservationDesk:
         """Drop observations up to a stamp: they were used."""
         self.used_ns = max(self.used_ns, until_ns)
         self._observed = [o for o in self._observed if o.stamp_ns > until_ns]
-
-
-def as_measurements(
-    observations: Sequence[Observation], sigma_m: float | None = None
-) -> Measurements:
-    """Arrays of observations; orientations only where all have one.
-
-    ``sigma_m``: standard deviation of a coordinate of one visit, to which each measurement's own
-    is added; None where the noise is to be found.
-    """
-    rotations = [o.rotation for o in observations if o.rotation is not None]
-    complete = bool(observations) and len(rotations) == len(observations)
-    several = len({o.target for o in observations}) > 1
-    return Measurements(
-        q=np.array([o.q for o in observations]),
-        position=np.array([o.position for o in observations]),
-        target=tuple(o.target for o in observations),
-        sample=tuple(
-            f"{o.stamp_ns}/{o.target}" if several else str(o.stamp_ns) for o in observations
-        ),
-        rotation=np.array(rotations) if complete else None,
-        sigma=None if sigma_m is None else np.hypot(sigma_m, [o.sigma_m for o in observations]),
-        stamp_ns=np.array([o.stamp_ns for o in observations], dtype=np.int64),
-    )

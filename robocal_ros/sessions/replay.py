@@ -13,7 +13,8 @@ from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING, Observation
+from robocal_ros.sessions.observation import Observation
+from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
 from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.thermal import ThermalSession
 

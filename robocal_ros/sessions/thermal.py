@@ -18,7 +18,8 @@ from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce, outside_decision
-from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk, as_measurements
+from robocal_ros.sessions.observation import as_measurements
+from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk
 from robocal_ros.sessions.proposing import Proposer
 from robocal_ros.sessions.thermal_config import ThermalConfig, expected_drift
 

@@ -115,9 +115,7 @@ def test_one_ball_cannot_tell_the_last_joints_parameters_apart(nominal, cold):
     rng = np.random.default_rng(3)
     q = postures(nominal, 20, rng)
     reference = capture_reference(nominal, visit(cold, q, rng))
-    found, _ = identified(
-        reference, visit(cold, q, rng), drift_prior(nominal), in_force=nominal
-    )
+    found, _ = identified(reference, visit(cold, q, rng), drift_prior(nominal), in_force=nominal)
     assert found.seen.rank == 23
     (words,) = found.unobservable
     named = {name for name in nominal.parameters.names if f" {name}" in f" {words}"}
@@ -149,9 +147,7 @@ def test_static_errors_cancel(nominal, cold):
     for built in (nominal, cold):
         warm = built.with_mdh(built.parameters.add(built.mdh, change))
         reference = capture_reference(nominal, visit(built, q, rng, noise=0.0))
-        found, _ = identified(
-            reference, visit(warm, q, rng, noise=0.0), prior, in_force=nominal
-        )
+        found, _ = identified(reference, visit(warm, q, rng, noise=0.0), prior, in_force=nominal)
         check = postures(nominal, 50, np.random.default_rng(0))
         moved.append((found.arm.fk(check) - nominal.fk(check)) @ BALL)
     # static errors turn the drift by about 1e-3 rad: a thousandth of 0.05 mm

@@ -85,7 +85,7 @@ def identify_cycle(
     warm = spots.average(warm, sigma_m)
     if len(warm) < FEWEST_POSES:
         raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
-    spot = spots.match(warm)
+    spot, arm = spots.match(warm), spots.cell.arm
     y = spots.drift(warm).ravel()
     parameters, setup = spots.rows(warm.q, spots.target[spot])
     A, B = parameters.reshape(len(y), -1), setup.reshape(len(y), -1)
@@ -98,9 +98,7 @@ def identify_cycle(
     drift = gain @ y[rows]
     covariance = prior_covariance - gain @ A[rows] @ prior_covariance
     miss, spread = left_out(y, S, keep)
-    arm = spots.cell.arm
-    seen = observability(A[rows])
-    chosen = arm.parameters
+    chosen, seen = arm.parameters, observability(A[rows])
     words = (describe(column, chosen.names, chosen.to_display) for column in seen.null.T)
     return CycleDrift(
         drift=drift,
