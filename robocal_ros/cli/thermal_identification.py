@@ -54,7 +54,9 @@ def identify_fixed_files(arm: SerialArm, request: FixedRequest) -> Document:
     sensor = read_sensor(request.sensor_file, arm)
     cold, spots = cold_spots(arm, sensor, request.cold_file)
     warm = warm_visits(request.warm_file, arm, cold)
-    check = None if request.check_file is None else _check(request.check_file, arm, cold, warm)
+    check = (
+        None if request.check_file is None else check_visits(request.check_file, arm, cold, warm)
+    )
     prior = drift_prior(arm) if request.prior_file is None else read_prior(request.prior_file, arm)
     documents = []
     for name in warm.cycles:
@@ -103,7 +105,8 @@ def warm_visits(path: Path, arm: SerialArm, cold: Visits) -> Visits:
     return warm
 
 
-def _check(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visits:
+def check_visits(path: Path, arm: SerialArm, cold: Visits, warm: Visits) -> Visits:
+    """Read a table of warm visits of poses that are not in the warm table."""
     check = warm_visits(path, arm, cold)
     shared = sorted(set(check.pose) & set(warm.pose))
     if shared:

@@ -13,6 +13,7 @@ from robocal_ros.storage.robots import load_robot
 
 ROBOT = "kr150_r3100"
 SIGMA = 2e-5
+JUDGES = ("c15", "c16", "c17", "c18", "c19")
 HEADER = ["pose", "cycle", "sample", *(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"]
 
 
@@ -73,6 +74,10 @@ def fixed_tables(folder: Path) -> None:
     visits(folder / "check.csv", warm, unseen, 3)
     history = {f"{i}": drifted(0.15 * i) for i in range(12)}
     visits(folder / "history.csv", history, measuring, 4)
+    shift = {f"{i}": drifted(2.0 - 2.0 * 0.9**i) for i in range(30)}
+    told = {name: q for name, q in (measuring | unseen).items() if name not in JUDGES}
+    visits(folder / "shift.csv", shift, told, 5)
+    visits(folder / "judges.csv", shift, {name: unseen[name] for name in JUDGES}, 6)
 
 
 def session(path: Path, count: int, seed: int) -> Path:

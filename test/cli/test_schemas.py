@@ -25,6 +25,7 @@ delta_alpha = [ 0.0003, 0.0005, 0.0008, 0.0002, 0.0018, 0]
 """
 PLACE = ["thermal", "calibrate-sensor", "--robot", ROBOT]
 DRIFT = ["thermal", "identify", "--robot", ROBOT, "--sensor", "s.yaml", "--cold", "cold.csv"]
+SCREEN = ["thermal", "screen", *DRIFT[2:]]
 PRIOR = ["thermal", "learn-prior", *DRIFT[2:]]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
@@ -92,6 +93,12 @@ CASES = {
         "thermal.prior.json",
         [*PRIOR, "--warm", "history.csv"],
         [*PRIOR, "--warm", "warm.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "thermal screen": (
+        "thermal.screen.json",
+        [*SCREEN, "--warm", "shift.csv", "--check", "judges.csv"],
+        [*SCREEN, "--warm", "warm.csv", "--check", "check.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
     "import-ur": (

@@ -162,3 +162,15 @@ def test_people_get_the_verdict_first(folder):
     done = robocal("thermal", "identify", *words, "--warm", folder / "warm.csv")
     assert done.returncode == 0
     assert done.stdout.startswith("ACCEPT: held-out mean")
+
+
+def test_screening_reports_every_round_and_draws_them(folder):
+    words = ["--robot", ROBOT, "--sensor", folder / "s.yaml", "--cold", folder / "cold.csv"]
+    words += ["--warm", folder / "shift.csv", "--check", folder / "judges.csv"]
+    words += ["--wanted", 4, "--best-subset", "--plot", folder / "rounds.png"]
+    document = robocal_json("thermal.screen.json", "thermal", "screen", *words)
+    assert [row["parameters"] for row in document["rounds"]] == list(range(24, 3, -1))
+    assert len(document["chosen"]) == len(document["best_subset"]["names"]) == 4
+    best = max(row["share"] for row in document["rounds"] if row["share"] is not None)
+    assert best > document["uncompensated"]
+    assert (folder / "rounds.png").read_bytes().startswith(b"\x89PNG")
