@@ -20,9 +20,9 @@ from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
-from robocal_ros.sessions.correction import CorrectionSession
-from robocal_ros.sessions.correction_guard import CorrectionStatus
-from robocal_ros.sessions.correction_inputs import (
+from robocal_ros.sessions.correction import (
+    CorrectionSession,
+    CorrectionStatus,
     JointCommand,
     Reason,
     RefusedError,
