@@ -9,7 +9,7 @@ import numpy as np
 from robocal_ros.core.assessment import hold_out, pose_groups
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import identification_document
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.identification import (
     JudgedIdentification,
     Method,
@@ -77,14 +77,22 @@ def identify_files(arm: SerialArm, request: Request) -> Answer:
         warnings += _compared(train, check, request)
     base, tool = "base" in request.fit, "tool" in request.fit
     require_match(arm, data, base=base, tool=tool, file=str(request.data_file))
-    judged = identify_and_judge(
-        arm,
-        train,
-        check,
-        fit=request.fit,
-        method=request.method,
-        check_refit=request.check_refit,
-    )
+    try:
+        judged = identify_and_judge(
+            arm,
+            train,
+            check,
+            fit=request.fit,
+            method=request.method,
+            check_refit=request.check_refit,
+        )
+    except TooFewSamplesError as error:
+        if request.check_file is not None:
+            raise
+        raise TooFewSamplesError(
+            f"{request.data_file}: {error} ({len(check)} of its {len(data)} measurements are held "
+            "out to judge)"
+        ) from error
     if request.check_file is not None:
         _require_check_fits(judged, check, request)
         if judged.verdict.code is Code.RESIDUAL_TOO_LARGE and not request.check_refit:

@@ -126,7 +126,8 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
             f"{what}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
-            "robot file, units, joint signs and target names",
+            "robot file, units, joint signs and target names"
+            + (f"; {uninformative}" if uninformative else ""),
         )
     if _one_sided_p(-gain) <= SIGNIFICANCE:
         return Verdict(Code.WORSE_THAN_CURRENT, what)

@@ -20,9 +20,9 @@ from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
-from robocal_ros.sessions.correction import CorrectionSession
-from robocal_ros.sessions.correction_guard import CorrectionStatus
-from robocal_ros.sessions.correction_inputs import (
+from robocal_ros.sessions.correction import (
+    CorrectionSession,
+    CorrectionStatus,
     JointCommand,
     Reason,
     RefusedError,
@@ -58,7 +58,7 @@ class JointCorrectionNode(HouseNode):
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
         self._session.enable(self.settings["enable_on_start"])
-        self._refusals = 0
+        self._refusals = self._held = 0
         self._outputs = {
             topic: self.add_output(kind, f"~/{topic}", qos.RELIABLE)
             for topic, kind in ((TRAJECTORY, JointTrajectory), (TARGETS, JointState))
@@ -150,6 +150,9 @@ class JointCorrectionNode(HouseNode):
         if refusals > self._refusals:
             health.worsen(WARN, status.last_refusal)
         self._refusals = refusals
+        if status.held > self._held:
+            health.worsen(WARN, "the blend waits: its next step would lead beyond a bound")
+        self._held = status.held
         for guard in self._sources.values():
             if guard.fault:
                 health.worsen(ERROR, guard.fault)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core import frames
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig, ShiftBounds
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.sessions.correction_bounds import CorrectionConfig, ShiftBounds
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = "nominal"

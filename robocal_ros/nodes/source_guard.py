@@ -1,7 +1,8 @@
-"""Joint readings must come from the controller, not from a node that un-corrected them."""
+"""Joints must come from the controller or the planner, not from a node that corrected them."""
 
 from rclpy.node import Node
 
+from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.replay import UNCORRECTED
 
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"  # not yet discovered
@@ -19,9 +20,15 @@ class SourceGuard:
         self._node = node
         self._topic = node.resolve_topic_name(topic)
         self._known = -1
+        states = topic.rsplit("/", 1)[-1] == JOINTS
+        self._why = (
+            "its joint states are un-corrected, subscribe the robot's"
+            if states
+            else "it is corrected already, subscribe what the planner publishes"
+        )
         self.fault = ""
         if UNCORRECTED in self._topic:
-            self.fault = f"{self._topic} carries un-corrected joint states: subscribe the robot's"
+            self.fault = f"{self._topic} comes from a correction node: {self._why}"
 
     def look(self) -> None:
         """Look again when the number of publishers changed; cheap otherwise."""
@@ -33,8 +40,5 @@ class SourceGuard:
         self._known = -1 if _UNKNOWN in names else count
         culprits = [name for name in names if UNCORRECTED in name]
         self.fault = (
-            f"{self._topic} is published by {', '.join(culprits)}: its joint states are "
-            "un-corrected, subscribe the robot's"
-            if culprits
-            else ""
+            f"{self._topic} is published by {', '.join(culprits)}: {self._why}" if culprits else ""
         )

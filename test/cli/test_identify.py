@@ -348,6 +348,13 @@ class TestTooLittle:
         status, document = identify("--data", table(folder / "row.csv", measured(1)))
         assert (status, document["error"]["code"]) == (3, "TOO_FEW_SAMPLES")
 
+    def test_rows_held_out_are_told_where_too_few_are_left(self, folder: Path, identify) -> None:
+        path = table(folder / "few.csv", measured(8))
+        status, document = identify("--data", path)
+        assert status == 3
+        assert f"{path}: 4 samples" in document["error"]["message"]
+        assert "4 of its 8 measurements are held out to judge" in document["error"]["message"]
+
     def test_too_few_poses_to_judge_carry_their_figures(self, folder: Path, identify) -> None:
         path = table(folder / "scarce.csv", measured(16))
         status, document = identify("--data", path, "--hold-out", "0.2")

@@ -31,6 +31,7 @@ EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 # Domains whose ports lie below those that Linux hands out to any program.
 DOMAINS = range(1, 102)
 DEADLINE_S = 10.0
+DISCOVERY_S = 0.05
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -165,6 +166,8 @@ class Graph:
         client = self.probe.create_client(kind, name)
         try:
             self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
+            # A server drops its answer to a client that it has not discovered itself yet.
+            self.spin_for(DISCOVERY_S)
             future = client.call_async(kind.Request(**fields))
             self.spin_until(future.done, f"service {name} answers", within_s)
             return future.result()

@@ -243,6 +243,39 @@ def test_its_own_output_is_not_corrected_again(graph: Any) -> None:
     graph.probe.destroy_publisher(other)
 
 
+def test_a_stop_passes_whoever_sends_it(graph: Any) -> None:
+    """An empty trajectory goes through at once, even where everything else is refused."""
+    corrector = f"{NODE}/joint_trajectory"
+    sender = graph.probe.create_publisher(JointTrajectory, corrector, 10)
+    looped = graph.add(
+        JointCorrectionNode,
+        {"serial": "s1"},
+        namespace="second",
+        cli_args=["--ros-args", "-r", f"joint_trajectory:={corrector}"],
+    )
+    looped._sources["joint_trajectory"].fault = "as if a correction node published it"
+    outputs = graph.collect(JointTrajectory, "/second/joint_correction_node/joint_trajectory")
+    graph.spin_until(sender.get_subscription_count, "it listens")
+    sender.publish(trajectory(HOME[None], np.array([1.0])))
+    graph.spin_until(lambda: looped.inputs["joint_trajectory"].invalid, "motion is refused")
+    sender.publish(JointTrajectory(joint_names=NAMES))
+    graph.spin_until(lambda: outputs, "the stop is through")
+    assert outputs[0].points == []
+
+
+def test_a_blend_that_waits_warns(graph: Any) -> None:
+    line = Line(graph, enable_on_start=True)
+    chosen = NOMINAL.parameters
+    grown = 2e-3 * chosen.is_length  # two millimetres in each length: beyond 1 mm at the tool
+    line.to_model.publish(model_message(NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, grown))))
+
+    def waits() -> bool:
+        line.target()
+        return "the blend waits" in line.node._full_health().message
+
+    graph.spin_until(waits, "the diagnostics warn")
+
+
 def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
     line = Line(graph, enable_on_start=True)
     actual = drifted()

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from lifecycle_msgs.srv import GetState
+from diagnostic_msgs.msg import DiagnosticArray
 
 ROOT = Path(__file__).parents[2]
 SHARE = ROOT / "install" / "robocal_ros" / "share" / "robocal_ros"
 FILE = SHARE / "launch" / "thermal.launch.py"
+MODEL = "/thermal_node/model"
 NODES = ("thermal_node", "joint_correction_node")
 
 
@@ -64,18 +65,16 @@ def test_one_file_may_hold_both_nodes(graph, tmp_path, name):
     mine = tmp_path / "mine.yaml"
     section = "/**/{}:\n  ros__parameters: {{robot: ur10, serial: R7}}\n"
     mine.write_text("".join(section.format(node) for node in NODES))
-    process = graph.start(
-        name, None, {"__node": name, "kinematic_model": "/thermal_node/model"},
-        "--ros-args", "--params-file", str(mine),
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    graph.start(
+        name, None, {"__node": name, "kinematic_model": MODEL}, "--ros-args", "--params-file",
+        str(mine),
     )  # fmt: skip
-    state = graph.call(GetState, f"/{name}/get_state").current_state.label
-    assert state == "active", process.output
-    if name == "thermal_node":
-        graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
-    else:
-        graph.spin_until(lambda: listens(graph, name), "it listens to the model")
 
+    def told() -> list[tuple[str, str]]:
+        states = [s for a in said for s in a.status if s.name == name]
+        return [(s.hardware_id, v.value) for s in states for v in s.values if v.key == "state"]
 
-def listens(graph: Any, name: str) -> bool:
-    infos = graph.probe.get_subscriptions_info_by_topic("/thermal_node/model")
-    return name in [info.node_name for info in infos]
+    graph.spin_until(lambda: ("R7", "active") in told(), "it is active, for this robot")
+    infos = graph.probe.get_subscriptions_info_by_topic(MODEL)
+    assert [info.node_name for info in infos] == ([name] if name == NODES[1] else [])

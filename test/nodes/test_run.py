@@ -1,7 +1,6 @@
 """A node as a process of its own: how it starts and how it ends."""
 
 import signal
-import time
 from pathlib import Path
 from typing import Any
 
@@ -43,19 +42,9 @@ def script(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) -> None:
     sleeper = graph.start(script)
     assert graph.call(Trigger, "/sleeper/ping").success
-    began = time.monotonic()
     assert sleeper.stop(by) == 0
-    assert time.monotonic() - began < 1.0
     assert sleeper.output.count("released") == 1
     assert "Traceback" not in sleeper.output
-
-
-def test_answers_within_the_time_of_a_bare_start(graph: Any, script: Path) -> None:
-    began = time.monotonic()
-    sleeper = graph.start(script)
-    assert graph.call(Trigger, "/sleeper/ping").success
-    assert time.monotonic() - began < 1.5
-    sleeper.stop()
 
 
 def test_a_bug_ends_the_process_and_says_where(graph: Any, script: Path) -> None:

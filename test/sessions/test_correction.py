@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.core import frames
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.sessions.correction import CorrectionSession
-from robocal_ros.sessions.correction_bounds import CorrectionConfig
-from robocal_ros.sessions.correction_inputs import (
+from robocal_ros.sessions.correction import (
+    CorrectionSession,
     JointCommand,
     OfferedModel,
     OfferedTool,

@@ -6,37 +6,70 @@ correct is refused with a reason, counted, and nothing is put out for it: `Refus
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction.blending import blend_rates
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.sessions.correction_blend import blend_rates
-from robocal_ros.sessions.correction_bounds import CorrectionConfig
-from robocal_ros.sessions.correction_gate import CorrectionGate
-from robocal_ros.sessions.correction_guard import (
+from robocal_ros.sessions.correction.corrector import Corrected, Corrector
+from robocal_ros.sessions.correction.incoming import (
     READING,
     TARGET,
     TRAJECTORY,
     CorrectionGuard,
-    CorrectionStatus,
+    JointBook,
+    require_finite,
 )
-from robocal_ros.sessions.correction_inputs import (
+from robocal_ros.sessions.correction.inputs import (
     JointCommand,
     OfferedModel,
     OfferedTool,
-    Reason,
-    RefusedError,
     TrajectoryCommand,
 )
-from robocal_ros.sessions.correction_joints import JointBook, require_finite
-from robocal_ros.sessions.corrector import Corrected, Corrector
+from robocal_ros.sessions.correction.offers import CorrectionGate
 
 Array = NDArray[np.float64]
 Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class CorrectionStatus:
+    """What a correction session does; the figures are of the last message that was put out.
+
+    Attributes
+    ----------
+    enabled : asked for.
+    active : commands differ from what came in, or will.
+    settled : no blend is under way.
+    revision : of the model taken over, None without one.
+    new_tool : a tool other than the taught one was taken over.
+    tcp_shift_m : error at the tool that the drift would have made.
+    largest_shift : largest shift of a joint, rad (prismatic: m).
+    remaining_m : error that was left at the tool.
+    held : how often a blend waited because a bound would have been exceeded.
+    reduced : how many points were corrected in part, near a singularity.
+    refused : how often, by reason.
+    last_refusal : in words; empty when there was none.
+    """
+
+    enabled: bool
+    active: bool
+    settled: bool
+    revision: int | None
+    new_tool: bool
+    tcp_shift_m: float
+    largest_shift: float
+    remaining_m: float
+    held: int
+    reduced: int
+    refused: dict[Reason, int]
+    last_refusal: str
 
 
 class CorrectionSession:

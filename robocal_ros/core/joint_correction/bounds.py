@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import StagedResult
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.correction_inputs import Reason, RefusedError
 
 Array = NDArray[np.float64]
 

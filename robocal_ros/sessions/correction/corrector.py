@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction import blend_models, pack_model
-from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.correction_blend import Commanded, blend_along, step_towards
-from robocal_ros.sessions.correction_bounds import (
+from robocal_ros.core.joint_correction.blending import Commanded, blend_along, step_towards
+from robocal_ros.core.joint_correction.bounds import (
     FADES_FROM,
     CorrectionConfig,
     require_limits,
     require_solved,
     require_within,
 )
-from robocal_ros.sessions.correction_inputs import RefusedError
+from robocal_ros.core.joint_correction.refusals import RefusedError
+from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
+from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 

@@ -1,13 +1,30 @@
-"""Joints by name: partial and reordered sets against the arm's, and their last known state."""
+"""What comes in: joints by name, their last known state, order in time, own output."""
+
+from collections import Counter
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.correction_inputs import JointCommand, Reason, RefusedError
+from robocal_ros.core.samples import CORRECTED, TAUGHT
+from robocal_ros.sessions.correction.inputs import JointCommand
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Answer = TypeVar("Answer")
+
+READING = "joint reading"
+TARGET = "joint target"
+TRAJECTORY = "trajectory"
+
+# A reading this much older than the last one comes from a clock that was set back.
+CLOCK_RESET_NS = 1_000_000_000
+# Positions nearer than this are the same; own output is told by what it was shifted.
+SAME = 1e-12
+SHIFTED = 1e-9
 
 
 class JointBook:
@@ -98,6 +115,70 @@ class JointBook:
             missing = [self._names[i] for i in np.flatnonzero(absent)]
             raise RefusedError(Reason.MISSING_JOINT, ", ".join(missing))
         return self.measured
+
+
+class CorrectionGuard:
+    """Watches what comes in.
+
+    Attributes
+    ----------
+    refused : how often, by reason.
+    last_refusal : in words.
+    """
+
+    def __init__(self) -> None:
+        self._clock_s = -np.inf
+        self._stamps: dict[str, int] = {}
+        self._last_output: tuple[tuple[str, ...], Array] | None = None
+        self.refused: Counter[Reason] = Counter()
+        self.last_refusal = ""
+
+    def counted(self, act: Callable[[], Answer]) -> Answer:
+        """Do something; a refusal is counted and passed on."""
+        try:
+            return act()
+        except RefusedError as error:
+            self.refused[error.reason] += 1
+            self.last_refusal = str(error)
+            raise
+
+    def require_order(self, kind: str, stamp: int, mark: str, now_s: float) -> None:
+        """Refuse what carries a mark of a correction, or is older than the one before."""
+        if mark == CORRECTED or (mark == TAUGHT and kind == READING):
+            raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
+        if not now_s >= self._clock_s:
+            raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {self._clock_s}")
+        last = self._stamps.get(kind, 0)
+        reset = kind == READING and last - stamp > CLOCK_RESET_NS
+        if stamp and stamp < last and not reset:
+            detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
+            raise RefusedError(Reason.TIME_BACKWARDS, detail)
+
+    def accept_order(self, kind: str, stamp: int, now_s: float) -> None:
+        """Remember the time of what was acted on."""
+        self._clock_s = now_s
+        if stamp:
+            self._stamps[kind] = stamp
+
+    def forget_stamps(self) -> None:
+        """Start afresh with any source stamp."""
+        self._stamps.clear()
+
+    def note_output(self, corrected: JointCommand | None, shift: float = 0.0) -> None:
+        """Remember a corrected target, and by how much it was shifted."""
+        self._last_output = None
+        if corrected is not None and shift > SHIFTED:
+            self._last_output = (corrected.names, corrected.position)
+
+    def require_not_own(self, command: JointCommand) -> None:
+        """Refuse a target that is the last corrected one."""
+        if self._last_output is None:
+            return
+        names, position = self._last_output
+        if command.names != names or command.position.shape != position.shape:
+            return
+        if np.max(np.abs(command.position - position)) <= SAME:
+            raise RefusedError(Reason.OWN_OUTPUT, "equal to the last corrected target")
 
 
 def require_finite(names: tuple[str, ...], values: Array | None) -> None:

@@ -7,14 +7,10 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.joint_correction import JointCorrection
+from robocal_ros.core.joint_correction.bounds import ROUNDING, CorrectionConfig
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.correction_bounds import ROUNDING, CorrectionConfig
-from robocal_ros.sessions.correction_inputs import (
-    OfferedModel,
-    OfferedTool,
-    Reason,
-    RefusedError,
-)
+from robocal_ros.sessions.correction.inputs import OfferedModel, OfferedTool
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,48 @@
+"""Why an input of the joint correction is refused."""
+
+from enum import StrEnum
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+
+
+class Reason(StrEnum):
+    """Why an input was refused; counted one by one."""
+
+    NOT_FINITE = "a value is not finite"
+    WRONG_SIZE = "numbers of names and values differ"
+    NO_POSITION = "no positions"
+    UNKNOWN_JOINT = "a joint is unknown"
+    DOUBLED_JOINT = "a joint is named twice"
+    MISSING_JOINT = "a joint is missing and its state is not known"
+    TIME_BACKWARDS = "time goes backwards"
+    OWN_OUTPUT = "comes from a joint correction already"
+    JOINT_LIMIT = "a joint limit is exceeded"
+    TCP_BOUND = "the arm's correction at the tool exceeds its bound"
+    JOINT_BOUND = "the correction of a joint exceeds its bound"
+    NOT_SOLVED = "no solution near the taught joints"
+    NOT_ACCEPTED = "the model is not accepted"
+    WRONG_ROBOT = "made for another robot"
+    OLD_REVISION = "older than the revision in use"
+    TOOL_BOUND = "the tool's change exceeds its bound"
+    BAD_TOOL = "the tool's frame is not usable"
+
+
+_CODES = {
+    Reason.JOINT_LIMIT: Code.LIMIT_EXCEEDED,
+    Reason.TCP_BOUND: Code.LIMIT_EXCEEDED,
+    Reason.JOINT_BOUND: Code.LIMIT_EXCEEDED,
+    Reason.NOT_SOLVED: Code.LIMIT_EXCEEDED,
+    Reason.TOOL_BOUND: Code.LIMIT_EXCEEDED,
+    Reason.WRONG_ROBOT: Code.WRONG_ROBOT,
+    Reason.OLD_REVISION: Code.STALE,
+}
+
+
+class RefusedError(RobocalError):
+    """An input that is not acted on; nothing is published for it."""
+
+    def __init__(self, reason: Reason, detail: str) -> None:
+        super().__init__(f"refused, {reason.value}: {detail}")
+        self.reason = reason
+        self.code = _CODES.get(reason, Code.BAD_INPUT)

@@ -1,0 +1,41 @@
+"""The joint correction's session: taught joints in, corrected ones out, and back.
+
+session     what the node drives: commands, readings, offers, status
+inputs      what comes in, as types, and how they are built from messages
+incoming    joints by name, order in time, own output that comes back
+offers      which models and tools are taken over
+corrector   which model corrects at every instant, and where a correction may start
+"""
+
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig, ShiftBounds
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.sessions.correction.inputs import (
+    JointCommand,
+    OfferedModel,
+    OfferedTool,
+    TrajectoryCommand,
+    finite_command,
+    joint_command,
+    offered_model,
+    offered_tool,
+    trajectory_command,
+)
+from robocal_ros.sessions.correction.session import CorrectionSession, CorrectionStatus
+
+__all__ = [
+    "CorrectionConfig",
+    "CorrectionSession",
+    "CorrectionStatus",
+    "JointCommand",
+    "OfferedModel",
+    "OfferedTool",
+    "Reason",
+    "RefusedError",
+    "ShiftBounds",
+    "TrajectoryCommand",
+    "finite_command",
+    "joint_command",
+    "offered_model",
+    "offered_tool",
+    "trajectory_command",
+]
