@@ -147,14 +147,17 @@ def identify_subset(
     require_parameters(arm, names)
     chosen = np.array([name in names for name in arm.parameters.names], dtype=np.bool_)
     A = spots.rows(warm.q, spots.target[spot])[0].reshape(3 * len(warm), -1)[:, chosen]
-    if len(A) < A.shape[1] + 3:
-        raise TooFewSamplesError(
-            f"{len(warm)} poses give {len(A)} equations for {A.shape[1]} parameters: measure more"
-        )
+    few = TooFewSamplesError(
+        f"{len(warm)} poses give {len(A)} equations for {A.shape[1]} parameters: measure more"
+    )
+    if len(A) < A.shape[1]:
+        raise few
     seen = observability(A)
     if seen.null.shape[1]:
         words = [describe(column, tuple(names)) for column in seen.null.T]
         raise RankDeficientError(f"not determined by these poses: {'; '.join(words)}", words)
+    if len(A) < A.shape[1] + 3:  # without any pose the others must still determine all
+        raise few
     variance = float(_variance(spots, spot, warm, sigma_m).mean())
     return _least_squares(spots, warm, A, chosen, variance, seen)
 
