@@ -114,7 +114,8 @@ class JointCorrectionNode(HouseNode):
         command = self._session.counted(lambda: joint_command(message))
         if not np.all(np.isfinite(message.effort)):
             message.effort = _doubles(np.empty(0))  # many drivers have none: no NaN goes out
-        self._put_out(STATES, message, self._session.reading(command, time.monotonic()))
+        age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
+        self._put_out(STATES, message, self._session.reading(command, time.monotonic(), age))
 
     def _put_out(self, topic: str, message: Any, command: JointCommand) -> None:
         """Publish the message with the command's values; what it did not change stays."""
@@ -156,6 +157,10 @@ class JointCorrectionNode(HouseNode):
         for guard in self._sources.values():
             if guard.fault:
                 health.worsen(ERROR, guard.fault)
+        if status.mismatch:
+            health.worsen(ERROR, f"{Reason.START_MISMATCH.value}: {status.mismatch}")
+        if status.waits:
+            health.worsen(WARN, f"the blend waits, {status.waits}")
         if status.enabled and status.revision is None and not status.new_tool:
             health.worsen(WARN, "enabled, but neither a model nor a tool was taken over")
         health.values = {
@@ -163,6 +168,8 @@ class JointCorrectionNode(HouseNode):
             "shift at the tool mm": f"{status.tcp_shift_m * 1e3:.4f}",
             "largest joint shift deg": f"{np.degrees(status.largest_shift):.4f}",
             "remaining error mm": f"{status.remaining_m * 1e3:.6f}",
+            "start mismatch": status.mismatch,
+            "blend waits": status.waits,
             "blend held": status.held,
             "points corrected in part": status.reduced,
         } | {f"refused, {reason.value}": count for reason, count in status.refused.items()}
@@ -197,6 +204,8 @@ def _doubles(values: NDArray[np.float64]) -> "array[float]":
 
 def _in_words(status: CorrectionStatus) -> str:
     """What the correction does now, in one line."""
+    if status.mismatch:
+        return f"nothing goes out, {Reason.START_MISMATCH.value}: {status.mismatch}"
     if not status.enabled:
         return "off, blending out with the next commands" if status.active else "off"
     parts = [] if status.revision is None else [f"model revision {status.revision}"]

@@ -106,6 +106,31 @@ SETTINGS = (
         low=1e-4,
         high=0.1,
     ),
+    Setting(
+        "stream_gap_s",
+        0.1,
+        "After a longer pause a stream of targets must begin again where the robot stands",
+        unit="s",
+        low=0.01,
+        high=10.0,
+    ),
+    Setting(
+        "start_deg",
+        0.02,
+        "How far from where a command begins a joint may stand",
+        unit="deg",
+        low=0.001,
+        high=0.5,
+    ),
+    Setting("start_mm", 0.05, "and a sliding joint", unit="mm", low=0.001, high=1.0),
+    Setting(
+        "joint_state_age_s",
+        0.2,
+        "Older joint states do not tell where the robot is",
+        unit="s",
+        low=0.01,
+        high=5.0,
+    ),
 )
 
 
@@ -141,5 +166,9 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         blend_rad_s=float(np.radians(settings["blend_deg_s"])),
         blend_m_s=settings["blend_mm_s"] * 1e-3,
         longest_step_s=settings["longest_step_s"],
+        stream_gap_s=settings["stream_gap_s"],
+        start_rad=float(np.radians(settings["start_deg"])),
+        start_m=settings["start_mm"] * 1e-3,
+        joint_state_age_s=settings["joint_state_age_s"],
         flange_frame=settings["flange_frame"],
     )

@@ -69,15 +69,18 @@ def bent_tool(shift_m: float = 2e-3, turn_deg: float = 0.5) -> OfferedTool:
 
 
 class Robot:
-    """A session, and the time in which it is used."""
+    """A session, the time in which it is used, and a robot that goes where it is sent."""
 
     def __init__(self, **config: Any) -> None:
         self.session = CorrectionSession(NOMINAL, NOMINAL, "s1", CorrectionConfig(**config))
         self.now = 100.0
+        self.at = HOME
 
     def stream(self, q: np.ndarray = HOME, dt: float = DT, **fields: Any) -> np.ndarray:
         self.now += dt
-        return self.session.target(JointCommand(NAMES, np.array(q), **fields), self.now).position
+        self.read(self.at)
+        self.at = self.session.target(JointCommand(NAMES, np.array(q), **fields), self.now).position
+        return self.at
 
     def settle(self) -> np.ndarray:
         out = self.stream()
@@ -254,7 +257,7 @@ def test_a_moving_stream_steps_no_more_than_its_motion_and_the_blend(
     events: list[tuple[str, int, int]], speed: float
 ) -> None:
     robot = Robot(thermal=CorrectionConfig().tool)
-    t, shift = 0.0, np.zeros(6)
+    t, shift = 0.0, robot.stream() - HOME
     for revision, (what, seed, count) in enumerate(events, start=1):
         happen(robot, what, seed, revision)
         for _ in range(count):
@@ -277,6 +280,7 @@ def test_trajectories_start_where_the_last_command_was_and_never_jump(
     times = np.linspace(0.0, duration, m)
     points = np.tile(HOME, (m, 1))
     last = np.zeros(6)
+    robot.read(HOME)
     for revision, (what, seed, count) in enumerate(events, start=1):
         happen(robot, what, seed, revision)
         command = TrajectoryCommand(NAMES, points, times, np.zeros((m, 6)), np.zeros((m, 6)))
@@ -329,6 +333,7 @@ def test_a_trajectory_is_corrected_as_a_whole(warm: Robot) -> None:
 def test_velocities_follow_the_positions_while_a_blend_is_under_way(robot: Robot) -> None:
     robot.session.offer_model(offer(drifted(2.0)))
     robot.session.enable(True)
+    robot.read(HOME)
     command = swing()
     out = robot.session.trajectory(command, robot.now)
     assert out.velocity is not None
@@ -342,6 +347,7 @@ def test_velocities_follow_the_positions_while_a_blend_is_under_way(robot: Robot
 def test_readings_follow_a_blend_along_the_trajectory(robot: Robot) -> None:
     robot.session.offer_model(offer(drifted(2.0)))
     robot.session.enable(True)
+    robot.read(HOME)
     command = swing()
     out = robot.session.trajectory(command, robot.now)
     for i in (0, 20, 60, 200):
@@ -354,6 +360,7 @@ def test_readings_follow_a_blend_along_the_trajectory(robot: Robot) -> None:
 def test_a_trajectory_that_is_under_way_already_starts_without_a_jump(robot: Robot) -> None:
     robot.session.offer_model(offer(drifted(2.0)))
     robot.session.enable(True)
+    robot.read(HOME)
     command = swing()
     out = robot.session.trajectory(command, robot.now, starts_in_s=-0.5)
     shift = np.abs(out.position - command.position).max(axis=1)
@@ -364,6 +371,7 @@ def test_a_trajectory_that_is_under_way_already_starts_without_a_jump(robot: Rob
 def test_a_later_trajectory_begins_when_it_says(robot: Robot) -> None:
     robot.session.offer_model(offer(drifted(2.0)))
     robot.session.enable(True)
+    robot.read(HOME)
     command = swing()
     out = robot.session.trajectory(command, robot.now, starts_in_s=3.0)
     assert np.array_equal(robot.read(HOME).position, HOME)
@@ -375,6 +383,7 @@ def test_a_waiting_trajectory_begins_from_what_is_commanded_then(robot: Robot) -
     """The running one goes on until then, and the readings follow it."""
     robot.session.offer_model(offer(drifted(2.0)))
     robot.session.enable(True)
+    robot.read(HOME)
     running = swing()
     first = robot.session.trajectory(running, robot.now)
     robot.session.offer_model(offer(drifted(0.5), revision=2))
@@ -397,6 +406,7 @@ def test_a_part_of_the_joints_does_not_blend_the_others_unseen(robot: Robot) -> 
     robot.session.enable(True)
     for _ in range(1000):
         robot.now += DT
+        robot.read(before)
         robot.session.target(JointCommand(NAMES[:1], HOME[:1]), robot.now)
     allowed = CorrectionConfig().blend_rates(NOMINAL) * DT
     assert np.all(np.abs(robot.stream() - before) <= allowed * 1.001)
@@ -417,6 +427,227 @@ def test_ten_thousand_points_at_once(warm: Robot) -> None:
     assert distance(pose(drifted(), out.position), pose(NOMINAL, command.position)) < 1e-9
 
 
+# ---- where a command may begin -------------------------------------------------------------------
+
+FAR = np.radians(0.021)  # beyond the tolerance of 0.02 deg
+NEAR = np.radians(0.019)
+
+
+def still(q: np.ndarray = HOME, first_s: float = 0.0, seconds: float = 20.0) -> TrajectoryCommand:
+    times = np.linspace(first_s, first_s + seconds, 41)
+    return TrajectoryCommand(NAMES, np.tile(q, (41, 1)), times)
+
+
+def moved(by: float, joint: int = 1) -> np.ndarray:
+    q = HOME.copy()
+    q[joint] += by
+    return q
+
+
+def large() -> Robot:
+    """Enabled, with a drift and a bent tool, at rest at home, uncorrected: shifts of degrees."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.session.offer_tool(bent_tool())
+    robot.read(HOME)
+    robot.session.enable(True)
+    return robot
+
+
+def test_nothing_goes_out_before_joint_states_have_arrived() -> None:
+    robot = Robot()
+    said = refused(Reason.STALE_JOINTS, robot.session.target, JointCommand(NAMES, HOME), 1.0)
+    assert "joint_a1" in said
+    refused(Reason.STALE_JOINTS, robot.session.trajectory, still(first_s=60.0), 1.0)
+    assert not robot.session.status().mismatch  # nothing is wrong: they will come
+    assert np.array_equal(robot.stream(), HOME)
+
+
+@pytest.mark.parametrize("on", [False, True])
+@pytest.mark.parametrize("joint", range(6))
+def test_the_first_target_is_where_the_robot_stands(on: bool, joint: int) -> None:
+    robot = Robot()
+    robot.session.enable(on)
+    robot.at = moved(NEAR, joint)
+    robot.stream()
+    robot = Robot()
+    robot.session.enable(on)
+    robot.at = moved(-FAR, joint)
+    assert NAMES[joint] in refused(Reason.START_MISMATCH, robot.stream)
+
+
+def test_after_a_mismatch_nothing_goes_out_until_it_is_enabled_again() -> None:
+    robot = large()
+    robot.at = moved(0.5)
+    refused(Reason.START_MISMATCH, robot.stream)
+    robot.at = HOME  # also where it would fit now
+    refused(Reason.START_MISMATCH, robot.stream)
+    refused(Reason.START_MISMATCH, robot.session.trajectory, still(), robot.now)
+    assert "joint_a2" in robot.session.status().mismatch
+    assert "enable" in robot.session.status().mismatch
+    stop = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
+    assert robot.session.trajectory(stop, robot.now) is stop
+    assert np.array_equal(robot.read(HOME).position, HOME)
+    robot.session.enable(True)
+    assert not robot.session.status().mismatch
+    assert np.array_equal(robot.stream(), HOME)
+    assert robot.session.status().refused[Reason.START_MISMATCH] == 3
+
+
+def test_a_trajectory_that_the_controller_rejected_is_not_believed() -> None:
+    """The robot stands at home all the time: what comes next begins there, uncorrected."""
+    robot = large()
+    first = robot.session.trajectory(still(), robot.now)
+    assert np.abs(first.position[-1] - HOME).max() > 10 * FAR
+    for _ in range(25):
+        robot.now += 1.0
+        robot.read(HOME)
+    for command in (still(), still(first_s=0.01)):
+        out = robot.session.trajectory(command, robot.now)
+        first_s = command.time_from_start_s[0]
+        assert np.abs(out.position[0] - HOME).max() <= RATE * first_s + ROUNDING
+    assert np.allclose(robot.read(HOME).position, HOME, rtol=0.0, atol=1e-12)
+
+
+def test_a_trajectory_goes_on_from_the_correction_of_the_one_before() -> None:
+    robot = large()
+    first = robot.session.trajectory(still(), robot.now)
+    robot.now += 25.0
+    robot.read(first.position[-1])
+    for first_s in (0.0, 0.01):
+        out = robot.session.trajectory(still(first_s=first_s), robot.now)
+        assert np.allclose(out.position, first.position[-1], rtol=0.0, atol=1e-12)
+
+
+def test_a_trajectory_from_nowhere_is_refused_unless_it_takes_its_time() -> None:
+    """The robot was moved by hand: nobody knows what correction it shows."""
+    for first_s, fine in ((0.0, False), (0.05, False), (20.0, True)):
+        robot = large()
+        first = robot.session.trajectory(still(), robot.now)
+        robot.now += 25.0
+        robot.read(first.position[-1] + 0.3)
+        command = still(first_s=first_s)
+        if fine:
+            robot.session.trajectory(command, robot.now)
+        else:
+            refused(Reason.START_MISMATCH, robot.session.trajectory, command, robot.now)
+            assert robot.session.status().mismatch
+
+
+def test_a_restart_while_corrected_goes_on_where_the_robot_stands() -> None:
+    robot = large()
+    at = robot.settle()
+    assert np.abs(at - HOME).max() > 10 * FAR
+    for on in (False, True):
+        new = large()
+        new.session.enable(on)
+        new.at = at
+        assert np.abs(new.stream() - at).max() <= ROUNDING
+        last = at
+        for _ in range(2000):
+            assert np.abs(new.stream() - last).max() <= RATE * DT + ROUNDING
+            last = new.at
+        assert np.allclose(new.settle(), at if on else HOME, rtol=0.0, atol=ROUNDING)
+
+
+def test_a_restart_that_does_not_know_the_model_yet_waits() -> None:
+    at = large().settle()
+    new = Robot()
+    new.at = at
+    refused(Reason.START_MISMATCH, new.stream)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 3600.0])
+def test_after_a_pause_a_stream_begins_where_the_robot_stands(seconds: float) -> None:
+    robot = large()
+    at = robot.settle()
+    assert np.array_equal(robot.stream(dt=seconds), at)
+    robot.at = moved(0.5)
+    refused(Reason.START_MISMATCH, robot.stream, dt=seconds)
+
+
+def test_after_a_pause_at_the_uncorrected_target_the_correction_blends_in_again() -> None:
+    robot = large()
+    at = robot.settle()
+    robot.at = HOME
+    assert np.array_equal(robot.stream(dt=1.0), HOME)
+    assert np.abs(robot.stream() - HOME).max() <= RATE * DT + ROUNDING
+    assert np.allclose(robot.settle(), at, rtol=0.0, atol=ROUNDING)
+
+
+def test_between_two_messages_the_robot_may_be_anywhere(warm: Robot) -> None:
+    """A robot lags behind a stream that moves; that is no reason to stop it."""
+    at = warm.at
+    for t in np.arange(0.0, 0.5, DT):
+        warm.at = at
+        warm.stream(HOME + 2.0 * t)
+
+
+def test_a_robot_that_moves_may_lag_after_a_short_pause(warm: Robot) -> None:
+    shift = warm.stream() - HOME
+    for t in np.arange(0.0, 0.5, DT):
+        out = warm.stream(HOME + t)
+        warm.at = HOME + shift + max(0.0, t - 0.05)  # 50 ms behind
+    warm.now += 0.11
+    warm.read(out - 0.01)
+    resumed = warm.session.target(JointCommand(NAMES, HOME + 0.5), warm.now)
+    assert np.abs(resumed.position - out).max() < 5e-3
+
+
+def test_an_off_node_that_has_begun_is_transparent() -> None:
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.stream()
+    far = moved(0.7)
+    assert np.array_equal(robot.stream(far, dt=10.0), far)
+    command = still(moved(-0.4))
+    assert robot.session.trajectory(command, robot.now) is command
+
+
+def test_a_part_of_the_joints_does_not_tell_that_the_others_are_uncorrected() -> None:
+    """One joint is hardly shifted: where it stands says nothing about the rest."""
+    robot = large()
+    at = robot.settle()
+    joint = int(np.argmin(np.abs(at - HOME)))
+    assert abs(at[joint] - HOME[joint]) < NEAR < np.abs(at - HOME).max()
+    name, taught = (NAMES[joint],), HOME[[joint]]
+    robot.at = at.copy()
+    robot.at[joint] = HOME[joint]  # as if it were uncorrected: within the tolerance of both
+    part = TrajectoryCommand(name, np.tile(taught, (3, 1)), np.array([0.0, 0.5, 1.0]))
+    robot.now += 1.0
+    robot.read(robot.at)
+    robot.session.target(JointCommand(name, taught), robot.now)
+    assert np.abs(robot.stream() - at).max() <= ROUNDING
+    robot.session.trajectory(part, robot.now)
+    robot.now += 2.0
+    robot.at[joint] = HOME[joint]
+    robot.read(robot.at)
+    out = robot.session.trajectory(still(first_s=0.01), robot.now)
+    assert np.allclose(out.position, at, rtol=0.0, atol=1e-12)
+
+
+def test_old_readings_do_not_tell_where_the_robot_is(warm: Robot) -> None:
+    at = warm.stream()
+    command = JointCommand(NAMES, HOME)
+    warm.now += 0.3
+    said = refused(Reason.STALE_JOINTS, warm.session.target, command, warm.now)
+    assert "0.300 s" in said
+    warm.session.reading(JointCommand(NAMES, at), warm.now, 0.25)  # late on the way
+    refused(Reason.STALE_JOINTS, warm.session.target, command, warm.now)
+    warm.read(at)
+    assert np.array_equal(warm.session.target(command, warm.now).position, at)
+
+
+def test_a_part_of_the_joints_is_not_completed_from_old_readings(warm: Robot) -> None:
+    warm.stream()
+    part = JointCommand(NAMES[:2], HOME[:2])
+    warm.session.target(part, warm.now)
+    warm.now += 0.25
+    said = refused(Reason.STALE_JOINTS, warm.session.target, part, warm.now)
+    assert "joint_a3" in said
+    assert "0.2 s" in said
+
+
 # ---- joints by name ------------------------------------------------------------------------------
 
 
@@ -431,9 +662,10 @@ def test_joints_are_matched_by_name(warm: Robot) -> None:
 
 
 def test_a_part_of_the_joints_is_completed_from_the_readings(warm: Robot) -> None:
-    straight = warm.stream()
     part = JointCommand(NAMES[2:4], HOME[2:4])
-    refused(Reason.MISSING_JOINT, warm.session.target, part, warm.now)
+    new = Robot()
+    refused(Reason.MISSING_JOINT, new.session.target, part, new.now)
+    straight = warm.stream()
     warm.read(straight)
     assert np.allclose(warm.session.target(part, warm.now).position, straight[2:4], atol=1e-12)
 
@@ -461,11 +693,6 @@ def test_readings_of_velocity_are_un_corrected(warm: Robot) -> None:
     state = warm.read(here, velocity=(after - before) / (2 * h))
     assert state.velocity is not None
     assert np.allclose(state.velocity, speed, rtol=0.0, atol=1e-6)
-
-
-def test_until_all_joints_were_read_nothing_is_un_corrected(warm: Robot) -> None:
-    part = JointCommand(NAMES[:3], HOME[:3])
-    assert "joint_a4" in refused(Reason.MISSING_JOINT, warm.session.reading, part, warm.now)
 
 
 # ---- what is refused -----------------------------------------------------------------------------
@@ -555,6 +782,7 @@ def test_joint_limits_hold_after_the_correction(warm: Robot) -> None:
 def test_limits_hold_when_off_too(robot: Robot) -> None:
     q = HOME.copy()
     q[4] = 3.0
+    robot.at = q
     refused(Reason.JOINT_LIMIT, robot.stream, q)
 
 

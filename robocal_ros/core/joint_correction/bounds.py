@@ -44,6 +44,9 @@ class CorrectionConfig:
     thermal, tool : bounds of the arm's drift and of the tool's change.
     blend_rad_s, blend_m_s : fastest change of a joint's correction (prismatic: m/s).
     longest_step_s : a pause in a stream advances the blend by no more than this.
+    stream_gap_s : after a longer pause a stream begins anew, where the robot stands.
+    start_rad, start_m : how far from where a command begins the robot may stand.
+    joint_state_age_s : readings that are older do not tell where the robot is.
     flange_frame : parent of an acceptable tool frame.
     """
 
@@ -56,11 +59,33 @@ class CorrectionConfig:
     blend_rad_s: float = field(default_factory=lambda: _degrees(0.5))
     blend_m_s: float = 1e-3
     longest_step_s: float = 0.02
+    stream_gap_s: float = 0.1
+    start_rad: float = field(default_factory=lambda: _degrees(0.02))
+    start_m: float = 5e-5
+    joint_state_age_s: float = 0.2
     flange_frame: str = "tool0"
 
     def blend_rates(self, arm: SerialArm) -> Array:
         """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""
         return np.where(arm.prismatic, self.blend_m_s, self.blend_rad_s)
+
+    def start_near(self, arm: SerialArm) -> Array:
+        """(n,) how far from where a command begins each joint may stand, rad (prismatic: m)."""
+        return np.where(arm.prismatic, self.start_m, self.start_rad)
+
+
+def fault_of(
+    result: StagedResult, config: CorrectionConfig | None, arm: SerialArm
+) -> RefusedError | None:
+    """What is wrong with corrected joints; None as ``config``: a correction has no bounds."""
+    try:
+        require_limits(result.q, arm)
+        require_solved(result)
+        if config is not None:
+            require_within(result, config, arm)
+    except RefusedError as error:
+        return error
+    return None
 
 
 def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialArm) -> None:

@@ -15,6 +15,8 @@ class Reason(StrEnum):
     UNKNOWN_JOINT = "a joint is unknown"
     DOUBLED_JOINT = "a joint is named twice"
     MISSING_JOINT = "a joint is missing and its state is not known"
+    STALE_JOINTS = "joint states are missing or too old"
+    START_MISMATCH = "START_MISMATCH, the robot does not stand where the command begins"
     TIME_BACKWARDS = "time goes backwards"
     OWN_OUTPUT = "comes from a joint correction already"
     JOINT_LIMIT = "a joint limit is exceeded"
@@ -36,6 +38,8 @@ _CODES = {
     Reason.TOOL_BOUND: Code.LIMIT_EXCEEDED,
     Reason.WRONG_ROBOT: Code.WRONG_ROBOT,
     Reason.OLD_REVISION: Code.STALE,
+    Reason.STALE_JOINTS: Code.STALE,
+    Reason.START_MISMATCH: Code.CONFLICT,
 }
 
 
@@ -44,5 +48,5 @@ class RefusedError(RobocalError):
 
     def __init__(self, reason: Reason, detail: str) -> None:
         super().__init__(f"refused, {reason.value}: {detail}")
-        self.reason = reason
+        self.reason, self.detail = reason, detail
         self.code = _CODES.get(reason, Code.BAD_INPUT)

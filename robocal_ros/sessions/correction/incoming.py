@@ -1,6 +1,6 @@
 """What comes in: joints by name, their last known state, order in time, own output."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.core.joint_correction.starting import RESPONSE_S, Whereabouts
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction.inputs import JointCommand
@@ -20,15 +21,19 @@ READING = "joint reading"
 TARGET = "joint target"
 TRAJECTORY = "trajectory"
 
-# A reading this much older than the last one comes from a clock that was set back.
+# A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
-# Positions nearer than this are the same; own output is told by what it was shifted.
-SAME = 1e-12
+# Own output comes back as it was, or rounded (float32: 2.4e-7 rad): nearer than this, and nearer
+# than a share of what it was shifted by; so a target that is sent again is not taken for it.
+ROUNDED = 1e-6
+OF_SHIFT = 0.25
 SHIFTED = 1e-9
+ECHOES = 64  # a loop brings one of so many outputs back
+TRACK_S = 0.01  # between the places that tell how far the robot moved
 
 
 class JointBook:
-    """Knows the arm's joints and where they are.
+    """Knows the arm's joints and where they are; ``age_limit_s`` is how old a reading may be.
 
     Attributes
     ----------
@@ -36,8 +41,11 @@ class JointBook:
     taught : (n,) the same, un-corrected.
     """
 
-    def __init__(self, arm: SerialArm) -> None:
+    def __init__(self, arm: SerialArm, age_limit_s: float) -> None:
         self._names = arm.joint_names
+        self._age_limit_s = age_limit_s
+        self._read_s = np.full(arm.n, -np.inf)
+        self._track: deque[tuple[float, Array]] = deque()
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
         self.measured = np.full(arm.n, np.nan)
@@ -48,10 +56,20 @@ class JointBook:
         """Number of the arm's joints."""
         return len(self._names)
 
-    def complete(self, names: tuple[str, ...], position: Array) -> tuple[Array, Index]:
+    def where(self, now_s: float) -> Whereabouts:
+        """Where the robot is, how far it moved lately, and how old this is."""
+        places = np.array([q for t, q in self._track if t >= now_s - RESPONSE_S] or [self.measured])
+        travel = np.max(np.abs(places - self.measured), axis=0)
+        age = now_s - self._read_s
+        return Whereabouts(self._names, self.measured, travel, age, self._age_limit_s)
+
+    def complete(
+        self, names: tuple[str, ...], position: Array, now_s: float
+    ) -> tuple[Array, Index]:
         """All joints (m, n) of a command (m, k), and the joint number (k,) of each name.
 
-        Joints that the command leaves out keep their last known (taught) values.
+        Joints that the command leaves out keep their last known (taught) values, which must not
+        be old.
         """
         index = self._indices.get(names)
         if index is None:
@@ -70,6 +88,7 @@ class JointBook:
             if np.any(absent):
                 missing = [self._names[i] for i in np.flatnonzero(absent)]
                 raise RefusedError(Reason.MISSING_JOINT, ", ".join(missing))
+            self.where(now_s).require_fresh(np.flatnonzero(rest))
             q = np.tile(self.taught, (len(position), 1))
         q[:, index] = position
         return q, index
@@ -88,10 +107,10 @@ class JointBook:
         out[:, index] = rates
         return out
 
-    def read(self, state: JointCommand) -> tuple[Index, Index]:
+    def read(self, state: JointCommand, now_s: float, age_s: float) -> tuple[Index, Index]:
         """Take over readings; numbers of the arm's joints in it, and their places in the message.
 
-        Joints of others are left alone.
+        They are ``age_s`` old. Joints of others are left alone.
         """
         _require_single(state.names)
         if len(state.position) != len(state.names):
@@ -106,15 +125,12 @@ class JointBook:
             speeds = state.velocity[places]
             require_finite(tuple(state.names[i] for i in place), speeds[None])
         self.measured[index] = values
+        self._read_s[index] = now_s - max(age_s, 0.0)
+        if not self._track or now_s - self._track[-1][0] >= TRACK_S:
+            self._track.append((now_s, self.measured.copy()))
+            while self._track[0][0] < now_s - RESPONSE_S - TRACK_S:
+                self._track.popleft()
         return index, places
-
-    def known_measured(self) -> Array:
-        """Readings (n,) of all joints; refused while one has not been read."""
-        absent = ~np.isfinite(self.measured)
-        if np.any(absent):
-            missing = [self._names[i] for i in np.flatnonzero(absent)]
-            raise RefusedError(Reason.MISSING_JOINT, ", ".join(missing))
-        return self.measured
 
 
 class CorrectionGuard:
@@ -129,7 +145,7 @@ class CorrectionGuard:
     def __init__(self) -> None:
         self._clock_s = -np.inf
         self._stamps: dict[str, int] = {}
-        self._last_output: tuple[tuple[str, ...], Array] | None = None
+        self._echoes = {TARGET: Echoes(ECHOES), TRAJECTORY: Echoes(1)}
         self.refused: Counter[Reason] = Counter()
         self.last_refusal = ""
 
@@ -149,7 +165,7 @@ class CorrectionGuard:
         if not now_s >= self._clock_s:
             raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {self._clock_s}")
         last = self._stamps.get(kind, 0)
-        reset = kind == READING and last - stamp > CLOCK_RESET_NS
+        reset = last - stamp > CLOCK_RESET_NS
         if stamp and stamp < last and not reset:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
             raise RefusedError(Reason.TIME_BACKWARDS, detail)
@@ -164,21 +180,44 @@ class CorrectionGuard:
         """Start afresh with any source stamp."""
         self._stamps.clear()
 
-    def note_output(self, corrected: JointCommand | None, shift: float = 0.0) -> None:
-        """Remember a corrected target, and by how much it was shifted."""
-        self._last_output = None
-        if corrected is not None and shift > SHIFTED:
-            self._last_output = (corrected.names, corrected.position)
+    def note_output(self, kind: str, names: tuple[str, ...], taught: Array, out: Array) -> None:
+        """Remember what was put out for what came in."""
+        self._echoes[kind].remember(names, taught, out)
 
-    def require_not_own(self, command: JointCommand) -> None:
-        """Refuse a target that is the last corrected one."""
-        if self._last_output is None:
-            return
-        names, position = self._last_output
-        if command.names != names or command.position.shape != position.shape:
-            return
-        if np.max(np.abs(command.position - position)) <= SAME:
-            raise RefusedError(Reason.OWN_OUTPUT, "equal to the last corrected target")
+    def require_not_own(self, kind: str, names: tuple[str, ...], position: Array) -> None:
+        """Refuse what was put out, and comes back without its mark."""
+        if self._echoes[kind].holds(names, position):
+            raise RefusedError(Reason.OWN_OUTPUT, f"equal to a {kind} that was corrected before")
+
+
+class Echoes:
+    """The last corrected positions, to know them when they come back."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._names: tuple[str, ...] = ()
+        self._positions = np.empty((0, 0))
+        self._within = np.empty(0)
+        self._next = 0
+
+    def remember(self, names: tuple[str, ...], taught: Array, corrected: Array) -> None:
+        """Keep ``corrected`` for a while; one that equals ``taught`` is no echo."""
+        if names != self._names or corrected.shape != self._positions.shape[1:]:
+            self._names = names
+            self._positions = np.zeros((self._size, *corrected.shape))
+            self._within = np.full(self._size, -1.0)
+        shift = float(np.max(np.abs(corrected - taught)))
+        i = self._next % self._size
+        self._positions[i] = corrected
+        self._within[i] = min(ROUNDED, OF_SHIFT * shift) if shift > SHIFTED else -1.0
+        self._next += 1
+
+    def holds(self, names: tuple[str, ...], position: Array) -> bool:
+        """Whether a position is one of them, up to rounding."""
+        if names != self._names or position.shape != self._positions.shape[1:]:
+            return False
+        beside = np.abs(self._positions - position).reshape(self._size, -1).max(axis=1)
+        return bool(np.any(beside <= self._within))
 
 
 def require_finite(names: tuple[str, ...], values: Array | None) -> None:

@@ -1,4 +1,4 @@
-"""What the correction session takes in.
+"""What the correction session takes in, and what it says of itself.
 
 The builders accept any object with the attributes of the ROS message.
 """
@@ -72,6 +72,45 @@ class OfferedTool:
 
     parent: str
     T_flange_tool: Array
+
+
+@dataclass(frozen=True)
+class CorrectionStatus:
+    """What a correction session does; the figures are of the last message that was put out.
+
+    Attributes
+    ----------
+    enabled : asked for.
+    active : commands differ from what came in, or will.
+    settled : no blend is under way.
+    revision : of the model taken over, None without one.
+    new_tool : a tool other than the taught one was taken over.
+    tcp_shift_m : error at the tool that the drift would have made.
+    largest_shift : largest shift of a joint, rad (prismatic: m).
+    remaining_m : error that was left at the tool.
+    held : how often a blend waited because a bound would have been exceeded.
+    waits : why a blend waits now; empty when none does.
+    mismatch : why nothing is put out until the correction is enabled or disabled again; empty
+        when nothing is wrong.
+    reduced : how many points were corrected in part, near a singularity.
+    refused : how often, by reason.
+    last_refusal : in words; empty when there was none.
+    """
+
+    enabled: bool
+    active: bool
+    settled: bool
+    revision: int | None
+    new_tool: bool
+    tcp_shift_m: float
+    largest_shift: float
+    remaining_m: float
+    held: int
+    waits: str
+    mismatch: str
+    reduced: int
+    refused: dict[Reason, int]
+    last_refusal: str
 
 
 def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:

@@ -6,7 +6,7 @@ correct is refused with a reason, counted, and nothing is put out for it: `Refus
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.joint_correction.blending import blend_rates
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.core.joint_correction.starting import Sent
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction.corrector import Corrected, Corrector
@@ -27,6 +28,7 @@ from robocal_ros.sessions.correction.incoming import (
     require_finite,
 )
 from robocal_ros.sessions.correction.inputs import (
+    CorrectionStatus,
     JointCommand,
     OfferedModel,
     OfferedTool,
@@ -37,39 +39,7 @@ from robocal_ros.sessions.correction.offers import CorrectionGate
 Array = NDArray[np.float64]
 Answer = TypeVar("Answer")
 
-
-@dataclass(frozen=True)
-class CorrectionStatus:
-    """What a correction session does; the figures are of the last message that was put out.
-
-    Attributes
-    ----------
-    enabled : asked for.
-    active : commands differ from what came in, or will.
-    settled : no blend is under way.
-    revision : of the model taken over, None without one.
-    new_tool : a tool other than the taught one was taken over.
-    tcp_shift_m : error at the tool that the drift would have made.
-    largest_shift : largest shift of a joint, rad (prismatic: m).
-    remaining_m : error that was left at the tool.
-    held : how often a blend waited because a bound would have been exceeded.
-    reduced : how many points were corrected in part, near a singularity.
-    refused : how often, by reason.
-    last_refusal : in words; empty when there was none.
-    """
-
-    enabled: bool
-    active: bool
-    settled: bool
-    revision: int | None
-    new_tool: bool
-    tcp_shift_m: float
-    largest_shift: float
-    remaining_m: float
-    held: int
-    reduced: int
-    refused: dict[Reason, int]
-    last_refusal: str
+_AT_ONCE = np.zeros(1)
 
 
 class CorrectionSession:
@@ -95,7 +65,8 @@ class CorrectionSession:
         config = config or CorrectionConfig()
         self._gate = CorrectionGate(nominal, reference, serial, config)
         self._guard = CorrectionGuard()
-        self._joints = JointBook(reference)
+        self._config = config
+        self._joints = JointBook(reference, config.joint_state_age_s)
         self._corrector = Corrector(reference, config)
         self._enabled = False
         self._streamed_s: float | None = None
@@ -103,9 +74,13 @@ class CorrectionSession:
     # ---- what the operator and the estimators decide --------------------------------------------
 
     def enable(self, on: bool) -> None:
-        """Ask for the correction, or for its end; either blends in. Time stamps start afresh."""
+        """Ask for the correction, or for its end; either blends in.
+
+        Time stamps start afresh; after a mismatch the next command may begin where the robot is.
+        """
         self._enabled = on
         self._guard.forget_stamps()
+        self._corrector.restart()
         self._want()
 
     def offer_model(self, model: OfferedModel) -> None:
@@ -119,7 +94,7 @@ class CorrectionSession:
         self._want()
 
     def _want(self) -> None:
-        self._corrector.want(self._gate.actual if self._enabled else None)
+        self._corrector.want(self._gate.actual, self._enabled)
 
     # ---- commands -------------------------------------------------------------------------------
 
@@ -132,13 +107,16 @@ class CorrectionSession:
 
     def _target(self, command: JointCommand, now_s: float) -> JointCommand:
         self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s)
-        self._guard.require_not_own(command)
-        q, index = self._joints.complete(command.names, command.position[None])
+        self._guard.require_not_own(TARGET, command.names, command.position)
+        q, index = self._joints.complete(command.names, command.position[None], now_s)
         speeds = None if command.velocity is None else command.velocity[None]
         require_finite(command.names, speeds)
-        shift, corrected = 0.0, command
+        corrected = command
+        pause = np.inf if self._streamed_s is None else now_s - self._streamed_s
+        if self._must_start(now_s) and pause > self._config.stream_gap_s:
+            self._corrector.start_at(q, self._joints.where(now_s), now_s)
+            pause = 0.0
         if not self._corrector.passes(q, now_s):
-            pause = 0.0 if self._streamed_s is None else now_s - self._streamed_s
             whole = len(index) == self._joints.count
             done = self._corrector.point(q, now_s, pause, whole)
             velocity = None
@@ -149,11 +127,18 @@ class CorrectionSession:
                 velocity = rates[0][0, index]
             position = done.result.q[0, index]
             corrected = replace(command, position=position, velocity=velocity, mark=CORRECTED)
-            shift = float(np.max(np.abs(position - command.position)))
         self._streamed_s = now_s
         self._guard.accept_order(TARGET, command.stamp_ns, now_s)
-        self._guard.note_output(corrected, shift)
+        out = corrected.position
+        self._guard.note_output(TARGET, command.names, command.position, out)
+        self._corrector.note_sent(Sent(index, now_s, _AT_ONCE, command.position[None], out[None]))
         return corrected
+
+    def _must_start(self, now_s: float) -> bool:
+        """Whether a command must begin where the robot is; refused after a mismatch."""
+        if self._corrector.mismatch:
+            raise RefusedError(Reason.START_MISMATCH, self._corrector.mismatch)
+        return self._corrector.must_start(now_s)
 
     def trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float = 0.0
@@ -165,6 +150,7 @@ class CorrectionSession:
         """
         if len(command) == 0:
             self._corrector.stop(now_s)
+            self._streamed_s = None
             return command
         return self._guard.counted(lambda: self._trajectory(command, now_s, starts_in_s))
 
@@ -175,10 +161,13 @@ class CorrectionSession:
         times = command.time_from_start_s
         if not np.all(np.isfinite(times)) or times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
             raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
-        q, index = self._joints.complete(command.names, command.position)
+        self._guard.require_not_own(TRAJECTORY, command.names, command.position)
+        q, index = self._joints.complete(command.names, command.position, now_s)
         require_finite(command.names, command.velocity)
         require_finite(command.names, command.acceleration)
         corrected = command
+        if self._must_start(now_s):
+            self._start_path(q, index, times, now_s, starts_in_s)
         if not self._corrector.passes(q, now_s):
             whole = len(index) == self._joints.count
             done = self._corrector.path(q, times, now_s, starts_in_s, whole)
@@ -187,8 +176,23 @@ class CorrectionSession:
             if command.velocity is not None:
                 corrected = self._with_rates(corrected, done, q, index)
         self._guard.accept_order(TRAJECTORY, command.stamp_ns, now_s)
-        self._guard.note_output(None)
+        out = corrected.position
+        self._guard.note_output(TRAJECTORY, command.names, command.position, out)
+        begin = now_s + starts_in_s
+        self._corrector.note_sent(Sent(index, begin, times, command.position, out))
+        self._streamed_s = None
         return corrected
+
+    def _start_path(
+        self, q: Array, index: NDArray[np.int64], times: Array, now_s: float, starts_in_s: float
+    ) -> None:
+        """The robot must stand where a trajectory begins, or be led there in time."""
+        where, elapsed = self._joints.where(now_s), -starts_in_s
+        if elapsed < times[0]:
+            self._corrector.start_within(q[0], index, where, now_s, float(times[0] - elapsed))
+            return
+        by_now = [np.interp(elapsed, times, column) for column in q.T]
+        self._corrector.start_at(np.stack([q[0], by_now]), where, now_s)
 
     def _with_rates(
         self, command: TrajectoryCommand, done: Corrected, q: Array, index: NDArray[np.int64]
@@ -207,17 +211,17 @@ class CorrectionSession:
 
     # ---- readings -------------------------------------------------------------------------------
 
-    def reading(self, state: JointCommand, now_s: float) -> JointCommand:
+    def reading(self, state: JointCommand, now_s: float, age_s: float = 0.0) -> JointCommand:
         """Un-correct joint readings with the model that is being commanded at ``now_s``.
 
-        Joints of others pass as they are. Until each joint of the arm has been read once,
-        nothing can be un-corrected: refused while a correction is commanded.
+        ``age_s``: how old they were on arrival, by their stamp.
+        Joints of others pass as they are.
         """
-        return self._guard.counted(lambda: self._reading(state, now_s))
+        return self._guard.counted(lambda: self._reading(state, now_s, age_s))
 
-    def _reading(self, state: JointCommand, now_s: float) -> JointCommand:
+    def _reading(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
         self._guard.require_order(READING, state.stamp_ns, state.mark, now_s)
-        index, place = self._joints.read(state)
+        index, place = self._joints.read(state, now_s, age_s)
         self._guard.accept_order(READING, state.stamp_ns, now_s)
         passed = replace(state, mark=TAUGHT)
         stage = self._corrector.commanded(now_s)
@@ -226,7 +230,7 @@ class CorrectionSession:
             return passed
         if len(place) == 0:
             return passed
-        measured = self._joints.known_measured()
+        measured = self._joints.measured
         taught = stage.uncorrect(measured[None], np.ones(1))
         self._joints.taught = taught[0]
         position = state.position.copy()
@@ -255,6 +259,8 @@ class CorrectionSession:
             largest_shift=corrector.figures[1],
             remaining_m=corrector.figures[2],
             held=corrector.held,
+            waits=corrector.waits,
+            mismatch=corrector.mismatch,
             reduced=corrector.reduced,
             refused=dict(guard.refused),
             last_refusal=guard.last_refusal,
