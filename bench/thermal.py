@@ -4,19 +4,22 @@ Nothing is tuned on the shift that is judged: prior and parameters come from ano
 same robot.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
 from docs.examples.make_thermal import MEASURING, poses
+from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
 from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.drift_history import DriftHistory, share_within
-from robocal_ros.core.thermal.identification import identify_cycle
+from robocal_ros.core.thermal.identification import identify_cycle, judge_cycle
 from robocal_ros.core.thermal.learning import learn_drift
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess
@@ -35,6 +38,7 @@ from robocal_ros.sim.drift import (
     record,
 )
 from robocal_ros.sim.robot import Effects
+from robocal_ros.sim.sphere_cloud import CloudScene, sphere_cloud
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -93,6 +97,7 @@ class Judged:
     between: Array  # (PARTS t, c, 3) the same at every part of a period
     rows: Array  # (c, 3, k) of the check poses
     prior: Array
+    history: DriftHistory  # of the teacher's shift
     screened: tuple[int, ...]
 
     def left(self, drift: Array) -> Array:
@@ -115,6 +120,8 @@ def prepare(seed: int, effects: Effects) -> list[Judged]:
         between = cell.truth(plan, PARTS)
         teacher = Measured.of(arm, records[i - 1], everything)
         learned = learn_drift([(teacher.spots, teacher.cycles)], sigma_m=SIGMA_M)
+        history = _history(arm, cell, teacher, cell.plans[i - 1], seed)
+        chosen = screen(history, wanted=1).highest.names
         found.append(
             Judged(
                 measured=Measured.of(arm, records[i], MEASURING),
@@ -123,20 +130,21 @@ def prepare(seed: int, effects: Effects) -> list[Judged]:
                 between=between,
                 rows=rows,
                 prior=learned.covariance,
-                screened=_screened(arm, cell, teacher, cell.plans[i - 1], seed),
+                history=history,
+                screened=tuple(arm.parameters.names.index(name) for name in chosen),
             )
         )
     return found
 
 
-def _screened(
+def _history(
     arm: SerialArm, cell: DriftingCell, teacher: Measured, plan: DriftPlan, seed: int
-) -> tuple[int, ...]:
-    """The set of parameters with the highest share on the teacher's shift, judged as measured."""
+) -> DriftHistory:
+    """The teacher's shift for screening, its check poses judged as measured."""
     spots = teacher.spots
     truth = cell.truth(plan).reshape(len(teacher.cycles), -1)
     noise = SIGMA_M * np.random.default_rng([seed, 99]).standard_normal(truth.shape)
-    history = DriftHistory(
+    return DriftHistory(
         names=arm.parameters.names,
         displacement=np.array([_displacement(spots, cycle) for cycle in teacher.cycles]),
         rows=spots.rows(spots.q, spots.target)[0].reshape(-1, len(arm.parameters)),
@@ -145,8 +153,6 @@ def _screened(
             truth.shape[1], -1
         ),
     )
-    chosen = screen(history, wanted=1).highest.names
-    return tuple(arm.parameters.names.index(name) for name in chosen)
 
 
 def _displacement(spots: ColdSpots, cycle: Measurements) -> Array:
@@ -263,6 +269,47 @@ def between_table(seeds: Sequence[int]) -> Table:
     return table
 
 
+def speed_table() -> Table:
+    """What a cycle costs on line, and a screening off line."""
+    table = Table(
+        "thermal_speed",
+        "Thermal drift: time on one thread, ms",
+        ("what", "median", "95 %", "goal"),
+        "Sphere: 2000 points, a quarter of them not the sphere's. Cycle: from six centres to the "
+        "judged drift of all parameters. Screening: from 24 parameters to one.",
+    )
+    rng = np.random.default_rng(0)
+    clouds = [sphere_cloud(np.array([0.05, -0.03, 0.7]), 2000, rng) for _ in range(100)]
+    rule = SphereRule(CloudScene().radius_m)
+    _add_times(
+        table, "fit of a sphere", [partial(fit_sphere, cloud, rule) for cloud in clouds], 3.0
+    )
+    judged = prepare(SEEDS[0], Effects())[1]
+    spots, prior, arm = judged.measured.spots, judged.prior, judged.measured.spots.cell.arm
+
+    def cycle(one: Measurements) -> object:
+        found = identify_cycle(spots, one, prior_covariance=prior, sigma_m=SIGMA_M)
+        return judge_cycle(found, spots, in_force=arm, sigma_m=SIGMA_M)
+
+    _add_times(table, "one cycle", [partial(cycle, one) for one in judged.measured.cycles], 5.0)
+    history = judged.history
+    _add_times(table, "screening, 90 cycles of 20 poses", [partial(screen, history, wanted=1)], 1e4)
+    return table
+
+
+def _add_times(
+    table: Table, what: str, calls: Sequence[Callable[[], object]], limit: float
+) -> None:
+    calls[0]()
+    took = []
+    for call in calls:
+        start = time.perf_counter()
+        call()
+        took.append(1e3 * (time.perf_counter() - start))
+    p95 = float(np.quantile(took, 0.95))
+    table.add(what, float(np.median(took)), p95, Goal(p95, limit))
+
+
 def tables() -> Sequence[Table]:
     """All of them."""
     return [
@@ -274,4 +321,5 @@ def tables() -> Sequence[Table]:
             "The same without what no estimator knows of",
         ),
         between_table(SEEDS),
+        speed_table(),
     ]
