@@ -15,8 +15,9 @@ from robocal_ros.core.errors import ResidualError, TooFewSamplesError
 Array = NDArray[np.float64]
 
 FEWEST_POINTS = 30
-_TRIPLES = 120
-_JUDGES = 250  # points that complete and judge a start
+# How many triples are tried, and how many points complete and judge them: first in haste, then,
+# where that finds nothing, for a sphere among much else.
+_EFFORTS = ((100, 150), (400, 400))
 _REACH = 1.5  # radii between the points of a triple
 _NEAR_M = 3e-4  # a start is judged by the points so near to it
 _ROUNDS = 12
@@ -88,21 +89,26 @@ def fit_sphere(points: Array, rule: SphereRule) -> SphereFit:
         raise TooFewSamplesError(
             f"{len(cloud)} points give no sphere's centre: at least {FEWEST_POINTS} are needed"
         )
-    centre = _start(cloud, rule)
-    centre, near = _refine(cloud, centre, rule)
+    for triples, judges in _EFFORTS:
+        try:
+            centre, near = _refine(cloud, _start(cloud, rule, triples, judges), rule)
+            break
+        except TooFewSamplesError:
+            if (triples, judges) == _EFFORTS[-1]:
+                raise
     fit = _report(cloud, centre, near, finite)
     _require(fit, rule)
     return fit
 
 
-def _start(cloud: Array, rule: SphereRule) -> Array:
+def _start(cloud: Array, rule: SphereRule, triples: int, judge_count: int) -> Array:
     """The best of the spheres through three points that lie near each other."""
     rng = np.random.default_rng(0)
-    first = cloud[rng.integers(len(cloud), size=_TRIPLES)]
-    judges = cloud[rng.integers(len(cloud), size=_JUDGES)]
+    first = cloud[rng.integers(len(cloud), size=triples)]
+    judges = cloud[rng.integers(len(cloud), size=judge_count)]
     near = _squared(first, judges) < (_REACH * rule.radius_m) ** 2
-    order = (np.arange(_JUDGES) + rng.integers(_JUDGES, size=(_TRIPLES, 1))) % _JUDGES
-    rows, near = np.arange(_TRIPLES), np.take_along_axis(near, order, axis=1)
+    order = (np.arange(judge_count) + rng.integers(judge_count, size=(triples, 1))) % judge_count
+    rows, near = np.arange(triples), np.take_along_axis(near, order, axis=1)
     second = near.argmax(axis=1)
     near[rows, second] = False
     third = near.argmax(axis=1)
