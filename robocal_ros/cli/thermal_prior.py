@@ -5,8 +5,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.parsing import positive
@@ -54,6 +52,8 @@ def run(args: argparse.Namespace) -> Outcome:
         raise InputError(
             f"{len(args.cold)} --cold and {len(args.warm)} --warm: give one of each for each shift"
         )
+    import numpy as np
+
     from robocal_ros.cli.thermal_identification import cold_spots, warm_visits
     from robocal_ros.core.thermal.learning import learn_drift
     from robocal_ros.storage.prior_files import write_prior
