@@ -752,6 +752,56 @@ def test_readings_of_a_clock_that_was_set_back_are_taken(warm: Robot) -> None:
     warm.read(q, stamp_ns=1_000_000_000)
 
 
+def test_a_source_whose_clock_was_set_back_goes_on(warm: Robot) -> None:
+    """A simulator that was started again, or one stamp from the future."""
+    warm.stream(stamp_ns=10**15)
+    warm.stream(stamp_ns=10**9)
+    refused(Reason.TIME_BACKWARDS, warm.stream, stamp_ns=9 * 10**8)
+
+
+def test_a_trajectory_for_later_does_not_bar_those_that_come_before(warm: Robot) -> None:
+    later = replace(still(), stamp_ns=1_000_000_000_000)
+    warm.session.trajectory(later, warm.now, 600.0)
+    sooner = replace(still(first_s=0.5), stamp_ns=400_000_000_000)
+    warm.session.trajectory(sooner, warm.now, 10.0)
+
+
+@pytest.mark.parametrize("late", [1, 2, 3, 20])
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_own_output_without_its_mark_is_known_late_and_rounded(late: int, kind: Any) -> None:
+    """The loop is closed while the correction blends in, from its first visible step on."""
+    robot = large()
+    outputs = [robot.stream() for _ in range(50)]
+    back = outputs[-late].astype(kind).astype(np.float64)
+    assert np.abs(back - HOME).max() > 1e-5
+    refused(Reason.OWN_OUTPUT, robot.stream, back)
+    at = robot.settle()
+    refused(Reason.OWN_OUTPUT, robot.stream, at.astype(kind).astype(np.float64))
+    # what is no echo passes: the same target, and one that is rounded
+    assert np.array_equal(robot.stream(), at)
+    robot.stream(HOME.astype(np.float32).astype(np.float64))
+    robot.stream(at + 1e-5)
+
+
+def test_a_corrected_trajectory_that_comes_back_without_its_mark(warm: Robot) -> None:
+    out = warm.session.trajectory(still(), warm.now)
+    rounded = out.position.astype(np.float32).astype(np.float64)
+    back = replace(out, position=rounded, mark="")
+    refused(Reason.OWN_OUTPUT, warm.session.trajectory, back, warm.now)
+    warm.session.trajectory(still(), warm.now)
+
+
+def test_a_rounded_target_is_no_echo_of_a_tiny_correction() -> None:
+    """Corrected by less than a float32 holds: the same rounded target again is no loop."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted(1e-3)))
+    robot.session.enable(True)
+    rounded = HOME.astype(np.float32).astype(np.float64)
+    for _ in range(10):
+        shift = np.abs(robot.stream(rounded) - rounded).max()
+    assert 0.0 < shift < 5e-7
+
+
 def test_own_output_that_comes_back(warm: Robot) -> None:
     session, now = warm.session, warm.now
     out = warm.stream()
@@ -794,6 +844,26 @@ def test_a_drift_beyond_its_bound_is_not_taken_over(robot: Robot) -> None:
     assert np.array_equal(robot.stream(), HOME)
 
 
+def test_a_blend_that_waits_says_why(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.stream()
+    robot.session.enable(True)
+    robot.stream()
+    assert robot.session.status().waits == ""
+    robot.read(robot.at)
+    robot.session.target(JointCommand(NAMES[:1], HOME[:1]), robot.now)
+    assert "part of the joints" in robot.session.status().waits
+    robot.stream()
+    assert robot.session.status().waits == ""
+    part = TrajectoryCommand(NAMES[:1], HOME[None, :1], np.array([1.0]))
+    robot.session.trajectory(part, robot.now)
+    assert "part of the joints" in robot.session.status().waits
+    robot.session.enable(False)
+    robot.settle()
+    robot.stream()
+    assert robot.session.status().waits == ""
+
+
 def test_where_the_bound_is_reached_the_blend_waits(robot: Robot) -> None:
     """Without readings the model is judged only when commands come."""
     robot.session.offer_model(offer(drifted(12.0)))
@@ -801,6 +871,7 @@ def test_where_the_bound_is_reached_the_blend_waits(robot: Robot) -> None:
     outputs = [robot.stream() for _ in range(1500)]
     status = robot.session.status()
     assert status.held > 0
+    assert "1 mm" in status.waits
     assert not status.settled
     assert status.tcp_shift_m <= 1e-3
     assert np.array_equal(outputs[-1], outputs[-2])

@@ -157,7 +157,8 @@ class CorrectionSession:
     def _trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float
     ) -> TrajectoryCommand:
-        self._guard.require_order(TRAJECTORY, command.stamp_ns, command.mark, now_s)
+        # The stamp says when it begins, not when it was made: no order follows from it.
+        self._guard.require_order(TRAJECTORY, 0, command.mark, now_s)
         times = command.time_from_start_s
         if not np.all(np.isfinite(times)) or times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
             raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
@@ -175,7 +176,7 @@ class CorrectionSession:
             corrected = replace(command, position=position, mark=CORRECTED)
             if command.velocity is not None:
                 corrected = self._with_rates(corrected, done, q, index)
-        self._guard.accept_order(TRAJECTORY, command.stamp_ns, now_s)
+        self._guard.accept_order(TRAJECTORY, 0, now_s)
         out = corrected.position
         self._guard.note_output(TRAJECTORY, command.names, command.position, out)
         begin = now_s + starts_in_s
