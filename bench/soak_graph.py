@@ -27,7 +27,9 @@ from robocal_ros.storage.robots import load_robot
 
 SERIAL, ROBOT = "SOAK-1", "kr150_r3100"
 THERMAL, CORRECTION = "thermal_node", "joint_correction_node"
-STREAMS = {"joint_targets": "corrected target", "joint_states": "un-corrected joint state"}
+STREAMS = {"joint_states": "un-corrected joint state", "joint_targets": "corrected target"}
+ONE_STREAM = "stream_gap_s:=10.0"  # a stall of this machine is no new start
+STILL_S, GROWS_S = 1.0, 2.0  # a correction begins where the robot stands
 LISTED = "~/list"
 DRIFT = 2e-5  # m and rad, of each parameter: about a tenth of a millimetre at the tool
 ASK_EVERY_S = 0.5
@@ -44,12 +46,13 @@ class LoadedGraph:
         self._arm = load_robot(ROBOT)
         self._accept_a_drift(folder / "state")
         self._sent: dict[tuple[str, int], float] = {}
+        self._began = 0
         self._took: dict[str, list[float]] = defaultdict(list)
         self._processes = {
             name: self._start(folder, name, *more)
             for name, more in (
                 (THERMAL, ()),
-                (CORRECTION, ("-r", f"kinematic_model:=/{THERMAL}/model")),
+                (CORRECTION, ("-r", f"kinematic_model:=/{THERMAL}/model", "-p", ONE_STREAM)),
             )
         }
         rclpy.init()
@@ -139,7 +142,9 @@ class LoadedGraph:
 
     def _send(self) -> None:
         now = time.time_ns()
-        wave = 0.3 * np.sin(now * 1e-9 * np.linspace(0.3, 0.8, self._arm.n))
+        self._began = self._began or now
+        size = 0.3 * np.clip(((now - self._began) * 1e-9 - STILL_S) / GROWS_S, 0.0, 1.0)
+        wave = size * np.sin(now * 1e-9 * np.linspace(0.3, 0.8, self._arm.n))
         middle = np.radians([0.0, -80.0, 100.0, 10.0, 40.0, 0.0])
         for topic, publisher in self._publishers.items():
             message = JointState(name=list(self._arm.joint_names), position=middle + wave)

@@ -6,7 +6,6 @@ Numba keeps the machine code beside the source, so that no node pays for it at i
 import numpy as np
 
 from robocal_ros.core.identification import identify
-from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
@@ -50,7 +49,6 @@ def main() -> None:
     data = Measurements(q=q, position=position, target=("tool",) * POSES, sample=names)
     identify(arm, data).cell.residual(data)
     load_kernels(arm)
-    JointCorrection.between(arm, arm).point(q[0])
 
 
 if __name__ == "__main__":

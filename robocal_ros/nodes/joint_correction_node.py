@@ -49,6 +49,7 @@ class JointCorrectionNode(HouseNode):
 
     NAME = "joint_correction_node"
     SETTINGS = SETTINGS
+    _made_for = ""  # serial of the model in use
 
     def configure(self) -> None:
         """Load the models, then open the topics."""
@@ -80,6 +81,7 @@ class JointCorrectionNode(HouseNode):
     def _on_model(self, message: Any) -> None:
         build = self._session.counted
         self._session.offer_model(build(lambda: offered_model(message, KinematicModel.ACCEPTED)))
+        self._made_for = self._session.status().serial
 
     def _on_tool(self, message: Any) -> None:
         self._session.offer_tool(self._session.counted(lambda: offered_tool(message)))
@@ -144,6 +146,10 @@ class JointCorrectionNode(HouseNode):
         for guard in self._sources.values():
             guard.look()
 
+    def _serial(self) -> str:
+        """The robot's serial: as configured, else the model's, else the robot's name."""
+        return super()._serial() or self._made_for or str(self.get_parameter("robot").value)
+
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
         status, health = self._session.status(), Health()
@@ -161,6 +167,13 @@ class JointCorrectionNode(HouseNode):
             health.worsen(ERROR, f"{Reason.START_MISMATCH.value}: {status.mismatch}")
         if status.waits:
             health.worsen(WARN, f"the blend waits, {status.waits}")
+        if status.survey.beyond:
+            health.worsen(WARN, f"model revision {status.revision}: {status.survey}")
+        if status.waiting_revision is not None:
+            health.worsen(
+                WARN,
+                f"model revision {status.waiting_revision} was refused, ~/enable looks at it again",
+            )
         if status.enabled and status.revision is None and not status.new_tool:
             health.worsen(WARN, "enabled, but neither a model nor a tool was taken over")
         health.values = {
@@ -168,6 +181,7 @@ class JointCorrectionNode(HouseNode):
             "shift at the tool mm": f"{status.tcp_shift_m * 1e3:.4f}",
             "largest joint shift deg": f"{np.degrees(status.largest_shift):.4f}",
             "remaining error mm": f"{status.remaining_m * 1e3:.6f}",
+            "over the joint range": status.survey,
             "start mismatch": status.mismatch,
             "blend waits": status.waits,
             "blend held": status.held,

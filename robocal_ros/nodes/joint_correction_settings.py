@@ -40,6 +40,7 @@ SETTINGS = (
         check=_tool_fault,
     ),
     Setting("flange_frame", "tool0", "Parent frame of the tool_frame input"),
+    Setting("tool_child_frame", "", "Child frame of the tool_frame input; empty: any"),
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
     Setting(
         "thermal_tcp_mm",
@@ -171,4 +172,5 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         start_m=settings["start_mm"] * 1e-3,
         joint_state_age_s=settings["joint_state_age_s"],
         flange_frame=settings["flange_frame"],
+        tool_frame=settings["tool_child_frame"],
     )

@@ -1,6 +1,7 @@
 """The correction reaches the taught pose, can be undone, and never leaves its bounds."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +13,9 @@ from robocal_ros.core.joint_correction import (
     JointCorrection,
     blend_models,
     pack_model,
-    rates,
     solution,
 )
+from robocal_ros.core.joint_correction.rates import rates_batch
 from robocal_ros.core.joint_correction.solution import MOST_OVER
 from robocal_ros.core.joint_correction.staged import StagedCorrection
 from robocal_ros.core.kinematics import SerialArm
@@ -110,11 +111,9 @@ def test_a_batch_gives_the_bits_of_single_points() -> None:
     correction = JointCorrection.between(reference, drifted(reference, rng, 1e-3))
     q = rng.uniform(-2.0, 2.0, (50, 6))
     batch = correction.correct(q)
-    single = np.array([correction.point(row)[:6].copy() for row in q])
+    single = np.array([correction.correct(row).q for row in q])
     assert np.array_equal(batch.q, single)
-    one = correction.correct(q[3])
-    assert np.array_equal(one.q, single[3])
-    assert one.iterations == batch.iterations[3]
+    assert correction.correct(q[3]).iterations == batch.iterations[3]
 
 
 def test_nothing_to_correct_gives_the_same_joints() -> None:
@@ -182,24 +181,34 @@ def test_the_shift_is_continuous_through_a_wrist_singularity() -> None:
     assert np.abs(np.diff(shift, axis=0)).max() < 0.02 * bound
 
 
+def settled(reference: SerialArm, actual: SerialArm) -> StagedCorrection:
+    start, end = pack_model(reference), pack_model(actual)
+    return StagedCorrection(start, end, end, *np.ones((2, reference.n)))
+
+
+def shift(stage: StagedCorrection, q: np.ndarray) -> np.ndarray:
+    return stage.correct(q, np.ones(len(q))).q - q
+
+
+def rates(stage: StagedCorrection, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> Any:
+    ones = np.ones(len(q))
+    return stage.rates(q, qd, qdd, ones, np.zeros(len(q)), stage.correct(q, ones))
+
+
 def test_rates_follow_the_path() -> None:
     rng = np.random.default_rng(5)
     reference = robot("kr150_r3100")
     actual = bent(drifted(reference, rng, 1e-3), rng, 2e-3, 0.5)
-    correction = JointCorrection.between(reference, actual)
+    stage = settled(reference, actual)
     q = HOME + rng.uniform(-0.5, 0.5, (300, 6))
     qd, qdd = rng.uniform(-2.0, 2.0, (2, 300, 6))
-    v, a = correction.rates(q, qd, qdd)
+    v, a = rates(stage, q, qd, qdd)
     h = 1e-4
-    before, after = (
-        correction.correct(q + qd * t + 0.5 * qdd * t * t).joint_shift for t in (-h, h)
-    )
+    before, after = (shift(stage, q + qd * t + 0.5 * qdd * t * t) for t in (-h, h))
     assert np.abs(v - qd).max() > 1e-4
     assert np.allclose(v, qd + (after - before) / (2 * h), rtol=0.0, atol=2e-7)
     h = 3e-3
-    before, here, after = (
-        correction.correct(q + qd * t + 0.5 * qdd * t * t).joint_shift for t in (-h, 0.0, h)
-    )
+    before, here, after = (shift(stage, q + qd * t + 0.5 * qdd * t * t) for t in (-h, 0.0, h))
     shift_a = (after - 2 * here + before) / h**2
     assert np.allclose(a, qdd + shift_a, rtol=0.0, atol=1e-3 * np.abs(shift_a).max())
 
@@ -209,14 +218,14 @@ def test_rates_are_those_of_the_tool() -> None:
     rng = np.random.default_rng(6)
     reference = robot("ur10")
     actual = drifted(reference, rng, 1e-3)
-    correction = JointCorrection.between(reference, actual)
+    stage = settled(reference, actual)
     q = well_conditioned(reference, rng, 200)
     qd = rng.uniform(-1.0, 1.0, q.shape)
-    result = correction.correct(q)
-    v, _ = correction.rates(q, qd, np.zeros_like(q))
+    result = stage.correct(q, np.ones(len(q)))
+    v, _ = rates(stage, q, qd, np.zeros_like(q))
     wanted = (tool_jacobian(reference, q) @ qd[..., None])[..., 0]
     found = (tool_jacobian(actual, result.q) @ v[..., None])[..., 0]
-    whole = result.share == 1.0
+    whole = result.whole
     assert np.abs(found - wanted)[whole].max() < 1e-9
 
 
@@ -224,9 +233,8 @@ def test_an_arm_at_rest_stays_at_rest() -> None:
     reference = robot("kr150_r3100")
     actual = drifted(reference, np.random.default_rng(7), 1e-3)
     zero = np.zeros((1, 6))
-    v, a = JointCorrection.between(reference, actual).rates(
-        [[0.1, -1.5, 1.4, 0.2, 0.9, 0.3]], *[zero] * 2
-    )
+    q = np.array([[0.1, -1.5, 1.4, 0.2, 0.9, 0.3]])
+    v, a = rates(settled(reference, actual), q, zero, zero)
     assert np.all(v == 0.0)
     assert np.all(a == 0.0)
 
@@ -235,13 +243,13 @@ def test_rates_with_a_sliding_joint_match_differences() -> None:
     rng = np.random.default_rng(8)
     reference = load_robot("p1r2p3")
     actual = drifted(reference, rng, 1e-3)
-    correction = JointCorrection.between(reference, actual)
+    stage = settled(reference, actual)
     q = rng.uniform(0.1, 0.4, (20, 3))
     qd = rng.uniform(-0.5, 0.5, (20, 3))
-    v, _ = correction.rates(q, qd, np.zeros_like(q))
+    v, _ = rates(stage, q, qd, np.zeros_like(q))
     h = 1e-4
-    numeric = (correction.correct(q + h * qd).q - correction.correct(q - h * qd).q) / (2 * h)
-    assert np.allclose(v, numeric, rtol=0.0, atol=1e-6)
+    numeric = (shift(stage, q + h * qd) - shift(stage, q - h * qd)) / (2 * h)
+    assert np.allclose(v, qd + numeric, rtol=0.0, atol=1e-6)
 
 
 def test_an_arm_of_three_joints_gets_as_near_as_it_can() -> None:
@@ -344,10 +352,14 @@ def test_kernels_are_compiled_for_one_type_of_array_only() -> None:
     correction = JointCorrection(models, np.broadcast_to(0.1, (6,)))
     correction.correct(q)
     correction.correct(q[0].tolist(), 0.5)
-    correction.rates(q, q, q)
+    ones = np.ones(len(q))
+    ones.flags.writeable = False
+    stage = settled(reference, reference)
+    stage.rates(q, q, q, ones, ones, stage.correct(q, ones))
+    stage.rates(q, q, q, ones, 0.0 * ones, stage.correct(q, ones))
     correction.inverse().correct(q[:1], np.ones(1))
     assert len(solution.correct_batch.signatures) == 1
-    assert len(rates.rates_batch.signatures) == 1
+    assert len(rates_batch.signatures) == 1
 
 
 def test_wrong_shapes_are_a_callers_mistake() -> None:

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.core import frames
+from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
@@ -752,6 +753,56 @@ def test_readings_of_a_clock_that_was_set_back_are_taken(warm: Robot) -> None:
     warm.read(q, stamp_ns=1_000_000_000)
 
 
+def test_a_source_whose_clock_was_set_back_goes_on(warm: Robot) -> None:
+    """A simulator that was started again, or one stamp from the future."""
+    warm.stream(stamp_ns=10**15)
+    warm.stream(stamp_ns=10**9)
+    refused(Reason.TIME_BACKWARDS, warm.stream, stamp_ns=9 * 10**8)
+
+
+def test_a_trajectory_for_later_does_not_bar_those_that_come_before(warm: Robot) -> None:
+    later = replace(still(), stamp_ns=1_000_000_000_000)
+    warm.session.trajectory(later, warm.now, 600.0)
+    sooner = replace(still(first_s=0.5), stamp_ns=400_000_000_000)
+    warm.session.trajectory(sooner, warm.now, 10.0)
+
+
+@pytest.mark.parametrize("late", [1, 2, 3, 20])
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_own_output_without_its_mark_is_known_late_and_rounded(late: int, kind: Any) -> None:
+    """The loop is closed while the correction blends in, from its first visible step on."""
+    robot = large()
+    outputs = [robot.stream() for _ in range(50)]
+    back = outputs[-late].astype(kind).astype(np.float64)
+    assert np.abs(back - HOME).max() > 1e-5
+    refused(Reason.OWN_OUTPUT, robot.stream, back)
+    at = robot.settle()
+    refused(Reason.OWN_OUTPUT, robot.stream, at.astype(kind).astype(np.float64))
+    # what is no echo passes: the same target, and one that is rounded
+    assert np.array_equal(robot.stream(), at)
+    robot.stream(HOME.astype(np.float32).astype(np.float64))
+    robot.stream(at + 1e-5)
+
+
+def test_a_corrected_trajectory_that_comes_back_without_its_mark(warm: Robot) -> None:
+    out = warm.session.trajectory(still(), warm.now)
+    rounded = out.position.astype(np.float32).astype(np.float64)
+    back = replace(out, position=rounded, mark="")
+    refused(Reason.OWN_OUTPUT, warm.session.trajectory, back, warm.now)
+    warm.session.trajectory(still(), warm.now)
+
+
+def test_a_rounded_target_is_no_echo_of_a_tiny_correction() -> None:
+    """Corrected by less than a float32 holds: the same rounded target again is no loop."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted(1e-3)))
+    robot.session.enable(True)
+    rounded = HOME.astype(np.float32).astype(np.float64)
+    for _ in range(10):
+        shift = np.abs(robot.stream(rounded) - rounded).max()
+    assert 0.0 < shift < 5e-7
+
+
 def test_own_output_that_comes_back(warm: Robot) -> None:
     session, now = warm.session, warm.now
     out = warm.stream()
@@ -794,6 +845,26 @@ def test_a_drift_beyond_its_bound_is_not_taken_over(robot: Robot) -> None:
     assert np.array_equal(robot.stream(), HOME)
 
 
+def test_a_blend_that_waits_says_why(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted(2.0)))
+    robot.stream()
+    robot.session.enable(True)
+    robot.stream()
+    assert robot.session.status().waits == ""
+    robot.read(robot.at)
+    robot.session.target(JointCommand(NAMES[:1], HOME[:1]), robot.now)
+    assert "part of the joints" in robot.session.status().waits
+    robot.stream()
+    assert robot.session.status().waits == ""
+    part = TrajectoryCommand(NAMES[:1], HOME[None, :1], np.array([1.0]))
+    robot.session.trajectory(part, robot.now)
+    assert "part of the joints" in robot.session.status().waits
+    robot.session.enable(False)
+    robot.settle()
+    robot.stream()
+    assert robot.session.status().waits == ""
+
+
 def test_where_the_bound_is_reached_the_blend_waits(robot: Robot) -> None:
     """Without readings the model is judged only when commands come."""
     robot.session.offer_model(offer(drifted(12.0)))
@@ -801,6 +872,7 @@ def test_where_the_bound_is_reached_the_blend_waits(robot: Robot) -> None:
     outputs = [robot.stream() for _ in range(1500)]
     status = robot.session.status()
     assert status.held > 0
+    assert "1 mm" in status.waits
     assert not status.settled
     assert status.tcp_shift_m <= 1e-3
     assert np.array_equal(outputs[-1], outputs[-2])
@@ -869,6 +941,95 @@ def test_revisions_only_grow(warm: Robot) -> None:
     warm.session.offer_model(offer(drifted(0.5), 3))
     refused(Reason.OLD_REVISION, warm.session.offer_model, offer(drifted(), 2))
     assert warm.session.status().revision == 3
+
+
+def good_here_only() -> tuple[SerialArm, np.ndarray]:
+    """A drift that is within the bounds at home, and a posture where it is not."""
+    far = HOME + np.array([1.0, 0.6, -0.8, 1.0, 0.6, 1.0])
+    bounds = CorrectionConfig().thermal
+    for seed in range(400):
+        arm = drifted(6.0, seed)
+        here, there = (JointCorrection.between(NOMINAL, arm).correct(q) for q in (HOME, far))
+        if bounds.hold(here).all() and there.tcp_shift_m > 1.05e-3:
+            return arm, far
+    pytest.fail("no such drift")
+
+
+def test_a_model_that_is_too_large_elsewhere_is_announced(robot: Robot) -> None:
+    robot.session.offer_model(offer(drifted()))
+    assert robot.session.status().survey.beyond == 0.0
+    assert 0.0 < robot.session.status().survey.worst_m < 1e-3
+    arm, _ = good_here_only()
+    robot.stream()
+    robot.session.offer_model(offer(arm, 2))
+    survey = robot.session.status().survey
+    assert robot.session.status().revision == 2
+    # against ten times as many other postures
+    q = np.random.default_rng(1).uniform(NOMINAL.lower, NOMINAL.upper, (10_000, 6))
+    shift = JointCorrection.between(NOMINAL, arm).correct(q)
+    beyond = 1.0 - np.mean(CorrectionConfig().thermal.hold(shift))
+    assert beyond > 0.05
+    assert survey.beyond == pytest.approx(beyond, abs=0.05)
+    assert survey.worst_m == pytest.approx(shift.tcp_shift_m.max(), rel=0.2)
+    assert "of the postures" in str(survey)
+
+
+def test_a_model_that_is_too_large_where_the_robot_goes_is_not_taken_over(robot: Robot) -> None:
+    """It is sent far away, and has not got there yet."""
+    arm, far = good_here_only()
+    robot.read(HOME)
+    path = TrajectoryCommand(NAMES, np.stack([HOME, far]), np.array([0.0, 60.0]))
+    robot.session.trajectory(path, robot.now)
+    said = refused(Reason.TCP_BOUND, robot.session.offer_model, offer(arm))
+    assert "of the postures" in said
+    assert robot.session.status().waiting_revision == 1
+    # there, too, the operator's look does not help; at home it does
+    robot.session.enable(True)
+    assert robot.session.status().revision is None
+    robot.session.trajectory(still(), robot.now)
+    robot.session.enable(True)
+    assert robot.session.status().revision == 1
+    assert robot.session.status().waiting_revision is None
+
+
+@pytest.mark.parametrize("revision", [1, 7])
+def test_a_history_that_began_again_is_taken_over_by_its_stamp(revision: int) -> None:
+    robot = Robot()
+    robot.session.offer_model(offer(drifted(), 7, stamp_ns=10**15))
+    later = offer(drifted(0.5), revision, stamp_ns=10**15 + 1)
+    robot.session.offer_model(later)
+    assert robot.session.status().revision == revision
+    robot.session.enable(True)
+    q = robot.settle()
+    assert distance(pose(drifted(0.5), q), pose(NOMINAL, HOME)) < 1e-9
+
+
+@pytest.mark.parametrize("on", [False, True])
+def test_a_history_that_began_again_waits_for_the_operator_without_a_newer_stamp(on: bool) -> None:
+    robot = Robot()
+    robot.session.offer_model(offer(drifted(), 7, stamp_ns=10**15))
+    for old in (offer(drifted(0.5), 1, stamp_ns=10**15), offer(NOMINAL, 0)):
+        said = refused(Reason.OLD_REVISION, robot.session.offer_model, old)
+        assert "enable" in said
+        assert robot.session.status().revision == 7
+        assert robot.session.status().waiting_revision == old.revision
+    robot.session.enable(on)
+    status = robot.session.status()
+    assert (status.revision, status.waiting_revision) == (0, None)
+    # what the one in use says again is no news, and nothing waits after it
+    refused(Reason.OLD_REVISION, robot.session.offer_model, offer(drifted(0.5), 0))
+    robot.session.offer_model(offer(NOMINAL, 0))
+    assert robot.session.status().waiting_revision is None
+
+
+def test_the_frames_of_a_tool_are_those_configured() -> None:
+    robot = Robot(tool_frame="welding_gun")
+    named = replace(bent_tool(), child="welding_gun")
+    for wrong in (bent_tool(), replace(named, child="gripper"), replace(named, parent="base")):
+        refused(Reason.BAD_TOOL, robot.session.offer_tool, wrong)
+    assert not robot.session.status().new_tool
+    robot.session.offer_tool(named)
+    assert robot.session.status().new_tool
 
 
 # ---- from messages -------------------------------------------------------------------------------

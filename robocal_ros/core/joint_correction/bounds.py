@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction.correction import CorrectionResult, JointCorrection
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import StagedResult
 from robocal_ros.core.kinematics import SerialArm
@@ -16,6 +17,9 @@ ROUNDING = 1e-9
 # Near a singularity less is corrected from this share of the bound on, which the first Newton
 # step is held against: the solution may bend a little beyond its first step.
 FADES_FROM = 0.8
+# What a survey looks at: +-3 sigma of the share are 5 % at most.
+POSTURES = 1000
+WITHOUT_LIMIT = np.pi  # range of a joint without limits, rad (prismatic: m)
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,13 @@ class ShiftBounds:
     def of_joints(self, arm: SerialArm) -> Array:
         """(n,) largest shift of each joint."""
         return np.where(arm.prismatic, self.tcp_m, self.joint_rad)
+
+    def hold(self, result: CorrectionResult) -> NDArray[np.bool_]:
+        """Whether corrections keep within them at the tool."""
+        return np.asarray(
+            (result.tcp_shift_m <= self.tcp_m + ROUNDING)
+            & (result.tcp_rotation_rad <= self.tcp_rad + ROUNDING)
+        )
 
 
 def _degrees(value: float) -> float:
@@ -47,7 +58,7 @@ class CorrectionConfig:
     stream_gap_s : after a longer pause a stream begins anew, where the robot stands.
     start_rad, start_m : how far from where a command begins the robot may stand.
     joint_state_age_s : readings that are older do not tell where the robot is.
-    flange_frame : parent of an acceptable tool frame.
+    flange_frame, tool_frame : parent and child of an acceptable tool frame; an empty child: any.
     """
 
     thermal: ShiftBounds = field(
@@ -64,6 +75,7 @@ class CorrectionConfig:
     start_m: float = 5e-5
     joint_state_age_s: float = 0.2
     flange_frame: str = "tool0"
+    tool_frame: str = ""
 
     def blend_rates(self, arm: SerialArm) -> Array:
         """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""
@@ -72,6 +84,41 @@ class CorrectionConfig:
     def start_near(self, arm: SerialArm) -> Array:
         """(n,) how far from where a command begins each joint may stand, rad (prismatic: m)."""
         return np.where(arm.prismatic, self.start_m, self.start_rad)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """An arm's correction over postures that fill its joint range.
+
+    Attributes
+    ----------
+    beyond : share of postures in which it exceeds its bounds at the tool.
+    worst_m, worst_rad : largest correction at the tool.
+    """
+
+    beyond: float
+    worst_m: float
+    worst_rad: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.worst_m * 1e3:.3f} mm and {np.degrees(self.worst_rad):.3f} deg at worst, "
+            f"beyond the bounds in {self.beyond:.1%} of the postures"
+        )
+
+
+def survey(reference: SerialArm, actual: SerialArm, bounds: ShiftBounds) -> Survey:
+    """Look at the correction in `POSTURES` postures over the joint range, always the same ones."""
+    lower = np.where(np.isfinite(reference.lower), reference.lower, -WITHOUT_LIMIT)
+    upper = np.where(np.isfinite(reference.upper), reference.upper, WITHOUT_LIMIT)
+    q = np.random.default_rng(0).uniform(lower, upper, (POSTURES, reference.n))
+    found = JointCorrection.between(reference, actual).correct(q)
+    fine = bounds.hold(found)
+    return Survey(
+        1.0 - float(np.mean(fine)),
+        float(np.max(found.tcp_shift_m)),
+        float(np.max(found.tcp_rotation_rad)),
+    )
 
 
 def fault_of(
@@ -97,8 +144,7 @@ def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialAr
     drift = result.arm
     bound = config.thermal
     _require(
-        (drift.tcp_shift_m <= bound.tcp_m + ROUNDING)
-        & (drift.tcp_rotation_rad <= bound.tcp_rad + ROUNDING),
+        bound.hold(drift),
         Reason.TCP_BOUND,
         f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
         f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "

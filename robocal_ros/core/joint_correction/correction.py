@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import kernels, rates, solution
+from robocal_ros.core.joint_correction import kernels, solution
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ def pack_model(arm: SerialArm) -> Array:
     return packed
 
 
-def _plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+def plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """The one array type that the kernels are compiled for: contiguous and writable."""
     array = np.asarray(values, dtype=np.float64)
     if shape is not None:
@@ -99,15 +99,14 @@ class JointCorrection:
     """
 
     def __init__(self, models: Array, largest: ArrayLike = LARGEST_SHIFT) -> None:
-        self.models = _plain(models)
+        self.models = plain(models)
         self.n = self.models.shape[1] - 2
         if self.models.shape != (4, self.n + 2, 9):
             raise ValueError(f"models have shape {self.models.shape}, expected (4, n + 2, 9)")
-        self.largest = _plain(largest, (self.n,))
+        self.largest = plain(largest, (self.n,))
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
         self._work = np.empty(solution.work_size(self.n))
-        self._out = np.empty(self.n + solution.REPORT)
 
     @classmethod
     def between(
@@ -119,27 +118,18 @@ class JointCorrection:
         first, second = pack_model(reference), pack_model(actual)
         return cls(np.stack([first, first, second, second]), largest)
 
-    def point(self, q: Array, s: float = 1.0) -> Array:
-        """Correct one point (n,) without allocating.
-
-        Returns this object's buffer (n + 7), valid until the next call: joints, then position
-        and rotation error, iterations, converged, shift and rotation at the tool, share.
-        """
-        solution.correct_point(q, self.models, s, self.largest, self._work, self._out)
-        return self._out
-
     def correct(self, q: ArrayLike, s: ArrayLike = 1.0) -> CorrectionResult:
         """Correct joints (n,) or (m, n), at blend s (one, or one per point).
 
         A point's result does not depend on its neighbours: a batch gives a single point's bits.
         """
         joints = np.asarray(q, dtype=np.float64)
-        points = _plain(joints.reshape(-1, self.n))
+        points = plain(joints.reshape(-1, self.n))
         out = np.empty((len(points), self.n + solution.REPORT))
-        blends = _plain(s, (len(points),))
+        blends = plain(s, (len(points),))
         solution.correct_batch(points, self.models, blends, self.largest, self._work, out)
         lead = joints.shape[:-1]
-        corrected, report = _plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
+        corrected, report = plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
         return CorrectionResult(
             q=corrected.reshape(joints.shape),
             position_error_m=report[solution.POSITION_ERROR],
@@ -158,27 +148,6 @@ class JointCorrection:
         Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1.
         """
         return JointCorrection(self.models[[2, 3, 0, 1]], self.largest)
-
-    def rates(
-        self, q: ArrayLike, velocity: ArrayLike, acceleration: ArrayLike, s: ArrayLike = 1.0
-    ) -> tuple[Array, Array]:
-        """Velocities and accelerations (m, n) of the corrected joints, at constant blend.
-
-        By the chain rule J' qd' = J qd and its time derivative, both analytic. Points of which
-        only a share is corrected, and arms of fewer or more than six joints, are differentiated
-        numerically along the path (relative error about 1e-6).
-        """
-        points, qd, qdd = (_plain(np.atleast_2d(x)) for x in (q, velocity, acceleration))
-        blends = _plain(s, (len(points),))
-        here = self.correct(points, blends)
-        out_v, out_a = np.empty_like(points), np.empty_like(points)
-        rates.rates_batch(points, qd, qdd, here.q, self.models, blends, out_v, out_a)
-        rough = (here.share < 1.0) | (self.n != 6) | ~np.isfinite(out_v).all(axis=1)
-        if np.any(rough):
-            out_v[rough], out_a[rough] = path_rates(
-                lambda p, t: self.correct(p, blends[rough]).q, points[rough], qd[rough], qdd[rough]
-            )
-        return out_v, out_a
 
 
 def path_rates(

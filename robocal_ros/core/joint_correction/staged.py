@@ -17,6 +17,7 @@ from robocal_ros.core.joint_correction.correction import (
     blend_models,
     pack_model,
     path_rates,
+    plain,
 )
 from robocal_ros.core.kinematics import SerialArm
 
@@ -118,11 +119,12 @@ class StagedCorrection:
         where all of the correction is made by a settled model, else by central differences
         along the path.
         """
-        out_v, out_a = np.empty_like(q), np.empty_like(q)
+        out_v, out_a = np.empty(q.shape), np.empty(q.shape)
+        points, qd, qdd = plain(q), plain(velocity), plain(acceleration)
         models = self._whole.models
-        rates.rates_batch(q, velocity, acceleration, result.q, models, s, out_v, out_a)
-        plain = result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1)
-        rough = ~plain if self.n == 6 else np.ones(len(q), dtype=np.bool_)
+        rates.rates_batch(points, qd, qdd, plain(result.q), models, plain(s), out_v, out_a)
+        exact = result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1)
+        rough = ~exact if self.n == 6 else np.ones(len(q), dtype=np.bool_)
         if np.any(rough):
 
             def corrected(p: Array, t: float) -> Array:
@@ -142,8 +144,8 @@ class StagedCorrection:
         models = self._whole.models[[2, 3, 0, 1]]
         ones = np.ones(len(q))
         rates.rates_batch(corrected, velocity, zero, q, models, ones, out, unused)
-        plain = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
-        return np.where(plain[:, None], out, velocity)
+        exact = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
+        return np.where(exact[:, None], out, velocity)
 
 
 def load_kernels(arm: SerialArm) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.joint_correction.bounds import Survey
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.samples import stamp_ns
 
@@ -64,14 +65,16 @@ class OfferedModel:
     joint_names: tuple[str, ...]
     mdh: Array
     T_base_root: Array = field(default_factory=lambda: np.eye(4))
+    stamp_ns: int = 0
 
 
 @dataclass(frozen=True)
 class OfferedTool:
-    """A tool frame that somebody published: ``T_flange_tool`` (4, 4), and its parent's name."""
+    """A tool frame that somebody published: ``T_flange_tool`` (4, 4), and its frames' names."""
 
     parent: str
     T_flange_tool: Array
+    child: str = ""
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,9 @@ class CorrectionStatus:
     active : commands differ from what came in, or will.
     settled : no blend is under way.
     revision : of the model taken over, None without one.
+    serial : the one it was made for; empty without one.
+    survey : its correction over the joint range.
+    waiting_revision : of a model that was refused, and that enabling takes over; None without one.
     new_tool : a tool other than the taught one was taken over.
     tcp_shift_m : error at the tool that the drift would have made.
     largest_shift : largest shift of a joint, rad (prismatic: m).
@@ -101,6 +107,9 @@ class CorrectionStatus:
     active: bool
     settled: bool
     revision: int | None
+    serial: str
+    survey: Survey
+    waiting_revision: int | None
     new_tool: bool
     tcp_shift_m: float
     largest_shift: float
@@ -232,6 +241,7 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
         joint_names=names,
         mdh=mdh,
         T_base_root=_pose(root.translation, root.rotation, Reason.NOT_FINITE),
+        stamp_ns=stamp_ns(message.header.stamp),
     )
 
 
@@ -245,4 +255,4 @@ def offered_tool(message: Any) -> OfferedTool:
     """
     pose = message.transform
     T = _pose(pose.translation, pose.rotation, Reason.BAD_TOOL)
-    return OfferedTool(str(message.header.frame_id), T)
+    return OfferedTool(str(message.header.frame_id), T, str(message.child_frame_id))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.joint_correction import JointCorrection
-from robocal_ros.core.joint_correction.bounds import ROUNDING, CorrectionConfig
+from robocal_ros.core.joint_correction.bounds import ROUNDING, CorrectionConfig, Survey, survey
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.inputs import OfferedModel, OfferedTool
@@ -21,6 +21,8 @@ class CorrectionGate:
     Attributes
     ----------
     revision : of the model taken over, None before the first.
+    survey : its correction over the joint range.
+    waiting : a model that was refused but may be taken over when it is looked at again.
     """
 
     def __init__(
@@ -37,6 +39,8 @@ class CorrectionGate:
         self._model: OfferedModel | None = None
         self._tool: Array | None = None
         self.revision: int | None = None
+        self.survey = Survey(0.0, 0.0, 0.0)
+        self.waiting: OfferedModel | None = None
 
     @property
     def new_tool(self) -> bool:
@@ -51,32 +55,49 @@ class CorrectionGate:
         arm = self._arm_of(self._model) if self._model is not None else self._reference
         return arm if self._tool is None else replace(arm, T_flange_tool=self._tool)
 
-    def take_model(self, model: OfferedModel, taught: Array) -> None:
-        """Take over a model; ``taught`` (n,) is where the robot is, NaN when not known.
+    def take_model(self, model: OfferedModel, places: Array, *, again: bool = False) -> None:
+        """Take over a model; ``places`` (k, n) are where the robot is, and goes.
+
+        A revision lower than the one in use comes from a history that began again: it must be
+        newer by its stamp, or be looked at (``again``). One that is refused for this, or for its
+        size here, waits for `look_again`.
 
         Raises
         ------
         RefusedError
             When it is not accepted, made for another robot, older than the one in use, or would
-            move the tool beyond the bounds where the robot is.
+            move the tool beyond the bounds where the robot is or goes.
         """
         if not model.accepted:
             raise RefusedError(Reason.NOT_ACCEPTED, f"revision {model.revision}")
         self._require_robot(model)
-        if self.revision is not None and model.revision < self.revision:
-            detail = f"revision {model.revision} after {self.revision}"
-            raise RefusedError(Reason.OLD_REVISION, detail)
-        if self._model is not None and model.revision == self.revision:
-            same = np.array_equal(model.mdh, self._model.mdh) and np.array_equal(
-                model.T_base_root, self._model.T_base_root
-            )
-            if not same:
-                detail = f"revision {model.revision} comes with other numbers than before"
-                raise RefusedError(Reason.OLD_REVISION, detail)
-            return
-        if np.all(np.isfinite(taught)):
-            self._require_small(self._arm_of(model), taught)
+        self.waiting = None
+        if self._model is not None and not again:
+            if _same(model, self._model):
+                self._model = model
+                return
+            if not _later(model, self._model):
+                self.waiting = model
+                raise RefusedError(
+                    Reason.OLD_REVISION,
+                    f"revision {model.revision} with other numbers after {self.revision}, and not "
+                    "newer by its stamp; ~/enable takes it over",
+                )
+        arm = self._arm_of(model)
+        if len(places):
+            self._require_small(model, arm, places)
         self._model, self.revision = model, model.revision
+        self.survey = survey(self._reference, arm, self._config.thermal)
+
+    def look_again(self, places: Array) -> None:
+        """Take over the model that waits for it, if there is one; raises as `take_model`."""
+        if self.waiting is not None:
+            self.take_model(self.waiting, places, again=True)
+
+    @property
+    def serial(self) -> str:
+        """Of the model in use; empty without one."""
+        return "" if self._model is None else self._model.serial
 
     def _require_robot(self, model: OfferedModel) -> None:
         expected = {
@@ -99,18 +120,17 @@ class CorrectionGate:
             return self._reference
         return replace(self._reference, mdh=model.mdh, T_base_root=model.T_base_root)
 
-    def _require_small(self, arm: SerialArm, taught: Array) -> None:
-        shift = JointCorrection.between(self._reference, arm).correct(taught)
+    def _require_small(self, model: OfferedModel, arm: SerialArm, places: Array) -> None:
         bound = self._config.thermal
-        if (
-            shift.tcp_shift_m > bound.tcp_m + ROUNDING
-            or shift.tcp_rotation_rad > bound.tcp_rad + ROUNDING
-        ):
+        shift = JointCorrection.between(self._reference, arm).correct(places)
+        if not np.all(bound.hold(shift)):
+            self.waiting = model
             raise RefusedError(
                 Reason.TCP_BOUND,
-                f"{shift.tcp_shift_m * 1e3:.3f} mm and {np.degrees(shift.tcp_rotation_rad):.3f} "
-                f"deg where the robot is, allowed {bound.tcp_m * 1e3:g} mm and "
-                f"{np.degrees(bound.tcp_rad):g} deg",
+                f"{np.max(shift.tcp_shift_m) * 1e3:.3f} mm and "
+                f"{np.degrees(np.max(shift.tcp_rotation_rad)):.3f} deg where the robot is or "
+                f"goes, allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg; "
+                f"over its joint range {survey(self._reference, arm, bound)}",
             )
 
     def take_tool(self, tool: OfferedTool) -> None:
@@ -119,8 +139,11 @@ class CorrectionGate:
         Raises
         ------
         RefusedError
-            When its parent is not the flange, or it is too far from the taught tool.
+            When its frames are not the configured ones, or it is too far from the taught tool.
         """
+        wanted = self._config.tool_frame
+        if wanted and tool.child != wanted:
+            raise RefusedError(Reason.BAD_TOOL, f"child '{tool.child}', expected '{wanted}'")
         if tool.parent != self._config.flange_frame:
             detail = f"parent '{tool.parent}', expected '{self._config.flange_frame}'"
             raise RefusedError(Reason.BAD_TOOL, detail)
@@ -137,3 +160,15 @@ class CorrectionGate:
                 f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
             )
         self._tool = tool.T_flange_tool
+
+
+def _same(a: OfferedModel, b: OfferedModel) -> bool:
+    return (
+        a.revision == b.revision
+        and np.array_equal(a.mdh, b.mdh)
+        and np.array_equal(a.T_base_root, b.T_base_root)
+    )
+
+
+def _later(a: OfferedModel, b: OfferedModel) -> bool:
+    return a.revision > b.revision or a.stamp_ns > b.stamp_ns

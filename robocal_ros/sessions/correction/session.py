@@ -5,6 +5,7 @@ of model and tool parameters that moves no joint faster than a bound. What it ca
 correct is refused with a reason, counted, and nothing is put out for it: `RefusedError`.
 """
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeVar
@@ -70,28 +71,37 @@ class CorrectionSession:
         self._corrector = Corrector(reference, config)
         self._enabled = False
         self._streamed_s: float | None = None
+        self._goal = np.full(reference.n, np.nan)
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
     def enable(self, on: bool) -> None:
         """Ask for the correction, or for its end; either blends in.
 
-        Time stamps start afresh; after a mismatch the next command may begin where the robot is.
+        Time stamps start afresh; after a mismatch the next command may begin where the robot is;
+        a model that waits to be looked at is taken over, if it is not too large.
         """
         self._enabled = on
         self._guard.forget_stamps()
         self._corrector.restart()
+        with contextlib.suppress(RefusedError):  # counted, and in the status
+            self._guard.counted(lambda: self._gate.look_again(self._places()))
         self._want()
 
     def offer_model(self, model: OfferedModel) -> None:
         """Take over an accepted model of this robot; refused models change nothing."""
-        self._guard.counted(lambda: self._gate.take_model(model, self._joints.taught))
+        self._guard.counted(lambda: self._gate.take_model(model, self._places()))
         self._want()
 
     def offer_tool(self, tool: OfferedTool) -> None:
         """Take over a tool frame; refused ones change nothing."""
         self._guard.counted(lambda: self._gate.take_tool(tool))
         self._want()
+
+    def _places(self) -> Array:
+        """Taught joints (k, n) where the robot is, and where it was sent."""
+        places = np.stack([self._joints.taught, self._goal])
+        return np.asarray(places[np.isfinite(places).all(axis=1)])
 
     def _want(self) -> None:
         self._corrector.want(self._gate.actual, self._enabled)
@@ -127,7 +137,7 @@ class CorrectionSession:
                 velocity = rates[0][0, index]
             position = done.result.q[0, index]
             corrected = replace(command, position=position, velocity=velocity, mark=CORRECTED)
-        self._streamed_s = now_s
+        self._streamed_s, self._goal = now_s, q[0]
         self._guard.accept_order(TARGET, command.stamp_ns, now_s)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
@@ -157,7 +167,8 @@ class CorrectionSession:
     def _trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float
     ) -> TrajectoryCommand:
-        self._guard.require_order(TRAJECTORY, command.stamp_ns, command.mark, now_s)
+        # The stamp says when it begins, not when it was made: no order follows from it.
+        self._guard.require_order(TRAJECTORY, 0, command.mark, now_s)
         times = command.time_from_start_s
         if not np.all(np.isfinite(times)) or times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
             raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
@@ -175,12 +186,12 @@ class CorrectionSession:
             corrected = replace(command, position=position, mark=CORRECTED)
             if command.velocity is not None:
                 corrected = self._with_rates(corrected, done, q, index)
-        self._guard.accept_order(TRAJECTORY, command.stamp_ns, now_s)
+        self._guard.accept_order(TRAJECTORY, 0, now_s)
         out = corrected.position
         self._guard.note_output(TRAJECTORY, command.names, command.position, out)
         begin = now_s + starts_in_s
         self._corrector.note_sent(Sent(index, begin, times, command.position, out))
-        self._streamed_s = None
+        self._streamed_s, self._goal = None, q[-1]
         return corrected
 
     def _start_path(
@@ -254,6 +265,9 @@ class CorrectionSession:
             active=not corrector.idle,
             settled=corrector.settled,
             revision=self._gate.revision,
+            serial=self._gate.serial,
+            survey=self._gate.survey,
+            waiting_revision=None if self._gate.waiting is None else self._gate.waiting.revision,
             new_tool=self._gate.new_tool,
             tcp_shift_m=corrector.figures[0],
             largest_shift=corrector.figures[1],
