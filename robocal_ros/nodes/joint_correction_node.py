@@ -59,7 +59,7 @@ class JointCorrectionNode(HouseNode):
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
         self._session.enable(self.settings["enable_on_start"])
-        self._refusals = self._held = 0
+        self._refusals = 0
         self._outputs = {
             topic: self.add_output(kind, f"~/{topic}", qos.RELIABLE)
             for topic, kind in ((TRAJECTORY, JointTrajectory), (TARGETS, JointState))
@@ -157,9 +157,6 @@ class JointCorrectionNode(HouseNode):
         if refusals > self._refusals:
             health.worsen(WARN, status.last_refusal)
         self._refusals = refusals
-        if status.held > self._held:
-            health.worsen(WARN, "the blend waits: its next step would lead beyond a bound")
-        self._held = status.held
         for guard in self._sources.values():
             if guard.fault:
                 health.worsen(ERROR, guard.fault)

@@ -363,10 +363,20 @@ def test_a_trajectory_that_is_under_way_already_starts_without_a_jump(robot: Rob
     robot.session.enable(True)
     robot.read(HOME)
     command = swing()
+    robot.read(command.position[45])  # it lags
     out = robot.session.trajectory(command, robot.now, starts_in_s=-0.5)
     shift = np.abs(out.position - command.position).max(axis=1)
     assert np.all(shift[:51] == 0.0)
     assert shift[60] > 1e-5
+
+
+def test_a_trajectory_that_came_much_too_late_is_refused(robot: Robot) -> None:
+    """The robot still stands where it began: the controller would jump to where it should be."""
+    robot.read(HOME)
+    command = swing()
+    refused(Reason.START_MISMATCH, robot.session.trajectory, command, robot.now, starts_in_s=-0.5)
+    robot.session.enable(False)
+    robot.session.trajectory(command, robot.now, starts_in_s=-0.05)
 
 
 def test_a_later_trajectory_begins_when_it_says(robot: Robot) -> None:

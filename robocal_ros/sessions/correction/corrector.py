@@ -115,7 +115,7 @@ class Corrector:
         return not (self._started and none)
 
     def start_at(self, begins: Array, where: Whereabouts, now_s: float) -> None:
-        """A command begins at once, at one of the taught joints ``begins`` (r, n).
+        """A command begins at once, at where it should be now or was lately, ``begins`` (r, n).
 
         The correction goes on from the one that the robot shows: that which is commanded, none,
         or (before the first command) that which is known. Only a commanded robot may lag.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.joint_correction.blending import blend_rates
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
-from robocal_ros.core.joint_correction.starting import Sent
+from robocal_ros.core.joint_correction.starting import INSTANTS, RESPONSE_S, Sent
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction.corrector import Corrected, Corrector
@@ -202,8 +202,9 @@ class CorrectionSession:
         if elapsed < times[0]:
             self._corrector.start_within(q[0], index, where, now_s, float(times[0] - elapsed))
             return
-        by_now = [np.interp(elapsed, times, column) for column in q.T]
-        self._corrector.start_at(np.stack([q[0], by_now]), where, now_s)
+        lately = np.linspace(elapsed, elapsed - RESPONSE_S, INSTANTS)
+        begins = np.stack([np.interp(lately, times, column) for column in q.T], axis=1)
+        self._corrector.start_at(begins, where, now_s)
 
     def _with_rates(
         self, command: TrajectoryCommand, done: Corrected, q: Array, index: NDArray[np.int64]
