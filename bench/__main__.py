@@ -25,7 +25,7 @@ KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
-    from bench import files, monte_carlo, real_data, speed, startup
+    from bench import files, monte_carlo, real_data, speed, startup, thermal
 
     def start() -> Sequence[Table]:
         if startup.EXECUTABLES.is_dir():
@@ -36,6 +36,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
     return {
         "real_data": real_data.tables,
         "monte_carlo": monte_carlo.tables,
+        "thermal": thermal.tables,
         "speed": speed.tables,
         "startup": start,
         "files": lambda: [files.file_times()],

@@ -1,7 +1,6 @@
 """Entry point of ``robocal``.
 
-A command is a module of this package with ``NAME``, ``HELP``, ``add_arguments(parser)`` and
-``run(args) -> Outcome``. It imports what is heavy inside ``run``.
+A command is a module of this package (see `Command`).
 """
 
 # ruff: noqa: E402  # threads are set before anything can load NumPy
@@ -9,16 +8,16 @@ from robocal_ros.single_thread import use_one_thread
 
 use_one_thread()
 
-import argparse
 import contextlib
 import os
 import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Protocol, TextIO, cast
+from typing import TextIO, cast
 
 from robocal_ros import __version__
+from robocal_ros.cli.command import Command
 from robocal_ros.cli.output import (
     BAD_REQUEST,
     CRASHED,
@@ -46,22 +45,10 @@ COMMANDS = {
     "identify": "identify",
     "replay": "replay",
     "history": "history",
+    "thermal": "thermal",
     "import-ur": "import_ur",
 }
 """Name of each command and its module, in the order of the help."""
-
-
-class Command(Protocol):
-    """What a command's module offers."""
-
-    NAME: str
-    HELP: str
-
-    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
-        """Declare the options."""
-
-    def run(self, args: argparse.Namespace) -> Outcome:
-        """Do it. Raises `RobocalError` for what a user can mend."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

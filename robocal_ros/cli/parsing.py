@@ -1,6 +1,7 @@
 """The command line: argparse with usage errors and help as results instead of exits."""
 
 import argparse
+import math
 import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -113,3 +114,20 @@ def text(value: str) -> str:
     except UnicodeEncodeError as error:
         raise argparse.ArgumentTypeError("holds bytes that are not text") from error
     return value
+
+
+def positive(value: str) -> float:
+    """Type of a finite number above zero.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    try:
+        number = float(value)
+    except ValueError:
+        number = 0.0
+    if not 0.0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a number above 0")
+    return number

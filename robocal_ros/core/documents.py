@@ -10,7 +10,7 @@ from robocal_ros.core.assessment import ErrorSummary, Verdict
 from robocal_ros.core.identification import CellModel, Identification, JudgedIdentification
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.identification import ColdReference
+from robocal_ros.core.thermal.reference import ColdReference
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]

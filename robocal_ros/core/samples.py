@@ -11,11 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
+from robocal_ros.core.point_clouds import cloud_points
 
 Array = NDArray[np.float64]
 
 DEFAULT_TARGET = "tool"
 CORRECTED = "robocal_corrected"  # frame_id of commands that carry a joint correction
+SPHERE_CLOUD = "sphere_cloud"
+MEASURED_POINT = "measured_point"  # the input that a point comes from where nothing else is said
 TAUGHT = "robocal_taught"  # frame_id of joint states from which the correction was removed
 
 
@@ -30,12 +34,18 @@ class JointSample:
 
 @dataclass(frozen=True, slots=True)
 class PointSample:
-    """A target's position (3,) in the measuring frame, in m."""
+    """A target's position (3,) in the measuring frame, in m.
+
+    ``topic``: the input that it came from. ``sigma_m``: rms standard deviation of a coordinate
+    from its own measurement, 0 where that is not known.
+    """
 
     stamp_ns: int
     frame: str
     target: str
     position_m: Array
+    topic: str = MEASURED_POINT
+    sigma_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,12 +164,30 @@ def _finite(values: Array, what: str) -> Array:
     return values
 
 
-def point_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PointSample:
+def point_sample(
+    message: Any, default_target: str = DEFAULT_TARGET, topic: str = MEASURED_POINT
+) -> PointSample:
     """Build a sample from a ``geometry_msgs/PointStamped`` (frame_id ``frame[/target]``)."""
     frame, target = _frame_and_target(message.header.frame_id, default_target)
     p = message.point
     position = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured point")
-    return PointSample(stamp_ns(message.header.stamp), frame, target, position)
+    return PointSample(stamp_ns(message.header.stamp), frame, target, position, topic)
+
+
+def cloud_sample(
+    message: Any, rule: SphereRule, default_target: str = DEFAULT_TARGET, topic: str = SPHERE_CLOUD
+) -> PointSample:
+    """Build a sample of a sphere's centre from a ``sensor_msgs/PointCloud2`` of its cap.
+
+    Raises
+    ------
+    InputError, TooFewSamplesError, ResidualError
+        When the message is no cloud, or holds no sphere as the rule wants it.
+    """
+    frame, target = _frame_and_target(message.header.frame_id, default_target)
+    fit = fit_sphere(cloud_points(message), rule)
+    sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
+    return PointSample(stamp_ns(message.header.stamp), frame, target, fit.centre, topic, sigma_m)
 
 
 def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSample:

@@ -9,11 +9,12 @@ from geometry_msgs.msg import PointStamped, PoseStamped
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from robocal_msgs.msg import CalibrationQuality, KinematicModel, SessionEvent
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.thermal.identification import require_parameters
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -24,7 +25,7 @@ from robocal_ros.nodes.thermal_services import ThermalServices
 from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
 from robocal_ros.sessions.events import IDENTIFY, Command, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import JOINTS, POINT, POSE
+from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.sessions.records import configuration
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -32,7 +33,13 @@ from robocal_ros.storage.robots import load_robot
 
 NO_SERIAL = "unset"
 POLL_S = 0.5
-INPUTS = {JOINTS: JointState, POINT: PointStamped, POSE: PoseStamped}
+INPUTS = {
+    JOINTS: JointState,
+    POINT: PointStamped,
+    CENTRE: PointStamped,
+    CLOUD: PointCloud2,
+    POSE: PoseStamped,
+}
 
 # Deep enough for the seconds that a large identification takes.
 STREAM = QoSProfile(
@@ -65,6 +72,7 @@ class ThermalNode(HouseNode):
         self._shown: tuple[Any, ...] = ()
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
+        require_parameters(self._nominal, settings["drift_parameters"])
         self._serial_in_use = settings["serial"] or NO_SERIAL
         folder = settings["state_dir"]
         self._history = CalibrationHistory.open(

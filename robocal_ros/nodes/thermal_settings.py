@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.samples import DEFAULT_TARGET
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.sessions.thermal_config import METHODS, PRIORS, ThermalConfig
+from robocal_ros.sessions.thermal_config import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
 
 SETTINGS = (
     Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
@@ -19,12 +20,41 @@ SETTINGS = (
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("prior", PRIORS[0], "Expected drift: by default or as learned", choices=PRIORS),
     Setting(
+        "drift_parameters",
+        [""],
+        "What lsq solves of a drift (a1_mm, beta2_deg, ...); empty: all, which takes many poses",
+    ),
+    Setting(
         "sigma_mm",
         0.03,
         "Standard deviation of one measured coordinate, sensor and repeatability",
         unit="mm",
         low=1e-4,
         high=10.0,
+    ),
+    Setting(
+        "sphere_radius_mm",
+        SPHERE_RADIUS_M * 1e3,
+        "Certified radius of the sphere in sphere_cloud",
+        unit="mm",
+        low=1.0,
+        high=200.0,
+    ),
+    Setting(
+        "sphere_tolerance_mm",
+        0.1,
+        "How far the radius of the points of a cloud may be off",
+        unit="mm",
+        low=1e-3,
+        high=5.0,
+    ),
+    Setting(
+        "sphere_noise_mm",
+        0.2,
+        "Largest scatter of a cloud's points about the sphere",
+        unit="mm",
+        low=1e-3,
+        high=5.0,
     ),
     Setting(
         "hold_out",
@@ -84,6 +114,7 @@ def session_config(settings: Mapping[str, Any]) -> ThermalConfig:
         method=settings["method"],
         prior=settings["prior"],
         sigma_m=settings["sigma_mm"] * 1e-3,
+        drift_parameters=tuple(settings["drift_parameters"]),
         hold_out=settings["hold_out"],
         seed=settings["seed"],
         lateness_s=settings["lateness_s"],
@@ -94,5 +125,10 @@ def session_config(settings: Mapping[str, Any]) -> ThermalConfig:
             after_s=settings["standstill_after_s"],
             tolerance_rad=float(np.radians(settings["standstill_tolerance_deg"])),
             gap_s=settings["joint_gap_s"],
+        ),
+        sphere=SphereRule(
+            radius_m=settings["sphere_radius_mm"] * 1e-3,
+            radius_tolerance_m=settings["sphere_tolerance_mm"] * 1e-3,
+            noise_m=settings["sphere_noise_mm"] * 1e-3,
         ),
     )

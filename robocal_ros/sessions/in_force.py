@@ -7,7 +7,7 @@ from robocal_ros.core.documents import arm_of, reference_of
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Decision, Head
-from robocal_ros.core.thermal.identification import ColdReference
+from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS

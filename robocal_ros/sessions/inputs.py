@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import joint_sample, point_sample, pose_sample
-from robocal_ros.sessions.observations import JOINTS, POINT, POSE
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.samples import cloud_sample, joint_sample, point_sample, pose_sample
+from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.sessions.thermal import ThermalSession
 
 
@@ -16,9 +16,11 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
     try:
         if kind == JOINTS:
             session.add(joint_sample(message))
-        elif kind == POINT:
-            session.add(point_sample(message, session.config.target))
+        elif kind in (POINT, CENTRE):
+            session.add(point_sample(message, session.config.target, kind))
+        elif kind == CLOUD:
+            session.add(cloud_sample(message, session.config.sphere, session.config.target))
         elif kind == POSE:
             session.add(pose_sample(message, session.config.target))
-    except InputError as error:
+    except RobocalError as error:
         session.desk.ignored.add(kind, str(error))

@@ -2,22 +2,32 @@
 
 from bisect import bisect_right, insort
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
+from robocal_ros.core.samples import (
+    MEASURED_POINT,
+    SPHERE_CLOUD,
+    JointSample,
+    PointSample,
+    PoseSample,
+)
 from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.sessions.ignored import Ignored
+from robocal_ros.sessions.observation import Observation
 
 Array = NDArray[np.float64]
 
 JOINTS = "joint_states"
-POINT = "measured_point"
+POINT = MEASURED_POINT
+CENTRE = "sphere_center"
+CLOUD = SPHERE_CLOUD
 POSE = "measured_pose"
+MEASURING = (POINT, CENTRE, CLOUD, POSE)
 JUMPS = "clock_jumps"
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
@@ -26,26 +36,8 @@ LEAD_NS = 1_000_000_000  # a topic is at most so far ahead of another where the 
 FAR_AHEAD_NS = 60_000_000_000  # a measurement stamped so much after the joints is an error
 
 
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """A measured target with the joints at that instant.
-
-    ``ready_ns``: stamp of the joint reading that completed it; ``rotation`` None for a point.
-    """
-
-    stamp_ns: int
-    ready_ns: int
-    topic: str
-    frame: str
-    target: str
-    q: Array
-    position: Array
-    rotation: Array | None
-    source: PointSample | PoseSample
-
-
 def _topic(sample: PointSample | PoseSample) -> str:
-    return POINT if isinstance(sample, PointSample) else POSE
+    return sample.topic if isinstance(sample, PointSample) else POSE
 
 
 @dataclass
@@ -106,13 +98,13 @@ class ObservationDesk:
     def why_nothing(self) -> str:
         """Say why a window holds no observation."""
         had_joints = self.received[JOINTS] or JOINTS in self.ignored
-        had_others = {POINT, POSE} & (self.received.keys() | self.ignored.keys())
+        had_others = set(MEASURING) & (self.received.keys() | self.ignored.keys())
         if not had_joints:
             words = f"no joint states received: does the robot's driver publish {JOINTS}?"
         elif JOINTS not in self.newest_ns:
             words = "no joint state could be used"
         elif not had_others:
-            words = f"no measurement received: does the sensor publish {POINT} or {POSE}?"
+            words = f"no measurement received: does the sensor publish {' or '.join(MEASURING)}?"
         else:
             words = "no measurement with the robot at standstill since the last command"
         waiting = len(self._pending)
@@ -270,20 +262,3 @@ class ObservationDesk:
         """Drop observations up to a stamp: they were used."""
         self.used_ns = max(self.used_ns, until_ns)
         self._observed = [o for o in self._observed if o.stamp_ns > until_ns]
-
-
-def as_measurements(observations: Sequence[Observation]) -> Measurements:
-    """Arrays of observations; orientations only where all have one."""
-    rotations = [o.rotation for o in observations if o.rotation is not None]
-    complete = bool(observations) and len(rotations) == len(observations)
-    several = len({o.target for o in observations}) > 1
-    return Measurements(
-        q=np.array([o.q for o in observations]),
-        position=np.array([o.position for o in observations]),
-        target=tuple(o.target for o in observations),
-        sample=tuple(
-            f"{o.stamp_ns}/{o.target}" if several else str(o.stamp_ns) for o in observations
-        ),
-        rotation=np.array(rotations) if complete else None,
-        stamp_ns=np.array([o.stamp_ns for o in observations], dtype=np.int64),
-    )

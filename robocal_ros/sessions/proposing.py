@@ -1,5 +1,6 @@
 """From the measurements of a command to a proposal in the history."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,18 +11,30 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import (
     identification_document,
     identified_model_document,
+    model_document,
     reference_document,
 )
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.identification import JudgedIdentification, Method, identify_and_hold_out
+from robocal_ros.core.identification import Method, identify_and_hold_out
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Proposal
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.identification import capture_reference, identify_drift
+from robocal_ros.core.thermal.documents import cycle_document
+from robocal_ros.core.thermal.identification import identify_cycle, identify_subset, judge_cycle
+from robocal_ros.core.thermal.reference import ColdReference, capture_reference
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE, InForce
 from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """A judged identification as it is kept."""
+
+    document: dict[str, Any]
+    model: dict[str, Any]
+    verdict: Verdict
 
 
 class Proposer:
@@ -104,30 +117,40 @@ class Proposer:
         RobocalError
             When they cannot answer, or the history refuses.
         """
-        judged = self._solve(data, method)
-        document = identification_document(judged)
+        reference = self._current.reference
+        solution = (
+            self._calibration(data, method)
+            if reference is None
+            else self._drift(reference, data, method)
+        )
         cycle_id = str(command.arguments.get("cycle_id", ""))
-        document |= {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
-        verdict = judged.verdict
-        model = identified_model_document(judged.identification)
-        if self._current.reference is not None:
-            model["reference_mdh"] = self._current.reference.cell.arm.mdh.tolist()
+        document = solution.document | {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
+        verdict, model = solution.verdict, solution.model
         chosen = self._propose(THERMAL, command, wall_ns, method, verdict, document, model, data)
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
 
-    def _solve(self, data: Measurements, method: Method) -> JudgedIdentification:
-        current = self._current
-        if current.reference is not None:
-            return identify_drift(
-                self._nominal,
-                current.reference,
-                data,
-                sigma_m=self._config.sigma_m,
-                in_force=current.arm,
-                prior_covariance=self._prior,
-                method=method,
+    def _drift(self, reference: ColdReference, data: Measurements, method: Method) -> _Solution:
+        """Since the cold visit, against the cold model: never a step on what is in force."""
+        config, spots = self._config, reference.spots
+        if method == "map":
+            found = identify_cycle(
+                spots, data, prior_covariance=self._prior, sigma_m=config.sigma_m
             )
-        return identify_and_hold_out(
+        else:
+            names = config.drift_parameters or self._nominal.parameters.names
+            found = identify_subset(spots, data, names, sigma_m=config.sigma_m)
+        judged = judge_cycle(found, spots, in_force=self._current.arm, sigma_m=config.sigma_m)
+        model = model_document(found.arm) | {
+            "parameters": list(self._nominal.parameters.names),
+            "covariance": found.covariance.tolist(),
+            "reference_mdh": reference.cell.arm.mdh.tolist(),
+        }
+        document = cycle_document(found, judged, spots, self._nominal, method)
+        return _Solution(document, model, judged.verdict)
+
+    def _calibration(self, data: Measurements, method: Method) -> _Solution:
+        current = self._current
+        judged = identify_and_hold_out(
             self._nominal,
             data,
             share=self._config.hold_out,
@@ -135,6 +158,8 @@ class Proposer:
             method=method,
             in_force=current.arm if current.head.model is not None else None,
         )
+        model = identified_model_document(judged.identification)
+        return _Solution(identification_document(judged), model, judged.verdict)
 
     def _propose(
         self,

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions.events import CONFIGURE, Command, Outcome
 from robocal_ros.sessions.observations import JOINTS
@@ -101,6 +102,8 @@ def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
     try:
         values = dict(arguments["config"])
         rule = StandstillRule(**values.pop("standstill"))
-        return ThermalConfig(standstill=rule, **values)
+        sphere = SphereRule(**values.pop("sphere"))
+        names = tuple(values.pop("drift_parameters"))
+        return ThermalConfig(standstill=rule, sphere=sphere, drift_parameters=names, **values)
     except (KeyError, TypeError) as error:
         raise InputError(f"the recorded configuration cannot be read: {error}") from error

@@ -9,11 +9,12 @@ import numpy as np
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import stamp_ns
-from robocal_ros.core.thermal.identification import SAME_VISIT_RAD
+from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import JOINTS, JUMPS, POINT, POSE, Observation
+from robocal_ros.sessions.observation import Observation
+from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
 from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.thermal import ThermalSession
 
@@ -105,7 +106,7 @@ def input_topics(topics: Iterable[str], configured: Command | None = None) -> di
     found: dict[str, str] = {}
     for topic in sorted(topics):
         kind = topic_kind(topic)
-        if kind not in (JOINTS, POINT, POSE) or UNCORRECTED in topic:
+        if kind not in (JOINTS, *MEASURING) or UNCORRECTED in topic:
             continue
         if kind in found.values():
             other = next(name for name, its in found.items() if its == kind)

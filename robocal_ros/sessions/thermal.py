@@ -12,13 +12,14 @@ from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
 from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
-from robocal_ros.core.thermal.identification import ColdReference
+from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.sessions import events
 from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce, outside_decision
-from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk, as_measurements
+from robocal_ros.sessions.observation import as_measurements
+from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk
 from robocal_ros.sessions.proposing import Proposer
 from robocal_ros.sessions.thermal_config import ThermalConfig, expected_drift
 
@@ -180,7 +181,9 @@ class ThermalSession:
         last = int(command.arguments.get("samples", 0))
         if not found:
             raise TooFewSamplesError(self.desk.why_nothing())
-        return as_measurements(found[-last:] if last else found)
+        drift = command.name == events.IDENTIFY and self.reference is not None
+        sigma_m = self.config.sigma_m if drift else None  # a calibration finds its noise itself
+        return as_measurements(found[-last:] if last else found, sigma_m)
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         outcome = self._proposer.capture(command, self._window(command), wall_ns)

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.identification import Method
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import State
@@ -19,6 +20,7 @@ Prior = Literal["default", "learned"]
 METHODS: tuple[Method, ...] = ("map", "lsq")
 PRIORS: tuple[Prior, ...] = ("default", "learned")
 LEARN_FROM = 500
+SPHERE_RADIUS_M = 0.01905  # 1.5 inches across, the usual reference sphere
 STOOD = (State.IN_FORCE, State.SUPERSEDED)  # what was rolled back was no drift
 
 
@@ -31,22 +33,26 @@ class ThermalConfig:
     method : estimator where a command names none.
     prior : ``default``, or ``learned`` from the drifts accepted and not rolled back so far.
     sigma_m : standard deviation of one measured coordinate in one visit of a pose.
+    drift_parameters : what ``lsq`` solves of a drift; empty: all, which takes many poses.
     hold_out, seed : share of the poses kept to judge a calibration without reference.
     lateness_s : a command waits for joint readings this much newer, so that measurements
         under way still count.
     measuring_frame : frame of the measurements; empty: that of the first one used.
     target : name of the target where the measurement's frame_id gives none.
+    sphere : what a sphere in a cloud must be like.
     """
 
     method: Method = "map"
     prior: Prior = "default"
     sigma_m: float = 3e-5
+    drift_parameters: tuple[str, ...] = ()
     hold_out: float = 0.5
     seed: int = 0
     lateness_s: float = 0.2
     measuring_frame: str = ""
     target: str = DEFAULT_TARGET
     standstill: StandstillRule = field(default_factory=StandstillRule)
+    sphere: SphereRule = field(default_factory=lambda: SphereRule(SPHERE_RADIUS_M))
 
 
 def expected_drift(

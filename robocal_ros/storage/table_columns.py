@@ -24,7 +24,7 @@ ROTATION_VECTOR = ("rvx_rad", "rvy_rad", "rvz_rad")
 QUATERNION = ("qx", "qy", "qz", "qw")
 ORIENTATIONS = (EULER, ROTATION_VECTOR, QUATERNION)
 NUMBERS = ("stamp_s", "sigma_mm")
-WORDS = ("target", "sample")
+WORDS = ("target", "sample", "pose", "cycle")
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 

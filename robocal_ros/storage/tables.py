@@ -15,6 +15,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import DEFAULT_TARGET, Measurements
+from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits
 from robocal_ros.storage.files import quoted, read_text, write_text
 from robocal_ros.storage.table_columns import (
     EULER,
@@ -64,7 +65,30 @@ def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
     InputError
         With file, row and column, when anything in the file is not as docs/csv.md says.
     """
+    return _measurements(_read_cells(Path(path), arm), arm)
+
+
+def read_visits(path: str | Path, arm: SerialArm) -> Visits:
+    """Read a table of visits of named poses: as ``read_measurements``, with a column ``pose``.
+
+    Raises
+    ------
+    InputError
+        As ``read_measurements``, and when the column ``pose`` is missing.
+    """
     table = _read_cells(Path(path), arm)
+    if "pose" not in table.layout.place:
+        raise InputError(
+            "column pose is missing: it names each measuring pose, the same name cold and warm",
+            file=table.file,
+            row=1,
+        )
+    data = _measurements(table, arm)
+    cycle = _words(table, "cycle") or (ONLY_CYCLE,) * len(data)
+    return Visits(data, _words(table, "pose"), cycle)
+
+
+def _measurements(table: _Table, arm: SerialArm) -> Measurements:
     layout = table.layout
     numbers = _numbers(table)
     n = arm.n

@@ -2,10 +2,12 @@
 
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from command import ROOT, robocal
+from command import ROOT, environment, robocal
 
 PREFIX = ".venv/bin/robocal "
 PAGES = ("README.md", *(f"docs/{name}.md" for name in ("quickstart", "identify", "history")))
@@ -18,6 +20,20 @@ def commands(page: str) -> list[list[str]]:
     lines = [line.strip() for block in blocks for line in block.splitlines()]
     typed = [line.removeprefix(PREFIX) for line in lines if line.startswith(PREFIX)]
     return [shlex.split(line.split(" > ")[0], comments=True) for line in typed]
+
+
+def test_the_thermal_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make = [sys.executable, ROOT / "docs/examples/make_thermal.py", "out/thermal"]
+    subprocess.run(make, check=True, env=environment())
+    typed = commands("docs/thermal.md")
+    assert len(typed) == 4
+    for words in typed:
+        done = robocal(*words)
+        assert done.returncode == 0, (words, done.stderr)
+    identified = next(words for words in typed if words[1] == "identify")
+    printed = robocal(*identified).stdout.splitlines()[0]
+    assert printed in (ROOT / "docs/thermal.md").read_text()
 
 
 @pytest.mark.parametrize("page", [*PAGES, "docs/replay.md"])

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from campaign import ROBOT, measured, table
 from command import SCHEMAS, conforms, robocal, robocal_json
+from drift_tables import fixed_tables
 from recordings import plain_bag, recorded_bag, shift
 
 from robocal_ros.cli.main import COMMANDS
@@ -22,6 +23,10 @@ delta_a = [ 0.0001, 0.0003, -0.0001, 0.0002, 0, 0]
 delta_d = [ 0.0002, 0.0, 0.0, 0.0004, -0.0001, 0]
 delta_alpha = [ 0.0003, 0.0005, 0.0008, 0.0002, 0.0018, 0]
 """
+PLACE = ["thermal", "calibrate-sensor", "--robot", ROBOT]
+DRIFT = ["thermal", "identify", "--robot", ROBOT, "--sensor", "s.yaml", "--cold", "cold.csv"]
+SCREEN = ["thermal", "screen", *DRIFT[2:]]
+PRIOR = ["thermal", "learn-prior", *DRIFT[2:]]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -72,6 +77,30 @@ CASES = {
         ["history", "accept", "2", "--state", "state"],
         (3, "CONFLICT"),
     ),
+    "thermal calibrate-sensor": (
+        "thermal.sensor.json",
+        ["thermal", "calibrate-sensor", "--robot", ROBOT, "--data", "sensor.csv"],
+        ["thermal", "calibrate-sensor", "--robot", ROBOT, "--data", "few.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "thermal identify": (
+        "thermal.identify.json",
+        [*DRIFT, "--warm", "warm.csv"],
+        [*DRIFT, "--warm", "nowhere.csv"],
+        (2, "BAD_INPUT"),
+    ),
+    "thermal learn-prior": (
+        "thermal.prior.json",
+        [*PRIOR, "--warm", "history.csv"],
+        [*PRIOR, "--warm", "warm.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "thermal screen": (
+        "thermal.screen.json",
+        [*SCREEN, "--warm", "shift.csv", "--check", "judges.csv"],
+        [*SCREEN, "--warm", "warm.csv", "--check", "check.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -89,6 +118,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     visits = shift()
     plain_bag(folder / "plain.mcap", visits)
     recorded_bag(folder / "live.mcap", folder / "state", visits)
+    fixed_tables(folder)
+    placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
+    robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)
     (folder / "c.conf").write_text(UR_DELTAS)
     return folder

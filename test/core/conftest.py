@@ -1,6 +1,8 @@
 """A measured cell with a known truth: the arm off its nominal model, noise and nothing else."""
 
+import sys
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.storage.robots import load_robot
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
 
 T_FRAME_BASE = frames.transform(frames.exp_rotation([0.4, -0.3, 2.0]), [3.0, -1.5, 0.7])
 TOOLS = {

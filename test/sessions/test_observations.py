@@ -6,6 +6,7 @@ import pytest
 from robocal_ros.core.samples import JointSample, PointSample, PoseSample
 from robocal_ros.core.streams import JointStream, Reading, StandstillRule
 from robocal_ros.sessions.ignored import MOST_REASONS
+from robocal_ros.sessions.observation import as_measurements
 from robocal_ros.sessions.observations import (
     JOINTS,
     JUMPS,
@@ -13,7 +14,6 @@ from robocal_ros.sessions.observations import (
     POINT,
     POSE,
     ObservationDesk,
-    as_measurements,
 )
 
 MS = 1_000_000

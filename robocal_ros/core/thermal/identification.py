@@ -1,235 +1,297 @@
-"""Drift of the model parameters between a cold reference and a warm visit of the same poses."""
+"""The drift that one measuring cycle shows, and its judgement: maximum a posteriori, closed form.
 
-from dataclasses import dataclass, replace
+Drifts are so small that the model is linear in them (0.1 mrad over 3 m: the second order is
+30 nm). With y the displacement of the targets since the cold visit, ``y = A x + B s - b + v``:
+x the parameters' drift, s the set-up's shift, b the cold visit's noise and v the warm one's.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import estimation
-from robocal_ros.core.assessment import LARGEST_RMS_M, gross, judge, pose_groups, summarise
-from robocal_ros.core.errors import InputError, ResidualError, TooFewSamplesError
-from robocal_ros.core.identification.cell import CellModel, CellProblem, make_layout
-from robocal_ros.core.identification.judged import JudgedIdentification, uninformative
-from robocal_ros.core.identification.mismatch import require_match
-from robocal_ros.core.identification.solve import Identification, Method, identify
+from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
+from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.observability import describe
+from robocal_ros.core.observability import Observability, describe, observability
 from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.agreement import agreeing, left_out
+from robocal_ros.core.thermal.process import SETUP_SIGMA_M
+from robocal_ros.core.thermal.spots import ColdSpots
 
 Array = NDArray[np.float64]
 
-SAME_VISIT_RAD = float(np.radians(0.5))
+FEWEST_POSES = 2
 
 
-@dataclass(frozen=True)
-class ColdReference:
-    """Cold visit of the measuring poses.
+@dataclass(frozen=True, eq=False)
+class CycleDrift:
+    """A drift identified from one cycle.
 
     Attributes
     ----------
-    cell : the cold model with base and targets as fitted to the cold visit.
-    data : the cold measurements.
-    rejected : names of those that did not fit the others.
+    drift, covariance : (k,) of the free parameters since the cold visit, and (k, k), SI.
+    prior_covariance : (k, k) of the drift before the cycle; None where there was none.
+    arm : the cold arm with the drift added.
+    warm : the visits, those of one pose averaged; m of them.
+    left_out : (m, 3) displacement at each sample less what all other samples say of it, m.
+    left_out_sigma : (m,) rms length of the same that the covariances predict, m.
+    rejected : (m,) samples that the others contradict.
+    noise_m : rms standard deviation of a coordinate of the visits.
+    seen, unobservable : what the data alone determine, and what not, in words.
     """
 
-    cell: CellModel
-    data: Measurements
-    rejected: tuple[str, ...] = ()
-
-    @property
-    def used(self) -> Measurements:
-        """The measurements that placed base and targets."""
-        return self.data.take(~np.isin(self.data.sample, self.rejected))
-
-
-def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
-    """Place base and targets from a cold visit with the cold model ``arm``.
-
-    Samples that do not fit the others do not place them, and are named in ``rejected``; a warm
-    visit of such a pose will not fit either.
-
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When the visit cannot place them.
-    InputError, ResidualError
-        When the visit misses the arm by a mistake that can be named, or by more than 5 mm rms.
-    """
-    require_match(arm, data, base=True, tool=True)
-    placed = identify(arm, data, fit=("base", "tool"), method="lsq")
-    reference = ColdReference(placed.cell, data, placed.rejected)
-    rms = summarise(placed.cell.residual(reference.used)).rms_m
-    if rms > LARGEST_RMS_M:
-        raise ResidualError(
-            f"the cold visit misses the model by {rms * 1e3:.1f} mm rms, more than any robot's "
-            f"static error ({LARGEST_RMS_M * 1e3:.0f} mm): check robot file, units, joint signs "
-            "and target names"
-        )
-    return reference
+    drift: Array
+    covariance: Array
+    prior_covariance: Array | None
+    arm: SerialArm
+    warm: Measurements
+    left_out: Array
+    left_out_sigma: Array
+    rejected: NDArray[np.bool_]
+    noise_m: float
+    seen: Observability
+    unobservable: tuple[str, ...]
 
 
-def against_reference(reference: ColdReference, warm: Measurements, sigma_m: float) -> Measurements:
-    """Warm measurements less the cold residual of the same pose (static errors cancel).
+def identify_cycle(
+    spots: ColdSpots,
+    warm: Measurements,
+    *,
+    prior_covariance: Array,
+    sigma_m: float,
+    setup_sigma_m: float = SETUP_SIGMA_M,
+) -> CycleDrift:
+    """Identify all free parameters from one cycle.
 
-    Poses are the same when all joints agree within 0.5 deg. Visits of one pose are averaged,
-    because they share the noise of its cold visit: the result's sigma holds both.
+    Visits of one pose are averaged first: they share the noise of its cold visit, and none may
+    judge another.
+
+    Parameters
+    ----------
+    prior_covariance : (k, k), SI, of the drift since the cold visit.
+    sigma_m : standard deviation of one coordinate of one visit, of the cold ones and of warm
+        ones without a sigma of their own.
 
     Raises
     ------
     InputError
-        When a warm sample has no cold counterpart.
-    """
-    cold = reference.cell.residual(reference.data)
-    visits: dict[tuple[int, str], list[int]] = {}
-    for i, group in enumerate(pose_groups(warm.q)):
-        visits.setdefault((int(group), warm.target[i]), []).append(i)
-    rows = [np.array(indices) for indices in visits.values()]
-    near = [_cold_visits(reference, warm, int(row[0])) for row in rows]
-    counts = [(np.sum(visit), len(row)) for visit, row in zip(near, rows, strict=True)]
-    return Measurements(
-        q=np.array([warm.q[row].mean(axis=0) for row in rows]),
-        position=np.array(
-            [
-                warm.position[row].mean(axis=0) + cold[visit].mean(axis=0)
-                for row, visit in zip(rows, near, strict=True)
-            ]
-        ),
-        target=tuple(warm.target[row[0]] for row in rows),
-        sample=tuple("+".join(warm.sample[i] for i in row) for row in rows),
-        sigma=np.array([sigma_m * np.sqrt(1.0 / before + 1.0 / now) for before, now in counts]),
-    )
-
-
-def _cold_visits(reference: ColdReference, warm: Measurements, i: int) -> NDArray[np.bool_]:
-    """Mark the cold samples of the same target and pose as a warm one."""
-    same = np.array([t == warm.target[i] for t in reference.data.target], dtype=np.bool_)
-    near = same & (np.max(np.abs(reference.data.q - warm.q[i]), axis=1) < SAME_VISIT_RAD)
-    if not np.any(near):
-        raise InputError(
-            f"sample {warm.sample[i]} of target '{warm.target[i]}' was not measured in the "
-            "cold reference: visit the reference poses, or capture a new reference"
-        )
-    return np.asarray(near)
-
-
-def identify_drift(
-    nominal: SerialArm,
-    reference: ColdReference,
-    warm: Measurements,
-    *,
-    sigma_m: float,
-    in_force: SerialArm,
-    prior_covariance: Array,
-    method: Method = "map",
-) -> JudgedIdentification:
-    """Identify the drifted model and judge it by leaving out one pose at a time.
-
-    Parameters
-    ----------
-    sigma_m : standard deviation of one coordinate of one visit (sensor and repeatability).
-    in_force : the model that the candidate must beat at the left-out poses.
-    prior_covariance : (k, k), SI, of the drift of the free parameters, for ``map``.
-
-    Raises
-    ------
+        When a sample has no cold counterpart.
     TooFewSamplesError
         With fewer than two poses.
     """
-    data = against_reference(reference, warm, sigma_m)
-    groups = pose_groups(data.q)
-    if groups.max() < 1:
+    warm = spots.average(warm, sigma_m)
+    if len(warm) < FEWEST_POSES:
         raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
-    prior = prior_covariance if method == "map" else None
-    result = _identify(nominal, reference, data, method, prior)
-    after, model = _left_out(nominal, reference, data, groups, method, prior)
-    current = replace(reference.cell, arm=nominal.with_mdh(in_force.mdh))
-    plain = np.linalg.norm(reference.cell.residual(data), axis=1)
-    before = np.linalg.norm(current.residual(data), axis=1)
-    sound = ~(gross(before, after) | result.estimate.rejected)
-    doubt = _doubt(result, summarise(before[sound]).rms_m, in_force, prior)
-    return JudgedIdentification(
-        identification=result,
-        nominal=summarise(plain[sound]),
-        current=summarise(before[sound]),
-        candidate=summarise(after[sound]),
-        predicted_rms_m=float(np.sqrt(model.mean())),
-        predicted_total_rms_m=float(np.sqrt(model.mean() + 3.0 * result.noise_m**2)),
-        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
-        held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
-        verdict=judge(before[sound], after[sound], groups[sound], doubt),
+    spot, arm = spots.match(warm), spots.cell.arm
+    y = spots.drift(warm).ravel()
+    parameters, setup = spots.rows(warm.q, spots.target[spot])
+    A, B = parameters.reshape(len(y), -1), setup.reshape(len(y), -1)
+    variance = _variance(spots, spot, warm, sigma_m)
+    R = np.diag(np.repeat(variance, 3)) + setup_sigma_m**2 * B @ B.T
+    S = A @ prior_covariance @ A.T + R
+    keep = agreeing(y, S, len(warm))
+    rows = np.repeat(keep, 3)
+    gain = np.linalg.solve(S[np.ix_(rows, rows)], A[rows] @ prior_covariance).T
+    drift = gain @ y[rows]
+    covariance = prior_covariance - gain @ A[rows] @ prior_covariance
+    miss, spread = left_out(y, S, keep)
+    chosen, seen = arm.parameters, observability(A[rows])
+    words = (describe(column, chosen.names, chosen.to_display) for column in seen.null.T)
+    return CycleDrift(
+        drift=drift,
+        covariance=0.5 * (covariance + covariance.T),
+        prior_covariance=prior_covariance,
+        arm=arm.with_mdh(chosen.add(arm.mdh, drift)),
+        warm=warm,
+        left_out=miss,
+        left_out_sigma=spread,
+        rejected=~keep,
+        noise_m=float(np.sqrt(variance.mean())),
+        seen=seen,
+        unobservable=tuple(words),
     )
 
 
-def _left_out(
-    nominal: SerialArm,
-    reference: ColdReference,
-    data: Measurements,
-    groups: NDArray[np.int64],
-    method: Method,
-    prior: Array | None,
-) -> tuple[Array, Array]:
-    """Error (m,) at each sample of the model without its pose, and its predicted variance (m,)."""
-    error, variance = np.empty(len(data)), np.empty(len(data))
-    for group in range(int(groups.max()) + 1):
-        left = groups == group
-        part, others = data.take(left), data.take(~left)
-        without = _identify(nominal, reference, others, method, prior)
-        error[left] = np.linalg.norm(without.cell.residual(part), axis=1)
-        spread = without.predicted_variance(part.q, part.target_index(without.cell.targets))
-        variance[left] = np.trace(spread, axis1=1, axis2=2)
-    return error, variance
+def require_parameters(arm: SerialArm, names: Sequence[str]) -> None:
+    """Refuse names that are not free parameters of ``arm``.
+
+    Raises
+    ------
+    InputError
+        Naming the first of them, and those that there are.
+    """
+    unknown = [name for name in names if name not in arm.parameters.names]
+    if unknown:
+        raise InputError(
+            f"unknown parameter '{unknown[0]}'; this model has {', '.join(arm.parameters.names)}"
+        )
 
 
-def _doubt(
-    result: Identification, current_rms_m: float, in_force: SerialArm, prior: Array | None
-) -> str:
+def identify_subset(
+    spots: ColdSpots, warm: Measurements, names: Sequence[str], *, sigma_m: float
+) -> CycleDrift:
+    """Identify some parameters by least squares and hold the others (thesis eq. 3-8 to 3-10).
+
+    Raises
+    ------
+    InputError
+        When a name is unknown, or a sample has no cold counterpart.
+    TooFewSamplesError, RankDeficientError
+        When the poses cannot answer.
+    """
+    warm = spots.average(warm, sigma_m)
+    spot, arm = spots.match(warm), spots.cell.arm
+    require_parameters(arm, names)
+    chosen = np.array([name in names for name in arm.parameters.names], dtype=np.bool_)
+    A = spots.rows(warm.q, spots.target[spot])[0].reshape(3 * len(warm), -1)[:, chosen]
+    few = TooFewSamplesError(
+        f"{len(warm)} poses give {len(A)} equations for {A.shape[1]} parameters: measure more"
+    )
+    if len(A) < A.shape[1]:
+        raise few
+    seen = observability(A)
+    if seen.null.shape[1]:
+        words = [describe(column, tuple(names)) for column in seen.null.T]
+        raise RankDeficientError(f"not determined by these poses: {'; '.join(words)}", words)
+    if len(A) < A.shape[1] + 3:  # without any pose the others must still determine all
+        raise few
+    variance = float(_variance(spots, spot, warm, sigma_m).mean())
+    return _least_squares(spots, warm, A, chosen, variance, seen)
+
+
+def _least_squares(
+    spots: ColdSpots,
+    warm: Measurements,
+    A: Array,
+    chosen: NDArray[np.bool_],
+    variance: float,
+    seen: Observability,
+) -> CycleDrift:
+    """By singular values; each pose is forecast from the others by its leverage."""
+    y, arm = spots.drift(warm).ravel(), spots.cell.arm
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    drift, covariance = np.zeros(len(chosen)), np.zeros((len(chosen),) * 2)
+    drift[chosen] = Vt.T @ ((U.T @ y) / s)
+    covariance[np.ix_(chosen, chosen)] = variance * (Vt.T / s**2) @ Vt
+    residual = (y - U @ (U.T @ y)).reshape(-1, 3)
+    rows = U.reshape(len(warm), 3, -1)
+    own = np.linalg.inv(np.eye(3) - rows @ np.swapaxes(rows, 1, 2))
+    return CycleDrift(
+        drift=drift,
+        covariance=covariance,
+        prior_covariance=None,
+        arm=arm.with_mdh(arm.parameters.add(arm.mdh, drift)),
+        warm=warm,
+        left_out=np.einsum("mij,mj->mi", own, residual),
+        left_out_sigma=np.sqrt(variance * np.trace(own, axis1=1, axis2=2)),
+        rejected=np.zeros(len(warm), dtype=np.bool_),
+        noise_m=float(np.sqrt(variance)),
+        seen=seen,
+        unobservable=(),
+    )
+
+
+def _variance(
+    spots: ColdSpots, spot: NDArray[np.int64], warm: Measurements, sigma_m: float
+) -> Array:
+    """Variance (m,) of one coordinate of a displacement: warm and cold noise."""
+    sigma = np.full(len(warm), sigma_m) if warm.sigma is None else warm.sigma
+    return np.asarray(sigma**2 + sigma_m**2 / spots.visits[spot])
+
+
+@dataclass(frozen=True)
+class JudgedCycle:
+    """A cycle's drift with its figures on measurements that were not used to solve.
+
+    Attributes
+    ----------
+    cold, current, candidate : errors of the cold model, of the one in force and of the
+        identified one.
+    predicted_rms_m, predicted_total_rms_m : the candidate's error expected from its covariance,
+        alone and with the noise of both visits.
+    workspace_rms_m : the same as the first over postures throughout the joint limits.
+    """
+
+    cold: ErrorSummary
+    current: ErrorSummary
+    candidate: ErrorSummary
+    predicted_rms_m: float
+    predicted_total_rms_m: float
+    workspace_rms_m: float
+    held_out_rejected: tuple[str, ...]
+    verdict: Verdict
+
+
+def judge_cycle(
+    found: CycleDrift,
+    spots: ColdSpots,
+    *,
+    in_force: SerialArm,
+    check: Measurements | None = None,
+    sigma_m: float,
+) -> JudgedCycle:
+    """Judge at the poses of ``check``, else at each pose of the cycle from the others.
+
+    ``in_force`` is an arm of the cold model's type. A drift that the cycle's poses do not show
+    throughout the workspace is refused, whatever the poses themselves say.
+    """
+    data = found.warm if check is None else check
+    spot = spots.match(data)
+    y = spots.drift(data)
+    A = spots.rows(data.q, spots.target[spot])[0]
+    chosen, cold = spots.cell.arm.parameters, spots.cell.arm
+    current = np.linalg.norm(y - A @ chosen.read(in_force.mdh - cold.mdh), axis=1)
+    if check is None:
+        after, spread = np.linalg.norm(found.left_out, axis=1), found.left_out_sigma
+        usable = ~found.rejected
+    else:
+        after = np.linalg.norm(y - A @ found.drift, axis=1)
+        noise = 3.0 * _variance(spots, spot, data, sigma_m)
+        spread = np.sqrt(np.einsum("mik,kl,mil->m", A, found.covariance, A) + noise)
+        usable = np.ones(len(data), dtype=np.bool_)
+    sound = usable & ~gross(current, after)
+    rows = _workspace_rows(spots)
+    moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
+    change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    doubt = _doubt(found, rows, summarise(current[sound]).rms_m, change)
+    return JudgedCycle(
+        cold=summarise(np.linalg.norm(y, axis=1)[sound]),
+        current=summarise(current[sound]),
+        candidate=summarise(after[sound]),
+        predicted_rms_m=_rms(A, found.covariance),
+        predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
+        workspace_rms_m=_rms(rows, found.covariance),
+        held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
+        verdict=judge(current[sound], after[sound], spot[sound], doubt),
+    )
+
+
+def _doubt(found: CycleDrift, rows: Array, current_rms_m: float, change_m: float) -> str:
     """Say why the poses do not carry over to the workspace; empty when they do.
 
-    Poses that halve the prior's error throughout the workspace do, however small the change: the
-    model in force came from such poses too and is no better known elsewhere.
+    Poses that halve the prior's error there do, however small the change: the model in force came
+    from such poses too and is no better known elsewhere.
     """
-    if prior is not None and result.estimate.converged:
-        left = result.workspace_rms(result.estimate.covariance)
-        if left <= 0.5 * result.workspace_rms(prior):
-            return ""
-    return uninformative(result, current_rms_m, in_force)
+    error = _rms(rows, found.covariance)
+    prior = found.prior_covariance
+    if prior is not None and error <= 0.5 * _rms(rows, prior):
+        return ""
+    if error <= max(2.0 * current_rms_m, change_m / np.sqrt(3.0)):
+        return ""
+    return (
+        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
+        f"for a change of {change_m * 1e3:.3f} mm: spread them and turn every joint, the wrist too"
+    )
 
 
-def _identify(
-    nominal: SerialArm,
-    reference: ColdReference,
-    data: Measurements,
-    method: Method,
-    prior: Array | None,
-) -> Identification:
-    """The model parameters alone, about the cold model; base and targets are the reference's."""
-    cell = reference.cell
-    layout = make_layout(
-        nominal,
-        cell.targets,
-        geometry=nominal.parameters.names,
-        base=False,
-        tool=False,
-        orientation=False,
-    )
-    if data.sigma is None:
-        raise ValueError("drift needs the measurements' sigma")
-    start = replace(cell, arm=nominal.with_mdh(cell.arm.mdh))
-    problem = CellProblem(layout, data, cell.targets, data.sigma, 0.0, cell.arm.mdh)
-    information = None if prior is None else np.asarray(np.linalg.inv(prior), dtype=np.float64)
-    estimate = estimation.solve(problem, start, prior_information=information, noise_known=True)
-    return Identification(
-        nominal=nominal,
-        cell=estimate.state,
-        layout=layout,
-        method=method,
-        estimate=estimate,
-        held=(),
-        prior_covariance=prior,
-        unobservable=tuple(
-            describe(direction, layout.names, layout.to_display)
-            for direction in estimate.observability.null.T
-        ),
-        rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
-        noise_m=estimate.scale * float(np.sqrt(np.mean(data.sigma**2))),
-    )
+def _rms(rows: Array, covariance: Array) -> float:
+    """Rms length, m, of what a covariance (k, k) does to points with rows (m, 3, k)."""
+    return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+
+
+def _workspace_rows(spots: ColdSpots) -> Array:
+    q = random_postures(spots.cell.arm)
+    return spots.rows(q, np.zeros(len(q), dtype=np.int64))[0]

@@ -1,0 +1,1 @@
+"""Shapes fitted to measured points."""

@@ -1,0 +1,67 @@
+"""The cold reference: base, targets and static errors, from one visit of the measuring poses."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from robocal_ros.core.assessment import LARGEST_RMS_M, summarise
+from robocal_ros.core.errors import ResidualError
+from robocal_ros.core.identification.cell import CellModel
+from robocal_ros.core.identification.mismatch import require_match
+from robocal_ros.core.identification.solve import identify
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.spots import ColdSpots
+
+
+@dataclass(frozen=True)
+class ColdReference:
+    """Cold visit of the measuring poses.
+
+    Attributes
+    ----------
+    cell : the cold model with base and targets as fitted to the cold visit.
+    data : the cold measurements.
+    rejected : names of those that did not fit the others.
+    """
+
+    cell: CellModel
+    data: Measurements
+    rejected: tuple[str, ...] = ()
+
+    @property
+    def used(self) -> Measurements:
+        """The measurements that placed base and targets."""
+        return self.data.take(~np.isin(self.data.sample, self.rejected))
+
+    @cached_property
+    def spots(self) -> ColdSpots:
+        """Each pose and target of the visit once."""
+        return ColdSpots.of(self.cell, self.data)
+
+
+def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
+    """Place base and targets from a cold visit with the cold model ``arm``.
+
+    Samples that do not fit the others do not place them, and are named in ``rejected``; a warm
+    visit of such a pose will not fit either.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        When the visit cannot place them.
+    InputError, ResidualError
+        When the visit misses the arm by a mistake that can be named, or by more than 5 mm rms.
+    """
+    require_match(arm, data, base=True, tool=True)
+    placed = identify(arm, data, fit=("base", "tool"), method="lsq")
+    reference = ColdReference(placed.cell, data, placed.rejected)
+    rms = summarise(placed.cell.residual(reference.used)).rms_m
+    if rms > LARGEST_RMS_M:
+        raise ResidualError(
+            f"the cold visit misses the model by {rms * 1e3:.1f} mm rms, more than any robot's "
+            f"static error ({LARGEST_RMS_M * 1e3:.0f} mm): check robot file, units, joint signs "
+            "and target names"
+        )
+    return reference

@@ -1,0 +1,177 @@
+"""The tracker: exact where it must be, honest where it cannot be, on simulated drift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from drift_cell import SIGMA, cell_of, drifted, postures, visit
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError, StaleError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.priors import drift_prior
+from robocal_ros.core.thermal.process import DriftProcess
+from robocal_ros.core.thermal.spots import ColdSpots
+from robocal_ros.core.thermal.tracking import DriftTracker
+from robocal_ros.storage.robots import load_robot
+
+PERIOD_S = 300.0
+
+
+@pytest.fixture(scope="module")
+def arm() -> SerialArm:
+    return load_robot("kr150_r3100")
+
+
+def sample_path(process: DriftProcess, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Drifts (count, k) drawn from the process, from a cold start, every five minutes."""
+    k = len(process.covariance)
+    root = np.linalg.cholesky(process.covariance)
+    rate = np.sqrt(3.0) / process.time_s
+    state = np.stack([np.zeros(k), rate * (root @ rng.standard_normal(k))])
+    F, noise = process.transition(PERIOD_S)
+    step = np.linalg.cholesky(noise)
+    path = []
+    for _ in range(count):
+        state = F @ state + step @ rng.standard_normal((2, k)) @ root.T
+        path.append(state[0])
+    return np.array(path)
+
+
+def test_the_process_is_stationary_and_smooth():
+    """Stepping twice is stepping once, and the long run has variance 1 (Matern 3/2)."""
+    process = DriftProcess(np.eye(1), 3600.0)
+    F1, Q1 = process.transition(100.0)
+    F2, Q2 = process.transition(200.0)
+    assert pytest.approx(F2, rel=1e-12, abs=1e-12) == F1 @ F1
+    assert pytest.approx(Q2, rel=1e-9) == F1 @ Q1 @ F1.T + Q1
+    far, all_noise = process.transition(1e6)
+    assert np.abs(far).max() < 1e-12
+    rate = np.sqrt(3.0) / 3600.0
+    assert all_noise == pytest.approx(np.diag([1.0, rate**2]))
+    lag = 700.0
+    correlation = process.transition(lag)[0][0, 0]
+    assert correlation == pytest.approx((1.0 + rate * lag) * np.exp(-rate * lag))
+
+
+def test_errors_and_innovations_are_what_the_filter_says(arm):
+    """Drifts drawn from the process itself: normalised squares are chi-square."""
+    cell, q = cell_of(arm), postures(6)
+    process = replace(DriftProcess(0.1 * drift_prior(arm)), setup_sigma_m=1e-9)
+    error2, innovation2, freedom, lag = 0.0, 0.0, 0, []
+    runs, cycles, k = 40, 12, len(arm.parameters)
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        tracker = DriftTracker(ColdSpots.of(cell, visit(cell, q, rng)), process, SIGMA)
+        before = None
+        for i, drift in enumerate(sample_path(process, cycles, rng)):
+            warm = visit(drifted(cell, drift), q, rng)
+            found = tracker.take(warm, PERIOD_S * (i + 1))
+            assert found.applied
+            innovation2 += found.squared
+            freedom += found.freedom
+            lag += [] if before is None else [before * (found.squared - found.freedom)]
+            before = found.squared - found.freedom
+        mean, covariance = tracker.drift(PERIOD_S * cycles)
+        miss = mean - drift
+        error2 += float(miss @ np.linalg.solve(covariance, miss))
+    assert error2 == pytest.approx(runs * k, abs=4.0 * np.sqrt(2.0 * runs * k))
+    assert innovation2 == pytest.approx(freedom, abs=4.0 * np.sqrt(2.0 * freedom))
+    assert abs(np.mean(lag)) < 4.0 * np.std(lag) / np.sqrt(len(lag))
+
+
+def test_a_constant_drift_is_found_and_kept(arm):
+    """Fifty cycles of the same drift: the answer converges and does not ratchet."""
+    cell, q = cell_of(arm), postures(10)
+    process = DriftProcess(drift_prior(arm))
+    drift = np.random.default_rng(3).standard_normal(len(arm.parameters)) * np.sqrt(
+        np.diag(drift_prior(arm))
+    )
+    tracker = DriftTracker(ColdSpots.of(cell, visit(cell, q)), process, SIGMA)
+    warm = visit(drifted(cell, drift), q)
+    check = postures(30, 9)
+    true = visit(drifted(cell, drift), check).position
+    errors = []
+    for i in range(50):
+        tracker.take(warm, PERIOD_S * (i + 1))
+        mean, _ = tracker.drift(PERIOD_S * (i + 1))
+        there = visit(drifted(cell, mean), check).position
+        errors.append(np.sqrt(np.mean((there - true) ** 2)))
+    assert errors[-1] < SIGMA
+    assert max(errors[5:]) <= 1.05 * errors[5]
+
+
+def test_one_wrong_sample_is_left_out_and_named(arm):
+    cell, q, rng = cell_of(arm), postures(8), np.random.default_rng(1)
+    tracker = DriftTracker(
+        ColdSpots.of(cell, visit(cell, q, rng)), DriftProcess(drift_prior(arm)), SIGMA
+    )
+    clean = DriftTracker(tracker.spots, tracker.process, SIGMA)
+    warm = visit(cell, q, rng)
+    clean.take(warm.take(np.arange(8) != 5), PERIOD_S)
+    warm.position[5, 0] += 1e-3
+    found = tracker.take(warm, PERIOD_S)
+    assert found.applied
+    assert found.rejected == ("5",)
+    assert tracker.state.mean == pytest.approx(clean.state.mean, abs=1e-12)
+
+
+def test_a_knocked_sensor_is_not_taken_for_drift(arm):
+    cell, q, rng = cell_of(arm), postures(8), np.random.default_rng(2)
+    tracker = DriftTracker(
+        ColdSpots.of(cell, visit(cell, q, rng)), DriftProcess(0.1 * drift_prior(arm)), SIGMA
+    )
+    for i in range(5):
+        assert tracker.take(visit(cell, q, rng), PERIOD_S * (i + 1)).applied
+    before = tracker.state
+    turned = frames.transform(frames.exp_rotation([0.0, 2e-3, 0.0]), [5e-4, 0.0, 0.0])
+    knocked = replace(cell, T_frame_base=turned @ cell.T_frame_base)
+    found = tracker.take(visit(knocked, q, rng), PERIOD_S * 6)
+    assert not found.applied
+    assert tracker.state is before
+
+
+def test_wrong_cold_visits_are_outvoted(arm):
+    cell, q, rng = cell_of(arm), postures(6), np.random.default_rng(4)
+    rounds = [visit(cell, q, rng) for _ in range(3)]
+    cold = Measurements(
+        q=np.vstack([data.q for data in rounds]),
+        position=np.vstack([data.position for data in rounds]),
+        target=("ball",) * 18,
+        sample=tuple(str(i) for i in range(18)),
+    )
+    cold.position[7] += [1e-3, 0.0, 0.0]
+    spots = ColdSpots.of(cell, cold)
+    assert spots.rejected == ("7",)
+    assert sorted(spots.visits.tolist()) == [2, 3, 3, 3, 3, 3]
+    assert np.abs(spots.error).max() < 4.0 * SIGMA
+
+
+def test_cycles_come_in_order_and_from_known_poses(arm):
+    cell, q = cell_of(arm), postures(6)
+    tracker = DriftTracker(
+        ColdSpots.of(cell, visit(cell, q)), DriftProcess(drift_prior(arm)), SIGMA
+    )
+    tracker.take(visit(cell, q), 600.0)
+    with pytest.raises(StaleError, match="300 s before the last cycle"):
+        tracker.take(visit(cell, q), 300.0)
+    with pytest.raises(InputError, match="not measured in the cold reference"):
+        tracker.take(visit(cell, postures(6, 5)), 900.0)
+
+
+def test_moving_the_sensor_changes_nothing(arm):
+    """The same robot seen from elsewhere drifts the same."""
+    q, rng = postures(6), np.random.default_rng(5)
+    here = cell_of(arm)
+    move = frames.transform(frames.exp_rotation([0.4, -0.2, 1.0]), [0.3, 2.0, -1.0])
+    there = replace(here, T_frame_base=move @ here.T_frame_base)
+    process, answers = DriftProcess(drift_prior(arm)), []
+    warm = drifted(here, 1e-5 * np.ones(len(arm.parameters)))
+    cold, late = visit(here, q, rng), visit(warm, q, rng)
+    for cell, M in ((here, np.eye(4)), (there, move)):
+        moved = [replace(d, position=d.position @ M[:3, :3].T + M[:3, 3]) for d in (cold, late)]
+        tracker = DriftTracker(ColdSpots.of(cell, moved[0]), process, SIGMA)
+        tracker.take(moved[1], PERIOD_S)
+        answers.append(tracker.drift(PERIOD_S)[0])
+    assert answers[1] == pytest.approx(answers[0], abs=1e-9)
