@@ -37,7 +37,7 @@ HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
 RATE = np.radians(0.5)
 DT = 0.002
 ROUNDING = 1e-12
-NOT_STRAIGHT = 2e-5  # rad, of up to 5 deg of correction blended between two points
+NOT_STRAIGHT = np.radians(2.0) ** 2 / 8  # rad: second order of the longest blend below, 4 s long
 
 
 def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:
