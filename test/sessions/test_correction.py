@@ -513,7 +513,7 @@ def test_a_trajectory_that_the_controller_rejected_is_not_believed() -> None:
     for _ in range(25):
         robot.now += 1.0
         robot.read(HOME)
-    for command in (still(), still(first_s=0.01)):
+    for command in (still(first_s=0.01), still()):
         out = robot.session.trajectory(command, robot.now)
         first_s = command.time_from_start_s[0]
         assert np.abs(out.position[0] - HOME).max() <= RATE * first_s + ROUNDING
@@ -543,6 +543,49 @@ def test_a_trajectory_from_nowhere_is_refused_unless_it_takes_its_time() -> None
         else:
             refused(Reason.START_MISMATCH, robot.session.trajectory, command, robot.now)
             assert robot.session.status().mismatch
+
+
+def straight(seconds: float = 4.0) -> TrajectoryCommand:
+    """Half a radian in each joint; 25 ms of it are beyond the tolerance."""
+    return TrajectoryCommand(NAMES, np.stack([HOME, HOME + 0.5]), np.array([0.0, seconds]))
+
+
+def test_a_robot_that_moves_under_a_trajectory_is_taken_to_follow_it() -> None:
+    """Between far points its controller goes another way than straight."""
+    robot = large()
+    at = robot.settle()
+    robot.session.trajectory(straight(), robot.now)
+    for t in np.arange(0.0, 1.0, 0.05):
+        robot.now += 0.05
+        robot.read(at + 0.02 + 0.1 * t)
+    out = robot.session.trajectory(still(HOME + 0.3, first_s=0.05), robot.now)
+    assert np.abs(out.position[0] - HOME - 0.3).max() > 10 * FAR
+
+
+def test_single_points_in_quick_succession_may_be_ahead_of_the_robot() -> None:
+    robot = large()
+    at = robot.settle()
+    for _ in range(150):  # long enough to be seen at rest
+        robot.stream()
+    for k in range(1, 4):
+        step = TrajectoryCommand(NAMES, HOME[None] + 0.005 * k, np.array([0.034]))
+        robot.session.trajectory(step, robot.now)
+        robot.now += 0.034 if k < 2 else 0.02
+        robot.read(at)
+
+
+def test_a_stopped_robot_goes_on_from_where_it_stopped() -> None:
+    robot = large()
+    robot.settle()
+    path = robot.session.trajectory(straight(), robot.now)
+    robot.now += 1.0
+    empty = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
+    robot.session.trajectory(empty, robot.now)
+    robot.now += 5.0
+    stands = path.position[0] + (path.position[1] - path.position[0]) * 1.1 / 4.0
+    robot.read(stands)
+    out = robot.session.trajectory(still(HOME + 0.15, first_s=0.05), robot.now)
+    assert np.abs(out.position[0] - HOME - 0.15).max() > 10 * FAR
 
 
 def test_a_restart_while_corrected_goes_on_where_the_robot_stands() -> None:

@@ -1,7 +1,7 @@
 """Where a corrected command may begin: the robot is compared with what was put out last."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -83,6 +83,12 @@ class Sent:
         """Whether the robot may still be moving by it."""
         end = min(self.stopped_s, self.begin_s + float(self.times_s[-1]))
         return now_s <= end + RESPONSE_S
+
+    def since(self, oldest_s: float) -> "Sent":
+        """The same without what was over before an instant."""
+        over = self.before is None or self.begin_s + self.times_s[0] <= oldest_s
+        before = None if self.before is None or over else self.before.since(oldest_s)
+        return replace(self, before=before)
 
     def around(self, now_s: float) -> Array | None:
         """Taught and corrected joints (2, r, k) at r instants of the robot's response time.

@@ -20,6 +20,7 @@ from robocal_ros.core.joint_correction.bounds import (
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
 from robocal_ros.core.joint_correction.starting import (
+    RESPONSE_S,
     Follows,
     Sent,
     Whereabouts,
@@ -172,13 +173,13 @@ class Corrector:
         self.mismatch = f"{detail}; call ~/enable when it may begin there"
         return RefusedError(Reason.START_MISMATCH, self.mismatch)
 
-    def note_sent(self, sent: Sent) -> None:
+    def note_sent(self, sent: Sent, now_s: float) -> None:
         """Remember what was put out."""
         earlier = self._sent
         if len(sent.times_s) > 1 or sent.times_s[0] > 0.0:
             same = earlier is not None and np.array_equal(earlier.index, sent.index)
             if earlier is not None and same:
-                sent = replace(sent, before=replace(earlier, before=None))
+                sent = replace(sent, before=earlier.since(now_s - RESPONSE_S))
         self._sent = sent
 
     # ---- corrected joints -----------------------------------------------------------------------

@@ -141,7 +141,8 @@ class CorrectionSession:
         self._guard.accept_order(TARGET, command.stamp_ns, now_s)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
-        self._corrector.note_sent(Sent(index, now_s, _AT_ONCE, command.position[None], out[None]))
+        sent = Sent(index, now_s, _AT_ONCE, command.position[None], out[None])
+        self._corrector.note_sent(sent, now_s)
         return corrected
 
     def _must_start(self, now_s: float) -> bool:
@@ -190,7 +191,7 @@ class CorrectionSession:
         out = corrected.position
         self._guard.note_output(TRAJECTORY, command.names, command.position, out)
         begin = now_s + starts_in_s
-        self._corrector.note_sent(Sent(index, begin, times, command.position, out))
+        self._corrector.note_sent(Sent(index, begin, times, command.position, out), now_s)
         self._streamed_s, self._goal = None, q[-1]
         return corrected
 
