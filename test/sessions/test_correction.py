@@ -557,7 +557,7 @@ def test_a_robot_that_moves_under_a_trajectory_is_taken_to_follow_it() -> None:
     robot.session.trajectory(straight(), robot.now)
     for t in np.arange(0.0, 1.0, 0.05):
         robot.now += 0.05
-        robot.read(at + 0.02 + 0.1 * t)
+        robot.read(at + 0.02 + 0.05 * t)
     out = robot.session.trajectory(still(HOME + 0.3, first_s=0.05), robot.now)
     assert np.abs(out.position[0] - HOME - 0.3).max() > 10 * FAR
 
