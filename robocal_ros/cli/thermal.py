@@ -8,13 +8,14 @@ from robocal_ros.cli.command import Command
 from robocal_ros.cli.output import Outcome
 
 NAME = "thermal"
-HELP = "place the sensor, identify a thermal drift, learn what drift to expect, screen"
+HELP = "place the sensor, identify a thermal drift, learn what drift to expect, screen, plan poses"
 
 ACTIONS = {
     "calibrate-sensor": "thermal_sensor",
     "identify": "thermal_identify",
     "learn-prior": "thermal_prior",
     "screen": "thermal_screen",
+    "plan-poses": "thermal_plan",
 }
 """Name of each action and its module."""
 

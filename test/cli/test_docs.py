@@ -27,7 +27,7 @@ def test_the_thermal_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.Monk
     make = [sys.executable, ROOT / "docs/examples/make_thermal.py", "out/thermal"]
     subprocess.run(make, check=True, env=environment())
     typed = commands("docs/thermal.md")
-    assert len(typed) == 4
+    assert len(typed) == 5
     for words in typed:
         done = robocal(*words)
         assert done.returncode == 0, (words, done.stderr)

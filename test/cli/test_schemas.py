@@ -26,6 +26,7 @@ delta_alpha = [ 0.0003, 0.0005, 0.0008, 0.0002, 0.0018, 0]
 PLACE = ["thermal", "calibrate-sensor", "--robot", ROBOT]
 DRIFT = ["thermal", "identify", "--robot", ROBOT, "--sensor", "s.yaml", "--cold", "cold.csv"]
 SCREEN = ["thermal", "screen", *DRIFT[2:]]
+PLAN = ["thermal", "plan-poses", "--robot", ROBOT, "--sensor", "s.yaml"]
 PRIOR = ["thermal", "learn-prior", *DRIFT[2:]]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
@@ -100,6 +101,12 @@ CASES = {
         [*SCREEN, "--warm", "shift.csv", "--check", "judges.csv"],
         [*SCREEN, "--warm", "warm.csv", "--check", "check.csv"],
         (3, "TOO_FEW_SAMPLES"),
+    ),
+    "thermal plan-poses": (
+        "thermal.plan.json",
+        [*PLAN, "--own", "sensor.csv", "--output", "planned.csv"],
+        [*PLAN, "--field-mm", "500,400,20000,19900,20100"],
+        (3, "LIMIT_EXCEEDED"),
     ),
     "import-ur": (
         "import-ur.json",

@@ -174,3 +174,17 @@ def test_screening_reports_every_round_and_draws_them(folder):
     best = max(row["share"] for row in document["rounds"] if row["share"] is not None)
     assert best > document["uncompensated"]
     assert (folder / "rounds.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_planned_poses_beat_random_and_own_ones(folder):
+    words = ["--robot", ROBOT, "--sensor", folder / "s.yaml", "--own", folder / "warm.csv"]
+    words += ["--working", folder / "check.csv", "--output", folder / "planned.csv"]
+    document = robocal_json("thermal.plan.json", "thermal", "plan-poses", *words)
+    assert len(document["poses"]) == 6
+    assert document["predicted_mm"] < document["random_mm"] < document["before_mm"]
+    assert document["gain"] > 0.0
+    rows = (folder / "planned.csv").read_text().splitlines()
+    assert rows[0] == "pose,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
+    assert len(rows) == 7
+    again = robocal_json("thermal.plan.json", "thermal", "plan-poses", *words)
+    assert again["poses"] == document["poses"]

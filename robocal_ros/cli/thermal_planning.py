@@ -1,0 +1,100 @@
+"""From files to planned poses: what ``robocal thermal plan-poses`` computes."""
+
+import argparse
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.cli.output import Document
+from robocal_ros.core import frames
+from robocal_ros.core.identification.cell import CellModel
+from robocal_ros.core.identification.solve import random_postures
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.thermal.pose_planning import (
+    Design,
+    PosePlan,
+    SensorField,
+    candidate_poses,
+    plan_poses,
+)
+from robocal_ros.core.thermal.priors import drift_prior
+from robocal_ros.storage.files import write_text
+from robocal_ros.storage.prior_files import read_prior
+from robocal_ros.storage.sensor_files import read_sensor
+from robocal_ros.storage.tables import read_measurements
+
+Array = NDArray[np.float64]
+
+COLD_VISITS = 3
+
+
+def plan_files(arm: SerialArm, args: argparse.Namespace) -> Document:
+    """Plan, compare, and write the poses.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        When a file cannot be read or belongs to another robot.
+    LimitError, TooFewSamplesError
+        When the sphere cannot be brought into the field often enough.
+    """
+    sensor = read_sensor(args.sensor, arm)
+    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
+    cell = CellModel(arm, sensor.T_sensor_base, ("sphere",), tool)
+    width, height, at, near, far = (1e-3 * x for x in args.field_mm)
+    rng = np.random.default_rng(args.seed)
+    field = SensorField(width, height, at, near, far)
+    candidates = candidate_poses(cell, field, args.candidates, rng)
+    working = random_postures(arm) if args.working is None else _joints(args.working, arm)
+    own = None if args.own is None else _joints(args.own, arm)
+    every = candidates if own is None else np.vstack([candidates, own])
+    prior = drift_prior(arm) if args.prior is None else read_prior(args.prior, arm)
+    sigma_m = args.sigma_mm * 1e-3
+    point = arm.T_flange_tool[:3, 3]
+    design = Design.of(cell, every, working, point, prior, sigma_m, COLD_VISITS)
+    plan = plan_poses(design.of_first(len(candidates)), candidates, args.poses, rng)
+    theirs = None if own is None else list(range(len(candidates), len(every)))
+    document = _document(arm, plan) | {
+        "working_poses": len(working),
+        "candidates": len(candidates),
+        "own_mm": None if theirs is None else design.error(theirs) * 1e3,
+        "own_poses": None if own is None else len(own),
+        "output": None,
+    }
+    if args.output is not None:
+        _write(args.output, document)
+        document["output"] = str(args.output)
+    return document
+
+
+def _joints(path: Path, arm: SerialArm) -> Array:
+    return read_measurements(path, arm).q
+
+
+def _document(arm: SerialArm, plan: PosePlan) -> Document:
+    unit = np.where(arm.prismatic, 1e3, np.degrees(1.0))
+    names = [f"q{i}_{'mm' if slides else 'deg'}" for i, slides in enumerate(arm.prismatic, 1)]
+    return {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "columns": names,
+        "poses": [
+            {"pose": f"p{i}", "joints": (q * unit).tolist()} for i, q in enumerate(plan.q, start=1)
+        ],
+        "predicted_mm": plan.predicted_rms_m * 1e3,
+        "random_mm": plan.random_rms_m * 1e3,
+        "before_mm": plan.before_rms_m * 1e3,
+        "gain": 1.0 - plan.predicted_rms_m / plan.random_rms_m,
+    }
+
+
+def _write(path: Path, document: Document) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["pose", *document["columns"]])
+    for pose in document["poses"]:
+        writer.writerow([pose["pose"], *(f"{value:.4f}" for value in pose["joints"])])
+    write_text(path, text.getvalue())
