@@ -4,11 +4,13 @@ Run as ``python history_workers.py NAME ARGUMENTS``. They fork from a process th
 imported and holds no connection, so that a round takes milliseconds.
 """
 
+import contextlib
 import json
 import os
 import random
 import resource
 import signal
+import sqlite3
 import sys
 import time
 import traceback
@@ -24,6 +26,7 @@ from robocal_ros.core.proposals import Proposal
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 SERIAL = "KR-7"
+_BEGUN = b"begun"
 
 
 def proposal(**changes: Any) -> Proposal:
@@ -93,6 +96,7 @@ def race(folder: Path, rounds: int) -> list[list[str]]:
     """Two processes accept at the same time; the outcome of each, by round.
 
     Even rounds: the same calibration; odd rounds: two of them with the expected revision.
+    The write lock is held until both have begun, so that neither can be through before the other.
     """
     ways = []
     for _ in range(2):
@@ -104,13 +108,19 @@ def race(folder: Path, rounds: int) -> list[list[str]]:
         os.close(answer)
         ways.append((child, ask, tell))
     outcomes = []
-    with CalibrationHistory.open(SERIAL, state_dir=folder) as history:
+    with (
+        CalibrationHistory.open(SERIAL, state_dir=folder) as history,
+        contextlib.closing(sqlite3.connect(history.path, isolation_level=None)) as gate,
+    ):
         for number in range(rounds):
             head = history.head().revision
             ids = [history.propose(proposal(based_on=head)) for _ in range(2)]
-            for place, (_, ask, _) in enumerate(ways):
+            gate.execute("BEGIN IMMEDIATE")
+            for place, (_, ask, tell) in enumerate(ways):
                 chosen = ids[place if number % 2 else 0]
                 os.write(ask, f"{chosen} {head}\n".encode())
+                os.read(tell, len(_BEGUN))
+            gate.execute("ROLLBACK")
             outcomes.append([os.read(tell, 100).decode() for _, _, tell in ways])
             if history.head().revision != head + 1:
                 raise RuntimeError(f"round {number}: {history.head()} after {head}")
@@ -127,6 +137,7 @@ def _answer(folder: Path, ask: int, tell: int) -> None:
     ):
         while (line := orders.readline()) != "stop\n":
             chosen, head = (int(word) for word in line.split())
+            os.write(tell, _BEGUN)
             try:
                 history.accept(chosen, by="racer", reason="", wall_ns=1, expected_head=head)
                 said = "done"

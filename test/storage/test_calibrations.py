@@ -354,8 +354,6 @@ class TestManyProcesses:
         outcomes = in_process("race", tmp_path, 200)
         assert len(outcomes) == 200
         assert all(sorted(outcome) == ["CONFLICT", "done"] for outcome in outcomes)
-        winners = {outcome.index("done") for outcome in outcomes}
-        assert winners == {0, 1}  # so both did race
 
     def test_many_open_a_new_history_at_once(self, tmp_path: Path) -> None:
         assert in_process("open_at_once", tmp_path, 10, 6) == [0] * 10
