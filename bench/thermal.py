@@ -18,8 +18,9 @@ from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
 from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.cycle_verdict import judge_cycle
 from robocal_ros.core.thermal.drift_history import DriftHistory, share_within
-from robocal_ros.core.thermal.identification import identify_cycle, judge_cycle
+from robocal_ros.core.thermal.identification import identify_cycle
 from robocal_ros.core.thermal.learning import learn_drift
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess

@@ -12,14 +12,10 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.thermal.cycle_verdict import judge_cycle
 from robocal_ros.core.thermal.documents import cycle_document, flange_sensor_document
 from robocal_ros.core.thermal.flange_identification import identify_and_judge_flange_sensor
-from robocal_ros.core.thermal.identification import (
-    CycleDrift,
-    identify_cycle,
-    identify_subset,
-    judge_cycle,
-)
+from robocal_ros.core.thermal.identification import CycleDrift, identify_cycle, identify_subset
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.spots import ColdSpots
 from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits, require_cold_counterparts

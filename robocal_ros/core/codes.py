@@ -24,3 +24,4 @@ class Code(IntEnum):
     BAD_INPUT = 11
     CONFLICT = 12
     STORAGE_FAILED = 13
+    SENSOR_OR_ROBOT_MOVED = 14

@@ -150,6 +150,8 @@ def reference_document(reference: ColdReference) -> Document:
         "position": data.position.tolist(),
         "target": list(data.target),
         "sample": list(data.sample),
+        "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
+        "fixed": reference.fixed.tolist(),
     }
 
 
@@ -161,10 +163,12 @@ def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
         tuple(document["targets"]),
         np.array(document["T_flange_target"]),
     )
+    stamps = document["stamp_ns"]
     data = Measurements(
         q=np.array(document["q"]),
         position=np.array(document["position"]),
         target=tuple(document["target"]),
         sample=tuple(document["sample"]),
+        stamp_ns=None if stamps is None else np.array(stamps, dtype=np.int64),
     )
-    return ColdReference(cell, data)
+    return ColdReference(cell, data, fixed=np.array(document["fixed"]).reshape(-1, 3))

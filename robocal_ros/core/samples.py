@@ -4,6 +4,7 @@ The builders accept any object with the attributes of the ROS message, so that l
 bag readers make the same samples from the same bytes.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ Array = NDArray[np.float64]
 DEFAULT_TARGET = "tool"
 CORRECTED = "robocal_corrected"  # frame_id of commands that carry a joint correction
 SPHERE_CLOUD = "sphere_cloud"
+REFERENCE_SPHERE = "reference_sphere_center"
 MEASURED_POINT = "measured_point"  # the input that a point comes from where nothing else is said
 TAUGHT = "robocal_taught"  # frame_id of joint states from which the correction was removed
 
@@ -107,6 +109,25 @@ class Measurements:
             "sample": np.array(self.sample),
             **{name: value for name, value in optional.items() if value is not None},
         }
+
+    @classmethod
+    def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "Measurements":
+        """Read back what ``arrays`` gave; other arrays may lie beside it."""
+        return cls(
+            q=arrays["q"],
+            position=arrays["position"],
+            target=tuple(arrays["target"].tolist()),
+            sample=tuple(arrays["sample"].tolist()),
+            **{name: arrays.get(name) for name in ("rotation", "sigma", "stamp_ns")},
+        )
+
+    @property
+    def middle_ns(self) -> int:
+        """Mean stamp; 0 without stamps."""
+        if self.stamp_ns is None or not len(self.stamp_ns):
+            return 0
+        first = int(self.stamp_ns.min())
+        return first + round(float(np.mean(self.stamp_ns - first)))
 
     def take(self, rows: NDArray[Any]) -> "Measurements":
         """Return the samples at ``rows`` (index or boolean mask)."""

@@ -9,9 +9,13 @@ from robocal_ros.core.codes import Code
 CONFIGURE = "configure"
 CAPTURE_REFERENCE = "capture_reference"
 IDENTIFY = "identify"
+BEGIN_CYCLE = "begin_cycle"
+END_CYCLE = "end_cycle"
 ACCEPT = "accept"
 REJECT = "reject"
 ROLLBACK = "rollback"
+CYCLE = (IDENTIFY, END_CYCLE)
+MEASURED = (IDENTIFY, END_CYCLE, CAPTURE_REFERENCE)  # wait for the last measurements
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ class Outcome:
     document : the identification, where one was made.
     calibration_id, revision : what was proposed or decided, and the revision now in force.
     outside : decided in the history by another process; nobody asked this session.
+    repeated : the answer of an earlier command, given again; nothing was done.
     """
 
     command: Command
@@ -54,6 +59,7 @@ class Outcome:
     revision: int = 0
     samples: int = 0
     outside: bool = False
+    repeated: bool = False
 
     @property
     def done(self) -> bool:

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from numpy.typing import NDArray
+
 from robocal_ros.core.proposals import Decision, Entry, Head, Proposal
 
 
@@ -48,6 +50,9 @@ class History(Protocol):
 
     def model(self, calibration_id: int) -> dict[str, Any]:
         """A calibration's model in full precision."""
+
+    def inputs(self, calibration_id: int) -> dict[str, NDArray[Any]]:
+        """The arrays that a calibration was solved from."""
 
     def data_version(self) -> Any:
         """A value that changes when the history does."""

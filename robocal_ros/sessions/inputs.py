@@ -4,7 +4,7 @@ from typing import Any
 
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.samples import cloud_sample, joint_sample, point_sample, pose_sample
-from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
+from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
 from robocal_ros.sessions.thermal import ThermalSession
 
 
@@ -16,7 +16,7 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
     try:
         if kind == JOINTS:
             session.add(joint_sample(message))
-        elif kind in (POINT, CENTRE):
+        elif kind in (POINT, CENTRE, FIXED):
             session.add(point_sample(message, session.config.target, kind))
         elif kind == CLOUD:
             session.add(cloud_sample(message, session.config.sphere, session.config.target))

@@ -1,7 +1,7 @@
 """One measured target with its joints, and many of them as arrays."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,36 @@ class Observation:
     def sigma_m(self) -> float:
         """Standard deviation of a coordinate from the measurement itself; 0 where not known."""
         return self.source.sigma_m if isinstance(self.source, PointSample) else 0.0
+
+
+def one_per_visit(observations: Sequence[Observation], same_rad: float) -> list[Observation]:
+    """Average what was measured of a target while the robot stood at one posture.
+
+    However often it was measured there, a visit shows the robot's repeatability once.
+    ``observations`` in order of their stamps; ``same_rad``: joints that move less stand still.
+    """
+    visits: list[dict[str, list[Observation]]] = []
+    first: Observation | None = None
+    for one in observations:
+        if first is None or np.max(np.abs(one.q - first.q)) > same_rad:
+            first = one
+            visits.append({})
+        visits[-1].setdefault(one.target, []).append(one)
+    return [_averaged(several) for visit in visits for several in visit.values()]
+
+
+def _averaged(several: Sequence[Observation]) -> Observation:
+    last = several[-1]
+    if len(several) == 1:
+        return last
+    position = np.mean([o.position for o in several], axis=0)
+    sigma_m = float(np.sqrt(np.mean([o.sigma_m**2 for o in several]) / len(several)))
+    return replace(
+        last,
+        q=np.mean([o.q for o in several], axis=0),
+        position=position,
+        source=PointSample(last.stamp_ns, last.frame, last.target, position, last.topic, sigma_m),
+    )
 
 
 def as_measurements(

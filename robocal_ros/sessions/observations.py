@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import (
     MEASURED_POINT,
+    REFERENCE_SPHERE,
     SPHERE_CLOUD,
     JointSample,
     PointSample,
@@ -27,7 +28,8 @@ POINT = MEASURED_POINT
 CENTRE = "sphere_center"
 CLOUD = SPHERE_CLOUD
 POSE = "measured_pose"
-MEASURING = (POINT, CENTRE, CLOUD, POSE)
+FIXED = REFERENCE_SPHERE  # a sphere fixed in the cell
+MEASURING = (POINT, CENTRE, CLOUD, POSE, FIXED)
 JUMPS = "clock_jumps"
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
@@ -257,6 +259,21 @@ class ObservationDesk:
             if observation.frame == self.frame:
                 once.setdefault((observation.stamp_ns, observation.target), observation)
         return list(once.values())
+
+    @property
+    def latest_ns(self) -> int:
+        """Stamp of the latest unused observation; 0 without."""
+        return max((o.stamp_ns for o in self.unused(self.from_ns)), default=0)
+
+    def unused(self, from_ns: int) -> list[Observation]:
+        """Observations from a stamp on that no command has used."""
+        return [o for o in self._observed if o.stamp_ns >= from_ns]
+
+    def last_run_ns(self, pause_ns: int) -> int:
+        """Stamp from which the unused observations follow each other without so long a pause."""
+        stamps = sorted(o.stamp_ns for o in self.unused(self.from_ns))
+        pauses = [i for i in range(1, len(stamps)) if stamps[i] - stamps[i - 1] > pause_ns]
+        return stamps[pauses[-1]] if pauses else self.from_ns
 
     def use(self, until_ns: int) -> None:
         """Drop observations up to a stamp: they were used."""

@@ -1,6 +1,6 @@
 """From the measurements of a command to a proposal in the history."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,18 @@ from robocal_ros.core.identification import Method, identify_and_hold_out
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Proposal
 from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.cycle_verdict import judge_cycle
 from robocal_ros.core.thermal.documents import cycle_document
-from robocal_ros.core.thermal.identification import identify_cycle, identify_subset, judge_cycle
+from robocal_ros.core.thermal.identification import identify_subset
 from robocal_ros.core.thermal.reference import ColdReference, capture_reference
+from robocal_ros.core.thermal.steps import FixedSphere, fixed_sphere
+from robocal_ros.sessions.drift_following import DriftFollower, Following
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE, InForce
 from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -43,7 +48,7 @@ class Proposer:
     Parameters
     ----------
     current : what is in force, followed by the session.
-    prior : (k, k) covariance of the expected drift, SI.
+    following : follows the drift since the cold reference in force.
     """
 
     def __init__(
@@ -53,24 +58,26 @@ class Proposer:
         config: ThermalConfig,
         software: str,
         current: InForce,
-        prior: NDArray[np.float64],
+        following: Following,
     ) -> None:
         self._nominal = nominal
         self._history = history
         self._config = config
         self._software = software
         self._current = current
-        self._prior = prior
+        self._following = following
 
-    def capture(self, command: Command, data: Measurements, wall_ns: int) -> Outcome:
+    def capture(self, command: Command, data: Measurements, fixed: Array, wall_ns: int) -> Outcome:
         """Make the cold reference of these measurements and bring it into force.
+
+        ``fixed``: centres (n, 3) of a sphere fixed in the cell, measured meanwhile, m.
 
         Raises
         ------
         RobocalError
             When they cannot be one, or the history refuses.
         """
-        reference = capture_reference(self._current.arm, data)
+        reference = replace(capture_reference(self._current.arm, data), fixed=fixed)
         rms_mm = summarise(reference.cell.residual(reference.used)).rms_m * 1e3
         message = (
             f"cold reference of {len(data)} measurements captured, residual {rms_mm:.3f} mm rms"
@@ -83,7 +90,9 @@ class Proposer:
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
         verdict = Verdict(Code.ACCEPT, message)
         model = reference_document(reference)
-        chosen = self._propose(REFERENCE, command, wall_ns, "lsq", verdict, document, model, data)
+        chosen = self._propose(
+            REFERENCE, command, wall_ns, "lsq", verdict, document, model, data.arrays()
+        )
         self._history.accept(
             chosen,
             by=str(command.arguments.get("by", "")),
@@ -108,45 +117,77 @@ class Proposer:
         raise InputError(f"method '{named}' is not one of {', '.join(METHODS)}")
 
     def identify(
-        self, command: Command, data: Measurements, method: Method, wall_ns: int
+        self, command: Command, data: Measurements, fixed: Array, method: Method, wall_ns: int
     ) -> Outcome:
         """Identify a model from these measurements, judge it and propose it.
+
+        ``fixed``: centres (n, 3) of a sphere fixed in the cell, measured meanwhile, m.
 
         Raises
         ------
         RobocalError
             When they cannot answer, or the history refuses.
         """
-        reference = self._current.reference
-        solution = (
-            self._calibration(data, method)
-            if reference is None
-            else self._drift(reference, data, method)
-        )
+        reference, follower = self._current.reference, self._following.follower
+        if reference is None or follower is None:
+            return self._keep(command, self._calibration(data, method), method, data, {}, wall_ns)
+        with follower.attempt():
+            solution = self._drift(follower, reference, data, fixed, method)
+            kept = follower.checkpoint()
+            return self._keep(command, solution, method, data, kept, wall_ns)
+
+    def _keep(
+        self,
+        command: Command,
+        solution: _Solution,
+        method: Method,
+        data: Measurements,
+        beside: dict[str, NDArray[Any]],
+        wall_ns: int,
+    ) -> Outcome:
+        verdict, inputs = solution.verdict, data.arrays() | beside
         cycle_id = str(command.arguments.get("cycle_id", ""))
         document = solution.document | {"stamp_ns": command.stamp_ns, "cycle_id": cycle_id}
-        verdict, model = solution.verdict, solution.model
-        chosen = self._propose(THERMAL, command, wall_ns, method, verdict, document, model, data)
+        chosen = self._propose(
+            THERMAL, command, wall_ns, method, verdict, document, solution.model, inputs
+        )
         return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
 
-    def _drift(self, reference: ColdReference, data: Measurements, method: Method) -> _Solution:
+    def _drift(
+        self,
+        follower: DriftFollower,
+        reference: ColdReference,
+        data: Measurements,
+        fixed: Array,
+        method: Method,
+    ) -> _Solution:
         """Since the cold visit, against the cold model: never a step on what is in force."""
-        config, spots = self._config, reference.spots
-        if method == "map":
-            found = identify_cycle(
-                spots, data, prior_covariance=self._prior, sigma_m=config.sigma_m
-            )
-        else:
+        config, spots, in_force = self._config, reference.spots, self._current.arm
+        tracked = follower.take(data, in_force, self._fixed(reference, fixed))
+        found, judged = tracked.found, tracked.judged
+        if method == "lsq" and not follower.state.moved:
             names = config.drift_parameters or self._nominal.parameters.names
             found = identify_subset(spots, data, names, sigma_m=config.sigma_m)
-        judged = judge_cycle(found, spots, in_force=self._current.arm, sigma_m=config.sigma_m)
+            judged = judge_cycle(found, spots, in_force=in_force, sigma_m=config.sigma_m)
         model = model_document(found.arm) | {
             "parameters": list(self._nominal.parameters.names),
             "covariance": found.covariance.tolist(),
             "reference_mdh": reference.cell.arm.mdh.tolist(),
+            "reference_stamp_ns": reference.data.middle_ns,
         }
-        document = cycle_document(found, judged, spots, self._nominal, method)
+        visited = spots.visited(data.q)
+        document = cycle_document(found, judged, spots, self._nominal, method) | {
+            "poses": {
+                "visited": len(visited),
+                "missing": [n for n in range(1, spots.poses + 1) if n not in visited],
+            }
+        }
         return _Solution(document, model, judged.verdict)
+
+    def _fixed(self, reference: ColdReference, now: Array) -> FixedSphere | None:
+        if not len(reference.fixed) or not len(now):
+            return None
+        return fixed_sphere(reference.fixed, now, self._config.sigma_m)
 
     def _calibration(self, data: Measurements, method: Method) -> _Solution:
         current = self._current
@@ -170,7 +211,7 @@ class Proposer:
         verdict: Verdict,
         document: dict[str, Any],
         model: dict[str, Any],
-        data: Measurements,
+        inputs: dict[str, NDArray[Any]],
     ) -> int:
         # What it was solved against, though another process may have decided meanwhile.
         head = self._current.head if kind == THERMAL else self._history.head(kind)
@@ -190,6 +231,6 @@ class Proposer:
                 candidate_rms_mm=held_out.get("rms_mm"),
                 document=document,
                 model=model,
-                inputs=data.arrays(),
+                inputs=inputs,
             )
         )

@@ -9,6 +9,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, WrongRobotError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Proposal
+from robocal_ros.sessions.drift_following import FollowerState
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
@@ -51,12 +52,17 @@ def session_as_recorded(
     arguments = configured.arguments
     try:
         model, reference, prior = arguments["model"], arguments["reference"], arguments["prior"]
+        tracker = arguments["tracker"]
     except KeyError as error:
         raise InputError(f"the recorded configuration lacks {error}") from error
-    if not history.list(1):
+    fresh = not history.list(1)
+    if fresh:
         _bring_into_force(history, THERMAL, nominal, model, software)
         _bring_into_force(history, REFERENCE, nominal, reference, software)
-    return ThermalSession(nominal, history, config_of(arguments), software, np.array(prior))
+    session = ThermalSession(nominal, history, config_of(arguments), software, np.array(prior))
+    if fresh and tracker is not None and session.follower is not None:
+        session.follower.go_on_from(FollowerState.of_document(tracker))
+    return session
 
 
 def _bring_into_force(

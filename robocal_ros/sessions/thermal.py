@@ -7,25 +7,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import reference_document
-from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
-from robocal_ros.core.samples import JointSample, Measurements, PointSample, PoseSample
+from robocal_ros.core.samples import JointSample, PointSample, PoseSample
 from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.sessions import events
+from robocal_ros.sessions.accuracy import Accuracy, accuracy_of
+from robocal_ros.sessions.cycles import TIME_OUT, CycleBook, ended
 from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.drift_following import DriftFollower, Following
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce, outside_decision
-from robocal_ros.sessions.observation import as_measurements
 from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk
 from robocal_ros.sessions.proposing import Proposer
 from robocal_ros.sessions.thermal_config import ThermalConfig, expected_drift
+from robocal_ros.sessions.windows import Windows
 
 __all__ = ["ThermalConfig", "ThermalSession"]
 
 SAME_CLOCK_NS = 1_000_000_000
+_NO_REFERENCE = "no cold reference: capture it before the first cycle"
 
 
 class ThermalSession:
@@ -37,6 +42,8 @@ class ThermalSession:
     Attributes
     ----------
     prior : (k, k) covariance of the expected drift, fixed for the life of the session.
+    cycle : the measuring cycle that is open.
+    windows : which measurements belong to a cycle.
     """
 
     def __init__(
@@ -56,7 +63,12 @@ class ThermalSession:
         self._queue: list[Command] = []
         self._current = InForce(history, nominal)
         self.prior = expected_drift(nominal, history, config) if prior is None else prior
-        self._proposer = Proposer(nominal, history, config, software, self._current, self.prior)
+        self.cycle = CycleBook()
+        self.windows = Windows(self.desk, self.cycle, self._current, config)
+        self._following = Following(history, self._current, self.prior, config.sigma_m)
+        self._proposer = Proposer(
+            nominal, history, config, software, self._current, self._following
+        )
 
     @property
     def in_force(self) -> Head:
@@ -105,9 +117,6 @@ class ThermalSession:
             newest = self.desk.clock_ns
             near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
             command = replace(command, stamp_ns=clock_ns if near else newest)
-        if command.name == events.IDENTIFY and not command.arguments.get("cycle_id"):
-            named = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
-            command = replace(command, arguments={**command.arguments, "cycle_id": named})
         self._queue.append(command)
 
     @property
@@ -130,7 +139,7 @@ class ThermalSession:
         """Carry out one command, as ``advance``: what was decided outside before it, and it."""
         if not self._queue or not (force or self._ready(self._queue[0])):
             return []
-        command = self._queue.pop(0)
+        command = self._named(self._queue.pop(0))
         outside = self.poll()
         if command.marks is None:
             command = self._marked(command)
@@ -140,11 +149,20 @@ class ThermalSession:
         ]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
 
+    def _named(self, command: Command) -> Command:
+        """Name a cycle: as the open one, else by its time."""
+        begins = command.name == events.BEGIN_CYCLE
+        if command.arguments.get("cycle_id") or not (begins or command.name in events.CYCLE):
+            return command
+        by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
+        name = by_time if begins else self.cycle.id or by_time
+        return replace(command, arguments={**command.arguments, "cycle_id": name})
+
     def _marked(self, command: Command) -> Command:
         """Return the command with the bounds of its samples, for the record."""
         marks, arguments = self.desk.marks, dict(command.arguments)
-        if command.name in (events.IDENTIFY, events.CAPTURE_REFERENCE):
-            arguments.setdefault("from_ns", self.desk.from_ns)
+        if command.name in events.MEASURED:
+            arguments.setdefault("from_ns", self.windows.from_ns(command))
         return replace(command, marks=marks, arguments=arguments)
 
     def _ready(self, command: Command) -> bool:
@@ -154,7 +172,7 @@ class ThermalSession:
             jumps = marks.pop(JUMPS, 0)
             reached = all(newest.get(topic, -1) >= stamp for topic, stamp in marks.items())
             return self.desk.jumps > jumps or (self.desk.jumps == jumps and reached)
-        if command.name not in (events.IDENTIFY, events.CAPTURE_REFERENCE):
+        if command.name not in events.MEASURED:
             return True
         wanted = (command.stamp_ns or 0) + int(self.config.lateness_s * 1e9)
         return newest.get(JOINTS, -1) >= wanted
@@ -163,6 +181,8 @@ class ThermalSession:
         handlers: dict[str, Callable[[Command, int], Outcome]] = {
             events.CAPTURE_REFERENCE: self._capture_reference,
             events.IDENTIFY: self._identify,
+            events.BEGIN_CYCLE: self._begin_cycle,
+            events.END_CYCLE: self._end_cycle,
             events.ACCEPT: self._decide,
             events.REJECT: self._decide,
             events.ROLLBACK: self._decide,
@@ -174,30 +194,67 @@ class ThermalSession:
         except RobocalError as error:
             return Outcome(command, error.code, str(error))
 
-    def _window(self, command: Command) -> Measurements:
-        self.desk.drop_far_ahead()
-        after = int(command.arguments.get("from_ns", self.desk.from_ns)) - 1
-        found = self.desk.window(after, command.stamp_ns or 0, command.marks or {})
-        last = int(command.arguments.get("samples", 0))
-        if not found:
-            raise TooFewSamplesError(self.desk.why_nothing())
-        drift = command.name == events.IDENTIFY and self.reference is not None
-        sigma_m = self.config.sigma_m if drift else None  # a calibration finds its noise itself
-        return as_measurements(found[-last:] if last else found, sigma_m)
-
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
-        outcome = self._proposer.capture(command, self._window(command), wall_ns)
-        self.desk.use(command.stamp_ns or 0)
+        data, fixed = self.windows.of(command)
+        outcome = self._proposer.capture(command, data, fixed, wall_ns)
+        self._close_cycle(command)
         return outcome
 
     def _identify(self, command: Command, wall_ns: int) -> Outcome:
         method = self._proposer.method(command)
-        outcome = self._proposer.identify(command, self._window(command), method, wall_ns)
-        self.desk.use(command.stamp_ns or 0)
+        data, fixed = self.windows.of(command)
+        outcome = self._proposer.identify(command, data, fixed, method, wall_ns)
+        self._close_cycle(command)
         return outcome
+
+    def _close_cycle(self, command: Command) -> None:
+        self.cycle.close()
+        self.desk.use(command.stamp_ns or 0)
+
+    def _begin_cycle(self, command: Command, wall_ns: int) -> Outcome:
+        if self.reference is None:
+            raise ConflictError(_NO_REFERENCE)
+        cycle_id, stamp_ns = str(command.arguments["cycle_id"]), command.stamp_ns or 0
+        going_on = self.cycle.id == cycle_id
+        message = self.cycle.begin(cycle_id, stamp_ns, self._history)
+        if not going_on:
+            self.desk.use(stamp_ns)
+        return Outcome(command, Code.ACCEPT, message, repeated=going_on)
+
+    def _end_cycle(self, command: Command, wall_ns: int) -> Outcome:
+        """Identify from the cycle; when that fails it stays open, unless its time has run out."""
+        cycle_id = str(command.arguments["cycle_id"])
+        if self.cycle.id != cycle_id:
+            if (before := ended(cycle_id, self._history)) is not None:
+                message = f"cycle '{cycle_id}' has ended already: {before.reason}"
+                return Outcome(command, before.code, message, None, before.id, repeated=True)
+            if self.cycle.id:
+                raise ConflictError(f"cycle '{self.cycle.id}' is open, not '{cycle_id}'")
+        if self.reference is None:
+            raise ConflictError(_NO_REFERENCE)
+        try:
+            return self._identify(command, wall_ns)
+        except RobocalError:
+            if command.arguments.get("by") == TIME_OUT:
+                self._close_cycle(command)
+            raise
+
+    def overdue(self) -> Command | None:
+        """The command that ends a cycle whose time has run out; None while there is none."""
+        idle = not self._queue and self.reference is not None
+        return self.windows.overdue() if idle else None
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
         return decide(self._history, command, self.in_force.revision, wall_ns)
+
+    @property
+    def follower(self) -> DriftFollower | None:
+        """What follows the drift since the cold reference; None without one."""
+        return self._following.follower
+
+    def accuracy(self, stamp_ns: int) -> Accuracy:
+        """How far the tool may be off at a stamp with the model in force."""
+        return accuracy_of(self._following, self._current, self.config, stamp_ns)
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""

@@ -35,6 +35,9 @@ class ThermalConfig:
     sigma_m : standard deviation of one measured coordinate in one visit of a pose.
     drift_parameters : what ``lsq`` solves of a drift; empty: all, which takes many poses.
     hold_out, seed : share of the poses kept to judge a calibration without reference.
+    cycle_timeout_s : a cycle ends when nothing was measured for so long.
+    tolerance_m, expires_after_s : error that the process allows, and age at which a measurement
+        says nothing any more.
     lateness_s : a command waits for joint readings this much newer, so that measurements
         under way still count.
     measuring_frame : frame of the measurements; empty: that of the first one used.
@@ -48,6 +51,9 @@ class ThermalConfig:
     drift_parameters: tuple[str, ...] = ()
     hold_out: float = 0.5
     seed: int = 0
+    cycle_timeout_s: float = 300.0
+    tolerance_m: float = 3e-4
+    expires_after_s: float = 8.0 * 3600.0
     lateness_s: float = 0.2
     measuring_frame: str = ""
     target: str = DEFAULT_TARGET

@@ -29,6 +29,7 @@ TYPES = {
     EVENTS: "robocal_msgs/msg/SessionEvent",
 }
 POSES = 8
+BETWEEN_S = 7200  # from visit to visit; a robot takes hours to warm up
 
 Sample = JointSample | PointSample
 
@@ -61,7 +62,7 @@ def shift() -> list[list[Sample]]:
     cold = true_arm()
     q = postures(cold, POSES, 21)
     parts = [(cold, q), (warmed(cold, 20.0), q), (warmed(cold, 30.0), q), (cold, q[:1])]
-    starts = [START_NS + i * (POSES + 4) * NS for i in range(len(parts))]
+    starts = [START_NS + i * BETWEEN_S * NS for i in range(len(parts))]
     return [
         list(visit(arm, poses, start_ns, seed))
         for seed, ((arm, poses), start_ns) in enumerate(zip(parts, starts, strict=True))
@@ -113,9 +114,12 @@ def recorded_bag(
             }
             bag.write(EVENTS, TYPES[EVENTS], content, now_ns)
 
-        if configure:
-            topics = {"joint_states": JOINTS, "measured_point": POINT}
-            record(configuration(session, topics), "{}", START_NS)
+        def configured(now_ns: int) -> None:
+            if configure:
+                topics = {"joint_states": JOINTS, "measured_point": POINT}
+                record(configuration(session, topics), "{}", now_ns)
+
+        configured(START_NS)
         asked = [
             Command(events.CAPTURE_REFERENCE, {"by": "night shift"}),
             Command(events.IDENTIFY, {"cycle_id": "one"}),
@@ -127,6 +131,7 @@ def recorded_bag(
                 session.add(sample)
                 for outcome in session.advance(wall_ns=7):
                     record(outcome.command, outcome_text(outcome), sample.stamp_ns + 5_000_000)
+                    configured(sample.stamp_ns + 6_000_000)
                     if outcome.document is not None:
                         documents.append(dict(outcome.document))
                     if outcome.command.arguments.get("cycle_id") == "one":

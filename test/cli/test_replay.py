@@ -11,6 +11,7 @@ import pytest
 from campaign import ROBOT, postures, true_arm
 from command import conforms, environment, robocal, robocal_json
 from recordings import (
+    BETWEEN_S,
     EVENTS,
     JOINTS,
     NS,
@@ -121,8 +122,8 @@ class TestRecordedSession:
             for recorded in read_bag(live[0]):
                 message = recorded.message
                 stamp = recorded.log_time_ns
-                if recorded.topic == POINT and stamp > START_NS + (POSES + 4) * NS:
-                    message.point.x += 1e-6 if stamp < START_NS + (POSES + 5) * NS else 0.0
+                if recorded.topic == POINT and stamp > START_NS + BETWEEN_S * NS:
+                    message.point.x += 1e-6 if stamp < START_NS + (BETWEEN_S + 1) * NS else 0.0
                 bag.write(recorded.topic, recorded.msgtype, message, stamp)
         status, document = replay(path)
         assert status == 0
@@ -140,7 +141,7 @@ class TestRecordedSession:
         self, live, folder: Path, replay
     ) -> None:
         """Only what came after the acceptance, and the latched configuration of that time."""
-        late_ns = START_NS + 2 * (POSES + 4) * NS + NS // 7
+        late_ns = START_NS + 2 * BETWEEN_S * NS + NS // 7
         path = folder / "late.mcap"
         state = folder / "late_state"
         _, whole = replay(live[0], "--state", state)
@@ -177,7 +178,7 @@ class TestRecordedSession:
         assert any("went on from there" in words for words in again["warnings"])
 
     def test_windows_instead_of_the_recorded_commands(self, live, replay) -> None:
-        second = POSES + 4
+        second = BETWEEN_S
         status, document = replay(live[0], "--cold", "0:9", "--warm", f"{second - 1}:{second + 9}")
         assert status == 0
         assert document["recorded"] is False
@@ -203,11 +204,11 @@ class TestWithoutEvents:
         names = [(entry["command"], entry["samples"]) for entry in document["commands"]]
         assert names[:3] == [("capture_reference", 8), ("identify", 8), ("identify", 8)]
         assert document["gaps"]["count"] >= 3
-        assert document["gaps"]["longest_s"] == pytest.approx(4.1, abs=0.01)
+        assert document["gaps"]["longest_s"] == pytest.approx(BETWEEN_S - POSES + 0.1, abs=0.01)
         assert document["topics"] == {"joint_states": JOINTS, "measured_point": POINT}
 
     def test_windows_give_the_same_as_auto(self, plain: Path, replay) -> None:
-        second, third = POSES + 4, 2 * (POSES + 4)
+        second, third = BETWEEN_S, 2 * BETWEEN_S
         windows = ["--cold", "0:9"]
         for start in (second, third):
             windows += ["--warm", f"{start}:{start + 9}"]
@@ -324,7 +325,7 @@ class TestDamage:
                 bag.write(topic, TYPES[topic], content, samples[where].stamp_ns)
             write_samples(bag, samples[where:])
         plain = plain_bag(folder / f"right_{where}.mcap", visits[:3])
-        windows = ("--robot", ROBOT, "--cold", "0:12", "--warm", "12:24")
+        windows = ("--robot", ROBOT, "--cold", "0:12", "--warm", f"{BETWEEN_S}:{BETWEEN_S + 12}")
         _, right = replay(plain, *windows)
         status, document = replay(path, *windows)
         assert status == 0
@@ -391,7 +392,15 @@ class TestDamage:
 
     def test_a_cold_window_without_measurements(self, plain: Path, replay) -> None:
         """No drift without its reference: the warm window must not pass for a calibration."""
-        status, document = replay(plain, "--robot", ROBOT, "--cold", "1000:1001", "--warm", "11:21")
+        status, document = replay(
+            plain,
+            "--robot",
+            ROBOT,
+            "--cold",
+            "1000:1001",
+            "--warm",
+            f"{BETWEEN_S}:{BETWEEN_S + 10}",
+        )
         assert status == 3
         assert document["error"]["code"] == "TOO_FEW_SAMPLES"
         assert document["verdict"]["accept"] is False

@@ -9,7 +9,8 @@ from drift_cell import SIGMA, cell_of, drifted, postures, visit
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.identification import identify_cycle, identify_subset, judge_cycle
+from robocal_ros.core.thermal.cycle_verdict import judge_cycle
+from robocal_ros.core.thermal.identification import identify_cycle, identify_subset
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.spots import ColdSpots
 from robocal_ros.storage.robots import load_robot

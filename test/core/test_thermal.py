@@ -10,12 +10,8 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, ResidualError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.identification import (
-    CycleDrift,
-    JudgedCycle,
-    identify_cycle,
-    judge_cycle,
-)
+from robocal_ros.core.thermal.cycle_verdict import JudgedCycle, judge_cycle
+from robocal_ros.core.thermal.identification import CycleDrift, identify_cycle
 from robocal_ros.core.thermal.priors import drift_prior, learned_prior
 from robocal_ros.core.thermal.reference import ColdReference, capture_reference
 from robocal_ros.storage.robots import load_robot

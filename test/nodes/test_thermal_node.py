@@ -53,7 +53,7 @@ def visits(nominal: Any) -> list[list[Any]]:
     """Cold and warm visits of the same poses."""
     shift = Shift(nominal.joint_names)
     cold, q = built(nominal), postures(nominal, POSES)
-    return [list(shift.visit(cold.with_mdh(warmed(cold, k).mdh), q)) for k in (0.0, 15.0, 20.0)]
+    return [list(shift.visit(warmed(cold, k), q, after_h=k / 7.5)) for k in (0.0, 15.0, 20.0)]
 
 
 def candidate(cell: Cell, visits: list[list[Any]]) -> int:

@@ -53,8 +53,9 @@ class Shift:
         self.now_ns = self.start_ns
         self.rng = np.random.default_rng(self.seed)
 
-    def visit(self, arm: SerialArm, q: np.ndarray) -> Iterator[Sample]:
-        """Go through the poses and measure once at each."""
+    def visit(self, arm: SerialArm, q: np.ndarray, after_h: float = 0.0) -> Iterator[Sample]:
+        """Go through the poses and measure once at each; a robot takes hours to warm up."""
+        self.now_ns += round(after_h * 3600.0 * NS)
         for target in q:
             yield from self._move(target)
             yield from self._rest(arm, target)

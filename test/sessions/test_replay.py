@@ -79,7 +79,11 @@ def visits(nominal):
     shift = Shift(nominal.joint_names)
     cold, q = built(nominal), postures(nominal, POSES)
     warm = warmed(cold)
-    parts = [list(shift.visit(arm, q)) for arm in (cold, warm, warmed(cold, 25.0))]
+    hot = warmed(cold, 25.0)
+    parts = [
+        list(shift.visit(arm, q, after_h))
+        for arm, after_h in ((cold, 0.0), (warm, 2.0), (hot, 2.0))
+    ]
     tail = list(shift.visit(warm, q[:1]))
     return [*parts, tail]
 

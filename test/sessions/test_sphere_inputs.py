@@ -31,7 +31,7 @@ def nominal() -> Any:
 def visits(nominal: Any) -> list[list[Any]]:
     shift = Shift(nominal.joint_names)
     cold, q = built(nominal), postures(nominal, POSES)
-    return [list(shift.visit(arm, q)) for arm in (cold, warmed(cold))]
+    return [list(shift.visit(cold, q)), list(shift.visit(warmed(cold), q, after_h=2.0))]
 
 
 def header(ns: int, frame: str = "sensor/ball") -> Message:

@@ -42,7 +42,7 @@ def visits(nominal):
     shift = Shift(nominal.joint_names)
     cold, q = built(nominal), postures(nominal, POSES)
     first = list(shift.visit(cold, q))
-    second = list(shift.visit(warmed(cold), q))
+    second = list(shift.visit(warmed(cold), q, after_h=2.0))
     tail = list(shift.visit(cold, q[:1]))
     return first, second, tail
 
@@ -364,7 +364,7 @@ def candidates(session: ThermalSession, nominal, count: int) -> list[Command]:
     todo = []
     for _ in range(count):
         begun_ns = shift.now_ns
-        run(session, shift.visit(warmed(cold), q), [])
+        run(session, shift.visit(warmed(cold), q, after_h=2.0), [])
         todo.append(Command(events.IDENTIFY, {"from_ns": begun_ns}, shift.now_ns))
     return todo
 

@@ -13,8 +13,9 @@ from robocal_ros.core.documents import (
     verdict_document,
 )
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.thermal.cycle_verdict import JudgedCycle
 from robocal_ros.core.thermal.flange_identification import JudgedFlangeSensor
-from robocal_ros.core.thermal.identification import CycleDrift, JudgedCycle
+from robocal_ros.core.thermal.identification import CycleDrift
 from robocal_ros.core.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict
 from robocal_ros.core.thermal.spots import ColdSpots
 

@@ -172,7 +172,7 @@ class Design:
         """
         none = np.zeros(len(candidates), dtype=np.int64)
         empty = np.zeros((len(candidates), 3))
-        spots = ColdSpots(cell, candidates, none, empty, none + visits)
+        spots = ColdSpots(cell, candidates, none, empty, none + visits, np.arange(len(none)))
         rows = np.concatenate(spots.rows(candidates, none), axis=2)
         rows = rows / (sigma_m * np.sqrt(1.0 + 1.0 / visits))
         size, k = rows.shape[2], len(prior)

@@ -1,9 +1,10 @@
 """The cold reference: base, targets and static errors, from one visit of the measuring poses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import LARGEST_RMS_M, summarise
 from robocal_ros.core.errors import ResidualError
@@ -13,6 +14,8 @@ from robocal_ros.core.identification.solve import identify
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.spots import ColdSpots
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -24,11 +27,13 @@ class ColdReference:
     cell : the cold model with base and targets as fitted to the cold visit.
     data : the cold measurements.
     rejected : names of those that did not fit the others.
+    fixed : (n, 3) centres of a sphere fixed in the cell, measured at the same visit, m; n may be 0.
     """
 
     cell: CellModel
     data: Measurements
     rejected: tuple[str, ...] = ()
+    fixed: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def used(self) -> Measurements:

@@ -1,6 +1,7 @@
 """The measuring poses of a cold reference, and what a warm visit shows against them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ class ColdSpots:
     target : (s,) index into the cell's targets.
     error : (s, 3) mean of predicted minus measured position, m; the arm's static errors.
     visits : (s,) how many cold measurements went into it.
+    first : (s,) the first of them.
     rejected : names of cold measurements that other visits of the same spot contradict.
     """
 
@@ -37,6 +39,7 @@ class ColdSpots:
     target: Index
     error: Array
     visits: Index
+    first: Index
     rejected: tuple[str, ...] = ()
 
     @classmethod
@@ -51,7 +54,32 @@ class ColdSpots:
         mean[spot[keep], np.flatnonzero(keep)] = 1.0 / visits[spot[keep]]
         first = np.array([int(np.flatnonzero(spot == s)[0]) for s in range(len(visits))])
         rejected = tuple(data.sample[i] for i in np.flatnonzero(~keep))
-        return cls(cell, mean @ data.q, target[first], mean @ error, visits, rejected)
+        return cls(cell, mean @ data.q, target[first], mean @ error, visits, first, rejected)
+
+    def knows(self, q: Array) -> NDArray[np.bool_]:
+        """Which joint readings (m, n) are those of a cold visit: all joints within 0.5 deg."""
+        away = np.max(np.abs(q[:, None] - self.q), axis=2)
+        return np.asarray(np.min(away, axis=1) < SAME_VISIT_RAD)
+
+    @cached_property
+    def _pose(self) -> Index:
+        """Number (s,) of each spot's pose, from 1 in the order of the cold visit."""
+        group = pose_groups(self.q)
+        first = [int(self.first[group == g].min()) for g in range(int(group.max()) + 1)]
+        return np.asarray(1 + np.argsort(np.argsort(first))[group], dtype=np.int64)
+
+    @property
+    def poses(self) -> int:
+        """How many poses were visited cold."""
+        return int(self._pose.max())
+
+    def visited(self, q: Array) -> tuple[int, ...]:
+        """Numbers of the cold poses, from 1 in their order, that joint readings (m, n) are at."""
+        if not len(q):
+            return ()
+        away = np.max(np.abs(q[:, None] - self.q), axis=2)
+        near = np.argmin(away, axis=1)[np.min(away, axis=1) < SAME_VISIT_RAD]
+        return tuple(np.unique(self._pose[near]).tolist())
 
     def match(self, warm: Measurements) -> Index:
         """The spot (m,) that each warm measurement visits again: all joints within 0.5 deg.

@@ -34,7 +34,7 @@ class TrackerState:
     covariance: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Innovation:
     """What a cycle brought against what was expected.
 
@@ -43,16 +43,18 @@ class Innovation:
     squared, freedom : normalised square of the innovation, and its degrees of freedom.
     limit : the square above which a cycle is not applied.
     applied : whether it was.
-    rejected : names of the samples that do not fit the others.
-    log_likelihood : of the samples in use.
+    kept : (m,) samples that agree with the others.
+    deviation, covariance : (3m,) measured less expected displacement, m, and (3m, 3m) what the
+        tracker expected of it.
     """
 
     squared: float
     freedom: int
     limit: float
     applied: bool
-    rejected: tuple[str, ...]
-    log_likelihood: float
+    kept: NDArray[np.bool_]
+    deviation: Array
+    covariance: Array
 
 
 class DriftTracker:
@@ -128,12 +130,11 @@ class DriftTracker:
             When the cycle is older than the last one.
         """
         state = self.at(time_s)
-        y, H, R = self._observation(cycle)
-        keep = agreeing(y - H @ state.mean, H @ state.covariance @ H.T + R, len(cycle))
+        y, H, R = self.observation(cycle)
+        deviation, expected = y - H @ state.mean, H @ state.covariance @ H.T + R
+        keep = agreeing(deviation, expected, len(cycle))
         rows = np.repeat(keep, 3)
-        v = (y - H @ state.mean)[rows]
-        PH = state.covariance @ H[rows].T
-        S = H[rows] @ PH + R[np.ix_(rows, rows)]
+        v, PH, S = deviation[rows], state.covariance @ H[rows].T, expected[np.ix_(rows, rows)]
         squared = float(v @ np.linalg.solve(S, v))
         limit = chi2_quantile(1.0 - FALSE_ALARM, len(v))
         applied = squared <= limit and np.mean(keep) >= FEWEST_SHARE
@@ -146,11 +147,12 @@ class DriftTracker:
             freedom=len(v),
             limit=limit,
             applied=bool(applied),
-            rejected=tuple(cycle.sample[i] for i in np.flatnonzero(~keep)),
-            log_likelihood=-0.5 * (squared + float(np.linalg.slogdet(2.0 * np.pi * S)[1])),
+            kept=keep,
+            deviation=deviation,
+            covariance=expected,
         )
 
-    def _observation(self, cycle: Measurements) -> tuple[Array, Array, Array]:
+    def observation(self, cycle: Measurements) -> tuple[Array, Array, Array]:
         """Drift of the spots (3m,), its rows (3m, d) in the state, and its noise (3m, 3m)."""
         spots, k, m = self.spots, self.count, len(cycle)
         spot = spots.match(cycle)
@@ -161,7 +163,3 @@ class DriftTracker:
         H[np.arange(m)[:, None], np.arange(3), columns] = -1.0
         sigma = np.full(m, self.sigma_m) if cycle.sigma is None else cycle.sigma
         return spots.drift(cycle).ravel(), H.reshape(3 * m, -1), np.diag(np.repeat(sigma**2, 3))
-
-    def with_process(self, process: DriftProcess) -> "DriftTracker":
-        """The tracker of the same reference, at its start, with another process."""
-        return DriftTracker(self.spots, process, self.sigma_m, self.state.time_s)

@@ -1,0 +1,98 @@
+"""How far the tool may be off by now, and when that is too much: from the tracker, at any time."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.descent import chi2_quantile
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.thermal.cycle_verdict import workspace_rows
+from robocal_ros.core.thermal.tracking import DriftTracker
+
+Array = NDArray[np.float64]
+
+HORIZON_S = 24.0 * 3600.0
+DUE_WITHIN_S = 1.0  # to which the time that is left is found
+
+
+class AccuracyLevel(IntEnum):
+    """Numbers of ``AccuracyState.msg``; 0 is never sent."""
+
+    OK = 1
+    DUE = 2
+    DEGRADED = 3
+    EXPIRED = 4
+    FAULT = 5
+
+
+@dataclass(frozen=True)
+class ToolError:
+    """Expected error of the tool throughout the workspace, m.
+
+    Attributes
+    ----------
+    rms_m : root mean square length.
+    bound_m : 95 % of the errors are shorter.
+    """
+
+    rms_m: float
+    bound_m: float
+
+
+class AccuracyForecast:
+    """Expected error of a model in force, from what the tracker knows.
+
+    Parameters
+    ----------
+    in_force : an arm of the cold model's type.
+    """
+
+    def __init__(self, tracker: DriftTracker, in_force: SerialArm) -> None:
+        cold = tracker.spots.cell.arm
+        self._tracker = tracker
+        self._in_force = cold.parameters.read(in_force.mdh - cold.mdh)
+
+    @cached_property
+    def _rows(self) -> Array:
+        return workspace_rows(self._tracker.spots)
+
+    def at(self, time_s: float) -> ToolError:
+        """Expected error at a time of the tracker's.
+
+        At one posture the squared length of a Gaussian error of mean m and covariance C has mean
+        m'm + tr C and variance 4 m'Cm + 2 tr C^2; over all postures it is taken for a scaled
+        chi-square of the same two moments (Satterthwaite 1946).
+        """
+        drift, covariance = self._tracker.drift(time_s)
+        rows = self._rows
+        miss = rows @ (drift - self._in_force)
+        C = rows @ covariance @ rows.transpose(0, 2, 1)
+        mean = np.einsum("pi,pi->p", miss, miss) + np.trace(C, axis1=1, axis2=2)
+        variance = 4.0 * np.einsum("pi,pij,pj->p", miss, C, miss)
+        variance += 2.0 * np.einsum("pij,pij->p", C, C)
+        all_mean = float(mean.mean())
+        all_variance = float(np.mean(variance + mean**2)) - all_mean**2
+        scale, freedom = all_variance / (2.0 * all_mean), 2.0 * all_mean**2 / all_variance
+        bound = scale * chi2_quantile(0.95, freedom)
+        return ToolError(float(np.sqrt(all_mean)), float(np.sqrt(bound)))
+
+    def due_in_s(self, time_s: float, tolerance_m: float) -> float:
+        """Time from ``time_s`` until the bound exceeds a tolerance: zero where it does already.
+
+        At most a day, which stands for longer.
+        """
+        if self.at(time_s).bound_m > tolerance_m:
+            return 0.0
+        late, early = HORIZON_S, 0.0
+        if self.at(time_s + late).bound_m <= tolerance_m:
+            return late
+        while late - early > DUE_WITHIN_S:
+            middle = 0.5 * (early + late)
+            if self.at(time_s + middle).bound_m > tolerance_m:
+                late = middle
+            else:
+                early = middle
+        return early

@@ -1,0 +1,137 @@
+"""Is the model that a cycle gives better than the one in force, in mm, throughout the workspace?"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
+from robocal_ros.core.identification.solve import random_postures
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.identification import CycleDrift, visit_variance
+from robocal_ros.core.thermal.spots import ColdSpots
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JudgedCycle:
+    """A cycle's drift with its figures on measurements that were not used to solve.
+
+    Attributes
+    ----------
+    cold, current, candidate : errors of the cold model, of the one in force and of the
+        identified one.
+    predicted_rms_m, predicted_total_rms_m : the candidate's error expected from its covariance,
+        alone and with the noise of both visits.
+    workspace_rms_m : the same as the first over postures throughout the joint limits.
+    """
+
+    cold: ErrorSummary
+    current: ErrorSummary
+    candidate: ErrorSummary
+    predicted_rms_m: float
+    predicted_total_rms_m: float
+    workspace_rms_m: float
+    held_out_rejected: tuple[str, ...]
+    verdict: Verdict
+
+    def with_verdict(self, verdict: Verdict) -> "JudgedCycle":
+        """Return the same figures with another verdict."""
+        return replace(self, verdict=verdict)
+
+
+def judge_cycle(
+    found: CycleDrift,
+    spots: ColdSpots,
+    *,
+    in_force: SerialArm,
+    check: Measurements | None = None,
+    sigma_m: float,
+) -> JudgedCycle:
+    """Judge at the poses of ``check``, else at each pose of the cycle from the others.
+
+    ``in_force`` is an arm of the cold model's type. A drift that the cycle's poses do not show
+    throughout the workspace is refused, whatever the poses themselves say.
+    """
+    data = found.warm if check is None else check
+    spot = spots.match(data)
+    y = spots.drift(data)
+    A = spots.rows(data.q, spots.target[spot])[0]
+    chosen, cold = spots.cell.arm.parameters, spots.cell.arm
+    current = np.linalg.norm(y - A @ chosen.read(in_force.mdh - cold.mdh), axis=1)
+    if check is None:
+        after, spread = np.linalg.norm(found.left_out, axis=1), found.left_out_sigma
+        usable = ~found.rejected
+    else:
+        after = np.linalg.norm(y - A @ found.drift, axis=1)
+        noise = 3.0 * visit_variance(spots, spot, data, sigma_m)
+        spread = np.sqrt(np.einsum("mik,kl,mil->m", A, found.covariance, A) + noise)
+        usable = np.ones(len(data), dtype=np.bool_)
+    return conclude(
+        found, spots, data, in_force, after=after, current=current, spread=spread, usable=usable
+    )
+
+
+def conclude(
+    found: CycleDrift,
+    spots: ColdSpots,
+    data: Measurements,
+    in_force: SerialArm,
+    *,
+    current: Array,
+    after: Array,
+    spread: Array,
+    usable: NDArray[np.bool_],
+) -> JudgedCycle:
+    """Judge from the errors (m,) of the model in force and of the candidate at ``data``.
+
+    ``spread`` (m,) is what the covariances expect of ``after``; ``usable`` (m,) what may judge.
+    """
+    chosen, cold, spot = spots.cell.arm.parameters, spots.cell.arm, spots.match(data)
+    A = spots.rows(data.q, spots.target[spot])[0]
+    sound = usable & ~gross(current, after)
+    rows = workspace_rows(spots)
+    moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
+    change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    doubt = _doubt(found, rows, summarise(current[sound]).rms_m, change)
+    return JudgedCycle(
+        cold=summarise(np.linalg.norm(spots.drift(data), axis=1)[sound]),
+        current=summarise(current[sound]),
+        candidate=summarise(after[sound]),
+        predicted_rms_m=_rms(A, found.covariance),
+        predicted_total_rms_m=float(np.sqrt(np.mean(spread[sound] ** 2))),
+        workspace_rms_m=_rms(rows, found.covariance),
+        held_out_rejected=tuple(data.sample[i] for i in np.flatnonzero(~sound)),
+        verdict=judge(current[sound], after[sound], spot[sound], doubt),
+    )
+
+
+def _doubt(found: CycleDrift, rows: Array, current_rms_m: float, change_m: float) -> str:
+    """Say why the poses do not carry over to the workspace; empty when they do.
+
+    Poses that halve the prior's error there do, however small the change: the model in force came
+    from such poses too and is no better known elsewhere.
+    """
+    error = _rms(rows, found.covariance)
+    prior = found.prior_covariance
+    if prior is not None and error <= 0.5 * _rms(rows, prior):
+        return ""
+    if error <= max(2.0 * current_rms_m, change_m / np.sqrt(3.0)):
+        return ""
+    return (
+        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
+        f"for a change of {change_m * 1e3:.3f} mm: spread them and turn every joint, the wrist too"
+    )
+
+
+def _rms(rows: Array, covariance: Array) -> float:
+    """Rms length, m, of what a covariance (k, k) does to points with rows (m, 3, k)."""
+    return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+
+
+def workspace_rows(spots: ColdSpots) -> Array:
+    """Displacement (p, 3, k) of the first target by the parameters, throughout the joint limits."""
+    q = random_postures(spots.cell.arm)
+    return spots.rows(q, np.zeros(len(q), dtype=np.int64))[0]
