@@ -31,7 +31,6 @@ from robocal_ros.cli.main import main
 from robocal_ros.core.samples import JointSample
 from robocal_ros.storage.bag_writer import ros_time
 from robocal_ros.storage.bags import BagWriter, read_bag
-from robocal_ros.storage.calibrations import CalibrationHistory
 
 
 @pytest.fixture(scope="module")
@@ -143,20 +142,18 @@ class TestRecordedSession:
         """Only what came after the acceptance, and the latched configuration of that time."""
         late_ns = START_NS + 2 * BETWEEN_S * NS + NS // 7
         path = folder / "late.mcap"
-        state = folder / "late_state"
-        _, whole = replay(live[0], "--state", state)
-        with CalibrationHistory.open("live", state_dir=state) as history:
-            model, reference = history.head().model, history.head("reference").model
+        _, whole = replay(live[0])
+        early = [
+            recorded
+            for recorded in read_bag(live[0])
+            if recorded.topic == EVENTS and recorded.log_time_ns < late_ns
+        ]
+        assert early[-1].message.command == "configure"
         with BagWriter(path) as bag:
+            bag.write(EVENTS, early[-1].msgtype, early[-1].message, late_ns)
             for recorded in read_bag(live[0]):
-                message, stamp = recorded.message, recorded.log_time_ns
-                if recorded.topic == EVENTS and message.command == "configure":
-                    record = json.loads(message.arguments)
-                    record["arguments"] |= {"model": model, "reference": reference}
-                    message.arguments = json.dumps(record)
-                    bag.write(recorded.topic, recorded.msgtype, message, late_ns)
-                elif stamp >= late_ns:
-                    bag.write(recorded.topic, recorded.msgtype, message, stamp)
+                if (stamp := recorded.log_time_ns) >= late_ns:
+                    bag.write(recorded.topic, recorded.msgtype, recorded.message, stamp)
         status, document = replay(path)
         assert status == 0
         assert document["differs"] == []
