@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Transform
-from robocal_msgs.msg import CalibrationQuality, CalibrationSummary, KinematicModel, SessionEvent
+from robocal_msgs.msg import (
+    AccuracyState,
+    CalibrationQuality,
+    CalibrationSummary,
+    KinematicModel,
+    SessionEvent,
+)
 from std_msgs.msg import Header
 
 from robocal_ros.core import frames
@@ -15,6 +21,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics.parameters import COLUMNS
 from robocal_ros.core.proposals import Entry
+from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
 
@@ -112,6 +119,35 @@ def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header)
     message.rejected = list(document["rejected"])
     _require_finite("quality", [message.predicted_rms_mm, message.condition])
     return message
+
+
+def accuracy_message(
+    found: Accuracy, tolerance_m: float, *, robot: str, serial: str, stamp: Header
+) -> AccuracyState:
+    """How accurate the robot is believed to be; -1 where the error is not known.
+
+    Raises
+    ------
+    InputError
+        When a figure is not finite.
+    """
+    rms_mm, bound_mm = (
+        (-1.0, -1.0)
+        if found.error is None
+        else (found.error.rms_m * 1e3, found.error.bound_m * 1e3)
+    )
+    _require_finite("accuracy", [rms_mm, bound_mm, found.due_in_s])
+    return AccuracyState(
+        header=stamp,
+        robot=robot,
+        serial=serial,
+        state=int(found.level),
+        predicted_error_mm=rms_mm,
+        bound_mm=bound_mm,
+        tolerance_mm=tolerance_m * 1e3,
+        due_in_s=found.due_in_s,
+        reason=found.reason,
+    )
 
 
 def _set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:

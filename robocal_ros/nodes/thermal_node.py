@@ -6,26 +6,25 @@ from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PointStamped, PoseStamped
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from robocal_msgs.msg import CalibrationQuality, KinematicModel, SessionEvent
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.identification import require_parameters
-from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.thermal_outputs import ThermalOutputs
 from robocal_ros.nodes.thermal_services import ThermalServices
 from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
-from robocal_ros.sessions.events import IDENTIFY, Command, Outcome
+from robocal_ros.sessions.events import CYCLE, Command, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
+from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
 from robocal_ros.sessions.records import configuration
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -33,11 +32,13 @@ from robocal_ros.storage.robots import load_robot
 
 NO_SERIAL = "unset"
 POLL_S = 0.5
+ACCURACY_S = 1.0
 INPUTS = {
     JOINTS: JointState,
     POINT: PointStamped,
     CENTRE: PointStamped,
     CLOUD: PointCloud2,
+    FIXED: PointStamped,
     POSE: PoseStamped,
 }
 
@@ -45,13 +46,22 @@ INPUTS = {
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT
 )
-# A recorder that comes later still gets the events.
-EVENTS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+
+
+class DataClock:
+    """The samples' clock, read between them too: ROS time runs on where they pause."""
+
+    def __init__(self) -> None:
+        self._newest_ns: int | None = None
+        self._read_ns = 0
+
+    def at(self, newest_ns: int | None, now_ns: int) -> int:
+        """Time of the samples' clock at ROS time ``now_ns``; that itself before the first."""
+        if newest_ns is None:
+            return now_ns
+        if newest_ns != self._newest_ns:
+            self._newest_ns, self._read_ns = newest_ns, now_ns
+        return newest_ns + max(now_ns - self._read_ns, 0)
 
 
 class ThermalNode(HouseNode):
@@ -68,7 +78,6 @@ class ThermalNode(HouseNode):
     def configure(self) -> None:
         """Open the history, then the topics and services."""
         self._asked: deque[Future] = deque()
-        self._sequence = 0
         self._shown: tuple[Any, ...] = ()
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
@@ -80,16 +89,17 @@ class ThermalNode(HouseNode):
             model_hash=self._nominal.model_hash,
             state_dir=Path(folder) if folder else None,
         )
-        self._candidate = self.add_output(KinematicModel, "~/candidate", qos.LATCHED)
-        self._model = self.add_output(KinematicModel, "~/model", qos.LATCHED)
-        self._quality = self.add_output(CalibrationQuality, "~/quality", qos.LATCHED)
-        self._events = self.add_output(SessionEvent, "~/session_events", EVENTS)
+        self._outputs = ThermalOutputs(
+            self.add_output, self._nominal, self._serial_in_use, settings["base_frame"]
+        )
+        self._data_clock = DataClock()
         self._guard = SourceGuard(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, message_type in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), STREAM)
         ThermalServices(self.add_service, self._ask, self._history)
         self.add_timer(POLL_S, self._poll, steady=True)
+        self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
         self._deadline = self.add_timer(settings["command_timeout_s"], self._force, steady=True)
         self._deadline.cancel()
 
@@ -167,10 +177,17 @@ class ThermalNode(HouseNode):
 
     def _poll(self) -> None:
         self._guard.look()
-        if self._session is not None:
-            for outcome in self._session.poll():
+        session = self._session
+        if session is None:
+            return
+        try:
+            for outcome in session.poll():
                 self._show(outcome)
             self._show_in_force()
+            if (command := session.overdue()) is not None:
+                self._ask(command)
+        except RobocalError as error:  # the history cannot be read: tried again at the next poll
+            self.get_logger().error(str(error), throttle_duration_sec=5.0)
 
     # ---- outputs --------------------------------------------------------------------------------
 
@@ -181,9 +198,10 @@ class ThermalNode(HouseNode):
         else:
             self.get_logger().warning(words)
         try:
-            self._publish_event(outcome.command, outcome)
-            if outcome.command.name == IDENTIFY:
-                self._show_candidate(outcome)
+            if not outcome.repeated:
+                self._outputs.event(outcome.command, outcome)
+                if outcome.command.name in CYCLE:
+                    self._show_candidate(outcome)
             self._show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{outcome.command.name} was done but not published: {error}")
@@ -191,47 +209,35 @@ class ThermalNode(HouseNode):
     def _show_candidate(self, outcome: Outcome) -> None:
         if self._session is None or self._history is None:
             return
-        stamp, frame = outcome.command.stamp_ns or 0, self._session.desk.frame or ""
-        self._quality.publish(
-            conversions.quality_message(
-                outcome,
-                robot=self._nominal.name,
-                serial=self._serial_in_use,
-                stamp=conversions.header(stamp, frame),
-            )
-        )
+        self._outputs.quality(outcome, self._session.desk.frame or "")
         if outcome.calibration_id:
             model = self._history.model(outcome.calibration_id)
-            self._candidate.publish(self._message(model, 0, KinematicModel.CANDIDATE, stamp))
+            self._outputs.candidate(model, outcome.command.stamp_ns or 0)
 
     def _show_in_force(self) -> None:
         """Publish the model in force and record the new state, when either changed."""
         session, history = self._session, self._history
         if session is None or history is None:
             return
-        head, reference = session.in_force, session.reference_id
-        if self._shown == (head.revision, reference):
+        head, follower = session.in_force, session.follower
+        cycles = 0 if follower is None else follower.state.cycles
+        shown = (head.revision, session.reference_id, cycles)
+        if self._shown == shown:
             return
-        if self._shown[:1] != (head.revision,):
+        if self._shown[:1] != shown[:1]:
             stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
             model = model_document(self._nominal) if head.model is None else head.model
-            self._model.publish(self._message(model, head.revision, KinematicModel.ACCEPTED, stamp))
-        self._shown = (head.revision, reference)
-        self._publish_event(configuration(session, self._topics), None)
+            self._outputs.model(model, head.revision, stamp)
+        self._shown = shown
+        self._outputs.event(configuration(session, self._topics), None)
 
-    def _message(self, model: Any, revision: int, state: int, stamp_ns: int) -> KinematicModel:
-        return conversions.kinematic_model(
-            model,
-            serial=self._serial_in_use,
-            model_hash=self._nominal.model_hash,
-            revision=revision,
-            state=state,
-            stamp=conversions.header(stamp_ns, self.settings["base_frame"]),
-        )
-
-    def _publish_event(self, command: Command, outcome: Outcome | None) -> None:
-        self._sequence += 1
-        self._events.publish(conversions.event_message(command, outcome, self._sequence))
+    def _show_accuracy(self) -> None:
+        if self._session is None:
+            return
+        newest = self._session.desk.newest_ns.get(JOINTS)
+        stamp_ns = self._data_clock.at(newest, self.now_ns())
+        found = self._session.accuracy(stamp_ns)
+        self._outputs.accuracy(found, self._session.config.tolerance_m, stamp_ns)
 
     def health(self) -> Health:
         """Tell what is in force, what waits, what was lost or ignored, what is wrong."""
@@ -245,6 +251,9 @@ class ThermalNode(HouseNode):
         except RobocalError as error:
             health.worsen(ERROR, str(error))
         values["cold reference"] = "captured" if session.reference_id else "none"
+        visited, poses = session.windows.progress()
+        named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
+        values["cycle"] = f"{named}{visited} of {poses} poses measured"
         values["joint gaps"] = session.desk.stream.gap_count
         ignored = session.desk.ignored
         for topic, reasons in ignored.items():

@@ -4,7 +4,14 @@ import json
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any
 
-from robocal_msgs.srv import CaptureReference, Decide, Identify, ListCalibrations
+from robocal_msgs.srv import (
+    BeginCycle,
+    CaptureReference,
+    Decide,
+    EndCycle,
+    Identify,
+    ListCalibrations,
+)
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
@@ -13,7 +20,9 @@ from robocal_ros.nodes.conversions import summary_message, trigger_text
 from robocal_ros.sessions.decisions import NEWEST, ONLY
 from robocal_ros.sessions.events import (
     ACCEPT,
+    BEGIN_CYCLE,
     CAPTURE_REFERENCE,
+    END_CYCLE,
     IDENTIFY,
     REJECT,
     ROLLBACK,
@@ -43,7 +52,11 @@ class ThermalServices:
         self._history = history
         add(CaptureReference, "~/capture_reference", self._capture_reference)
         add(Identify, "~/identify", self._identify)
+        add(BeginCycle, "~/begin_cycle", self._begin_cycle)
+        add(EndCycle, "~/end_cycle", self._end_cycle)
         add(ListCalibrations, "~/list", self._list)
+        add(Trigger, "~/begin_cycle_trigger", self._twin(BEGIN_CYCLE, {}))
+        add(Trigger, "~/end_cycle_trigger", self._twin(END_CYCLE, {}))
         add(Trigger, "~/capture_reference_trigger", self._twin(CAPTURE_REFERENCE, {}))
         add(Trigger, "~/identify_trigger", self._twin(IDENTIFY, {}))
         add(Trigger, "~/list_trigger", self._list_twin)
@@ -68,6 +81,23 @@ class ThermalServices:
         response.candidate_id = outcome.calibration_id
         _answer(response, outcome)
         response.success = outcome.calibration_id > 0
+        return response
+
+    async def _begin_cycle(self, request: Any, response: Any) -> Any:
+        outcome = await self._ask(Command(BEGIN_CYCLE, {"cycle_id": request.cycle_id}))
+        response.cycle_id = str(outcome.command.arguments["cycle_id"])
+        return _answer(response, outcome)
+
+    async def _end_cycle(self, request: Any, response: Any) -> Any:
+        outcome = await self._ask(Command(END_CYCLE, {"cycle_id": request.cycle_id}))
+        response.cycle_id = str(outcome.command.arguments["cycle_id"])
+        response.candidate_id = outcome.calibration_id
+        known = outcome.calibration_id > 0
+        poses = self._history.document(outcome.calibration_id).get("poses", {}) if known else {}
+        response.visited = poses.get("visited", 0)
+        response.missing = poses.get("missing", [])
+        _answer(response, outcome)
+        response.success = known
         return response
 
     def _decide(self, name: str) -> Callable[[Any, Any], Any]:

@@ -31,7 +31,7 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.diagnostics import Health
-from robocal_ros.nodes.thermal_node import EVENTS
+from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.replay import input_topics, read_events, replay
 from robocal_ros.sessions.thermal import ThermalSession
@@ -101,7 +101,8 @@ def test_a_cycle_from_measurement_to_force(graph, visits, nominal):
     assert (listed[0].by, listed[0].reason) == ("me", "good")
     assert [e.sequence for e in cell.events] == list(range(1, len(cell.events) + 1))
     assert [e.command for e in cell.events] == [
-        "configure", "capture_reference", "configure", "identify", "accept", "configure",
+        "configure", "capture_reference", "configure", "identify", "configure", "accept",
+        "configure",
     ]  # fmt: skip
     assert cell.value("joint_states lost") == "0"
 
@@ -310,7 +311,7 @@ def require_old_or_new(graph: Any, serial: str, before: Head, chosen: int) -> No
 
 
 COMMANDS = 9
-CHANGES = 4  # of what is in force, with the start
+CHANGES = 7  # of what is in force or of the tracker, with the start
 
 
 def test_live_equals_replay_bit_for_bit(graph, visits, nominal, tmp_path):

@@ -1,0 +1,87 @@
+"""What the thermal node says: its topics, and how results get onto them."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel, SessionEvent
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.nodes import conversions, qos
+from robocal_ros.sessions.accuracy import Accuracy
+from robocal_ros.sessions.events import Command, Outcome
+
+# A recorder that comes later still gets the events.
+EVENTS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+AddOutput = Callable[[type, str, QoSProfile], Any]
+
+
+class ThermalOutputs:
+    """Publishers of one robot's results.
+
+    Parameters
+    ----------
+    add : creates a publisher.
+    serial, base_frame : as messages carry them.
+    """
+
+    def __init__(self, add: AddOutput, nominal: SerialArm, serial: str, base_frame: str) -> None:
+        self._nominal, self._serial, self._base_frame = nominal, serial, base_frame
+        self._sequence = 0
+        self._candidate = add(KinematicModel, "~/candidate", qos.LATCHED)
+        self._model = add(KinematicModel, "~/model", qos.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self._accuracy = add(AccuracyState, "~/accuracy", qos.LATCHED)
+        self._events = add(SessionEvent, "~/session_events", EVENTS)
+
+    def model(self, model: Mapping[str, Any], revision: int, stamp_ns: int) -> None:
+        """Say what is in force."""
+        self._model.publish(self._message(model, revision, KinematicModel.ACCEPTED, stamp_ns))
+
+    def candidate(self, model: Mapping[str, Any], stamp_ns: int) -> None:
+        """Show what was identified."""
+        self._candidate.publish(self._message(model, 0, KinematicModel.CANDIDATE, stamp_ns))
+
+    def quality(self, outcome: Outcome, frame: str) -> None:
+        """Show the verdict on a candidate, or why there is none."""
+        stamp = conversions.header(outcome.command.stamp_ns or 0, frame)
+        self._quality.publish(
+            conversions.quality_message(
+                outcome, robot=self._nominal.name, serial=self._serial, stamp=stamp
+            )
+        )
+
+    def accuracy(self, found: Accuracy, tolerance_m: float, stamp_ns: int) -> None:
+        """Tell the line how accurate the robot is believed to be."""
+        self._accuracy.publish(
+            conversions.accuracy_message(
+                found,
+                tolerance_m,
+                robot=self._nominal.name,
+                serial=self._serial,
+                stamp=conversions.header(stamp_ns, self._base_frame),
+            )
+        )
+
+    def event(self, command: Command, outcome: Outcome | None) -> None:
+        """Record a command and what came of it, None for the configuration."""
+        self._sequence += 1
+        self._events.publish(conversions.event_message(command, outcome, self._sequence))
+
+    def _message(
+        self, model: Mapping[str, Any], revision: int, state: int, stamp_ns: int
+    ) -> KinematicModel:
+        return conversions.kinematic_model(
+            model,
+            serial=self._serial,
+            model_hash=self._nominal.model_hash,
+            revision=revision,
+            state=state,
+            stamp=conversions.header(stamp_ns, self._base_frame),
+        )
