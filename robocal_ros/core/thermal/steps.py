@@ -18,6 +18,7 @@ from robocal_ros.core.thermal.spots import ColdSpots
 
 Array = NDArray[np.float64]
 
+SENSOR = "sensor"
 CHANCE = 0.01  # a cause is ruled out where it would leave so much in fewer cases than this
 FIXED_FALSE_ALARM = 0.001
 SENSOR_WANDER_M = 1e-5  # a sensor that warms up moves by so much without a knock
@@ -29,7 +30,7 @@ class Cause:
 
     Attributes
     ----------
-    name : ``sensor``, ``sphere``, or a joint's name.
+    name : ``sensor`` (or the robot's base, which looks the same), ``sphere``, or a joint's name.
     words : what moved and by how much.
     """
 
@@ -64,7 +65,7 @@ def possible_causes(
 ) -> tuple[Cause, ...]:
     """Single causes that explain a deviation (3m,) of covariance (3m, 3m), measuring axes.
 
-    Needs samples of three poses or more; fewer leave every cause possible.
+    Few poses leave many causes possible.
     """
     target = spots.target[spots.match(warm)]
     parameters, setup = spots.rows(warm.q, target)
@@ -75,7 +76,7 @@ def possible_causes(
     if (moved := _explains(rigid, deviation, covariance)) is not None:
         turned = float(np.degrees(np.linalg.norm(moved[3:])))
         by = f"{np.linalg.norm(moved[:3]) * 1e3:.2f} mm and {turned:.3f} deg"
-        found.append(Cause("sensor", f"the sensor moved by {by}"))
+        found.append(Cause(SENSOR, f"sensor and robot base moved against each other by {by}"))
     if (moved := _explains(setup[:, :, 3:], deviation, covariance)) is not None:
         by = f"{np.linalg.norm(moved) * 1e3:.2f} mm"
         found.append(Cause("sphere", f"the sphere moved on the flange by {by}"))
@@ -94,25 +95,18 @@ def step_words(causes: Sequence[Cause], fixed: FixedSphere | None) -> str:
             f"the fixed sphere seems to have moved by {by}, so the sensor did: fasten it, then "
             "capture a new cold reference"
         )
-    if fixed is not None:
-        causes = [cause for cause in causes if cause.name != "sensor"]
-        still = "the fixed sphere stands where it was, so the sensor did not move: "
+    said = "" if fixed is None else "the fixed sphere stands where it was, so the sensor too; "
+    if causes:
+        said += "or ".join(f"{cause.words}; " for cause in causes)
+        said += "the data cannot tell these apart; " if len(causes) > 1 else ""
     else:
-        still = ""
-    advice = "look at sphere and robot, then calibrate the robot or capture a new cold reference"
-    if len(causes) == 1:
-        return f"{still}{causes[0].words}, or so it looks; {advice}"
-    if not causes:
-        return f"{still}no single cause explains it; {advice}"
-    words = "; or ".join(cause.words for cause in causes)
-    decide = "" if fixed is not None or all(cause.name != "sensor" for cause in causes) else _DECIDE
-    return f"{still}the data cannot tell these apart: {words}; {decide}{advice}"
-
-
-_DECIDE = (
-    "a second sphere, fixed to the floor or the base and measured as reference_sphere_center, "
-    "would decide; "
-)
+        said += "no single cause explains it; "
+    if fixed is None and any(cause.name == SENSOR for cause in causes):
+        said += (
+            "a second sphere, fixed to the floor or the base and measured as "
+            "reference_sphere_center, would decide; "
+        )
+    return f"{said}look at sensor, sphere and robot, then calibrate or capture a new cold reference"
 
 
 def _joint_zeros(arm: SerialArm) -> list[tuple[str, int]]:

@@ -68,7 +68,7 @@ def track_cycle(
     if moved:
         tracker.state = last
     miss, spread, drifts = _left_out(tracker, before, warm, innovation)
-    found = _found(tracker, before, warm, time_s, innovation, miss, spread)
+    found = _found(tracker, warm, time_s, innovation, miss, spread)
     arm = spots.cell.arm
     A = spots.rows(warm.q, spots.target[spots.match(warm)])[0]
     own = drifts - arm.parameters.read(in_force.mdh - arm.mdh)
@@ -89,7 +89,6 @@ def track_cycle(
 
 def _found(
     tracker: DriftTracker,
-    before: TrackerState,
     warm: Measurements,
     time_s: float,
     innovation: Innovation,
@@ -106,7 +105,7 @@ def _found(
     return CycleDrift(
         drift=drift,
         covariance=covariance,
-        prior_covariance=before.covariance[:k, :k],
+        prior_covariance=tracker.process.covariance,
         arm=arm.with_mdh(chosen.add(arm.mdh, drift)),
         warm=warm,
         left_out=miss,
