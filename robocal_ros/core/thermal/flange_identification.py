@@ -15,6 +15,7 @@ from robocal_ros.core.assessment import (
     judge,
     pose_groups,
     summarise,
+    too_narrow,
 )
 from robocal_ros.core.identification.priors import default_prior, fitted_prior
 from robocal_ros.core.identification.solve import random_postures
@@ -214,16 +215,6 @@ def identify_and_judge_flange_sensor(
 
 def _doubt(result: FlangeSensorIdentification, current_rms_m: float) -> str:
     """Say why the poses do not carry over to other ones; empty when they do."""
-    if not result.estimate.converged:
-        return (
-            f"the solution still crept after {result.estimate.iterations} iterations along "
-            "directions that the poses hardly show"
-        )
+    remedy = "look at the spheres from more sides, and turn every joint"
     error, change = result.workspace_rms(), result.workspace_change()
-    if error <= max(2.0 * current_rms_m, change / np.sqrt(3.0)):
-        return ""
-    return (
-        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
-        f"for a change of {change * 1e3:.3f} mm: look at the spheres from more sides, and turn "
-        "every joint"
-    )
+    return result.estimate.creeping or too_narrow(error, change, current_rms_m, remedy)

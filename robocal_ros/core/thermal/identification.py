@@ -11,7 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
+from robocal_ros.core.assessment import (
+    SPREAD_POSES,
+    ErrorSummary,
+    Verdict,
+    gross,
+    judge,
+    summarise,
+    too_narrow,
+)
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
@@ -279,12 +287,7 @@ def _doubt(found: CycleDrift, rows: Array, current_rms_m: float, change_m: float
     prior = found.prior_covariance
     if prior is not None and error <= 0.5 * _rms(rows, prior):
         return ""
-    if error <= max(2.0 * current_rms_m, change_m / np.sqrt(3.0)):
-        return ""
-    return (
-        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
-        f"for a change of {change_m * 1e3:.3f} mm: spread them and turn every joint, the wrist too"
-    )
+    return too_narrow(error, change_m, current_rms_m, SPREAD_POSES)
 
 
 def _rms(rows: Array, covariance: Array) -> float:
