@@ -44,6 +44,30 @@ class Verdict:
         return self.code is Code.ACCEPT
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """A candidate's figures on data that were not used to solve, and the decision.
+
+    Attributes
+    ----------
+    nominal, current, candidate : held-out errors of the nominal model (for a drift: the cold
+        one), of the model in force and of the identified one.
+    predicted_rms_m : the candidate's error expected from its covariance alone.
+    predicted_total_rms_m : the same with the noise of the measurements added.
+    workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
+    held_out_rejected : samples left out of the judgement because no model can fit them.
+    """
+
+    nominal: ErrorSummary
+    current: ErrorSummary
+    candidate: ErrorSummary
+    predicted_rms_m: float
+    predicted_total_rms_m: float
+    workspace_rms_m: float
+    held_out_rejected: tuple[str, ...]
+    verdict: Verdict
+
+
 def summarise(error: Array) -> ErrorSummary:
     """Summarise distances (m,) or error vectors (m, 3)."""
     e = np.linalg.norm(error, axis=1) if error.ndim == 2 else error

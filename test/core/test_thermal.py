@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
+from robocal_ros.core.assessment import Judgement
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, ResidualError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.identification import (
     CycleDrift,
-    JudgedCycle,
     identify_cycle,
     judge_cycle,
 )
@@ -59,7 +59,7 @@ def visit(arm: SerialArm, q: np.ndarray, rng: np.random.Generator, noise: float 
 
 def identified(
     reference: ColdReference, warm: Measurements, prior: np.ndarray, *, in_force: SerialArm
-) -> tuple[CycleDrift, JudgedCycle]:
+) -> tuple[CycleDrift, Judgement]:
     """The set-up stands still here, so nothing is laid to it."""
     spots = reference.spots
     found = identify_cycle(spots, warm, prior_covariance=prior, sigma_m=SIGMA_M, setup_sigma_m=1e-9)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import (
     SPREAD_POSES,
-    ErrorSummary,
+    Judgement,
     Verdict,
     gross,
     hold_out,
@@ -39,28 +39,10 @@ LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this muc
 
 
 @dataclass(frozen=True)
-class JudgedIdentification:
-    """An identification with its figures on data that were not used to solve.
-
-    Attributes
-    ----------
-    nominal, current, candidate : held-out errors of the nominal model (for a drift: the cold
-        one), of the model in force and of the identified one.
-    predicted_rms_m : the candidate's error expected from its covariance alone.
-    predicted_total_rms_m : the same with the noise of the measurements added.
-    workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
-    held_out_rejected : samples left out of the judgement because no model can fit them.
-    """
+class JudgedIdentification(Judgement):
+    """An identification with its judgement."""
 
     identification: Identification
-    nominal: ErrorSummary
-    current: ErrorSummary
-    candidate: ErrorSummary
-    predicted_rms_m: float
-    predicted_total_rms_m: float
-    workspace_rms_m: float
-    held_out_rejected: tuple[str, ...]
-    verdict: Verdict
 
 
 def identify_and_judge(

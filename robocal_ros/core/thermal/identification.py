@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import (
     SPREAD_POSES,
-    ErrorSummary,
-    Verdict,
+    Judgement,
     gross,
     judge,
     summarise,
@@ -210,29 +209,6 @@ def _variance(
     return np.asarray(sigma**2 + sigma_m**2 / spots.visits[spot])
 
 
-@dataclass(frozen=True)
-class JudgedCycle:
-    """A cycle's drift with its figures on measurements that were not used to solve.
-
-    Attributes
-    ----------
-    cold, current, candidate : errors of the cold model, of the one in force and of the
-        identified one.
-    predicted_rms_m, predicted_total_rms_m : the candidate's error expected from its covariance,
-        alone and with the noise of both visits.
-    workspace_rms_m : the same as the first over postures throughout the joint limits.
-    """
-
-    cold: ErrorSummary
-    current: ErrorSummary
-    candidate: ErrorSummary
-    predicted_rms_m: float
-    predicted_total_rms_m: float
-    workspace_rms_m: float
-    held_out_rejected: tuple[str, ...]
-    verdict: Verdict
-
-
 def judge_cycle(
     found: CycleDrift,
     spots: ColdSpots,
@@ -240,7 +216,7 @@ def judge_cycle(
     in_force: SerialArm,
     check: Measurements | None = None,
     sigma_m: float,
-) -> JudgedCycle:
+) -> Judgement:
     """Judge at the poses of ``check``, else at each pose of the cycle from the others.
 
     ``in_force`` is an arm of the cold model's type. A drift that the cycle's poses do not show
@@ -265,8 +241,8 @@ def judge_cycle(
     moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
     change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     doubt = _doubt(found, rows, summarise(current[sound]).rms_m, change)
-    return JudgedCycle(
-        cold=summarise(np.linalg.norm(y, axis=1)[sound]),
+    return Judgement(
+        nominal=summarise(np.linalg.norm(y, axis=1)[sound]),
         current=summarise(current[sound]),
         candidate=summarise(after[sound]),
         predicted_rms_m=_rms(A, found.covariance),
