@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.thermal.drift_history import share_within
 from robocal_ros.sim import kr150
 from robocal_ros.sim.motion import COUNT_RAD
 from robocal_ros.sim.robot import TrueRobot
@@ -20,7 +21,6 @@ from robocal_ros.sim.thermal import Warmth
 
 Array = NDArray[np.float64]
 
-THRESHOLD_M = 1e-4
 UNCORRECTED = 0.45  # the middle of the published 43 to 49 %
 SIX_LENGTHS = (0.70, 0.88)
 PERIOD_S = 300.0
@@ -119,7 +119,7 @@ def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell
     """Scale a robot's drift, and each further shift's level, to the published size."""
 
     def share(robot: TrueRobot, plan: DriftPlan) -> float:
-        return within(_displacement(robot, check, kr150.TOOL, plan, coarse=True))
+        return share_within(_displacement(robot, check, kr150.TOOL, plan, coarse=True))
 
     factor = _bisect(lambda f: share(_scaled(robot, f), PLANS[0]))
     robot = _scaled(robot, factor)
@@ -131,11 +131,6 @@ def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell
         check,
         tuple(_with_lengths(robot, sphere, check, plan) for plan in plans),
     )
-
-
-def within(displacement: Array) -> float:
-    """Share of directions (x, y, z apart) within 0.1 mm."""
-    return float(np.mean(np.abs(displacement) < THRESHOLD_M))
 
 
 def _bisect(share: Callable[[float], float]) -> float:
@@ -186,7 +181,7 @@ def _with_lengths(robot: TrueRobot, sphere: Array, check: Array, plan: DriftPlan
     moved = _displacement(robot, sphere, kr150.BALL, plan, coarse=True)
     lengths = moved.reshape(len(moved), -1) @ np.linalg.pinv(seen).T
     truth = _displacement(robot, check, kr150.TOOL, plan, coarse=True).reshape(len(moved), -1)
-    return within(truth - lengths @ told.T)
+    return share_within(truth - lengths @ told.T)
 
 
 def record(
