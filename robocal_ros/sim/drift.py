@@ -7,6 +7,7 @@ scaled, before any estimator sees it, to what was published for a KR 150 R3100: 
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.thermal.drift_history import share_within
 from robocal_ros.sim import kr150
 from robocal_ros.sim.motion import COUNT_RAD
+from robocal_ros.sim.poses import read_poses
 from robocal_ros.sim.robot import TrueRobot
 from robocal_ros.sim.sensor import SphereSensor
 from robocal_ros.sim.shift import SERVO_RAD
@@ -21,6 +23,7 @@ from robocal_ros.sim.thermal import Warmth
 
 Array = NDArray[np.float64]
 
+MEASURING = (5, 1, 11, 8, 10, 4)  # the six of the sphere poses that estimators are given
 UNCORRECTED = 0.45  # the middle of the published 43 to 49 %
 SIX_LENGTHS = (0.70, 0.88)
 PERIOD_S = 300.0
@@ -113,6 +116,11 @@ class DriftRecord:
     position: Array
     temperature_s: Array
     temperature: Array
+
+
+def poses(kind: str) -> Array:
+    """The cell's twenty poses of the ``sphere``, or 34 of ``check``: (m, 6), rad."""
+    return read_poses(Path(__file__).with_name("drift_poses.csv"), kind)
 
 
 def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell:
