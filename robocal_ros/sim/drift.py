@@ -28,7 +28,6 @@ UNCORRECTED = 0.45  # the middle of the published 43 to 49 %
 SIX_LENGTHS = (0.70, 0.88)
 PERIOD_S = 300.0
 LENGTHS = ("d1_mm", "d4_mm", "d6_mm", "a1_mm", "a2_mm", "a3_mm")
-TEMPERATURE_NOISE_K = 0.1
 _COARSE = 6  # scaling looks at every sixth cycle
 _BISECTIONS = 12
 
@@ -106,7 +105,6 @@ class DriftRecord:
     time_s : (t,) of each cycle.
     cold_q, cold : (r, s, n) readings and (r, s, 3) measured centres of the cold rounds.
     q, position : (t, s, n) and (t, s, 3) of the cycles.
-    temperature_s, temperature : (u,) and (u, n) of the motors above cold, K.
     """
 
     time_s: Array
@@ -114,8 +112,6 @@ class DriftRecord:
     cold: Array
     q: Array
     position: Array
-    temperature_s: Array
-    temperature: Array
 
 
 def poses(kind: str) -> Array:
@@ -201,16 +197,12 @@ def record(
     before = [_visit(cell, sensor, cold, 0.0, rng) for _ in range(rounds)]
     states = list(plan.warmths())
     after = [_visit(cell, sensor, state, time_s, rng) for time_s, state in states]
-    times = np.array([time_s for time_s, _ in states])
-    rise = np.array([state.motor for _, state in states])
     return DriftRecord(
-        time_s=times,
+        time_s=np.array([time_s for time_s, _ in states]),
         cold_q=np.array([q for q, _ in before]),
         cold=np.array([p for _, p in before]),
         q=np.array([q for q, _ in after]),
         position=np.array([p for _, p in after]),
-        temperature_s=times,
-        temperature=rise + TEMPERATURE_NOISE_K * rng.standard_normal(rise.shape),
     )
 
 
