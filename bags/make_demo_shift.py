@@ -12,7 +12,6 @@ poses; then, every twelve minutes, in eight of them. The bag holds what a cell w
   poses do not contain, when they are commanded without correction.
 """
 
-import csv
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.sim import kr150
 from robocal_ros.sim.motion import readings
+from robocal_ros.sim.poses import read_poses
 from robocal_ros.sim.robot import Effects, TrueRobot
 from robocal_ros.sim.sensor import SphereSensor
 from robocal_ros.sim.shift import Shift, ShiftPlan, simulate
@@ -56,22 +56,15 @@ class DemoCell:
     shift: Shift
 
 
-def poses(*kinds: str) -> Array:
-    """Poses (m, n) of these kinds from the file, rad."""
-    with POSES.open(newline="") as stream:
-        rows = [row for row in csv.reader(stream) if row[0] in kinds]
-    return np.radians(np.array([row[1:] for row in rows], dtype=np.float64))
-
-
 def build(effects: Effects | None = None, seed: int = SEED) -> DemoCell:
     """Simulate the shift; the same seed gives the same robot and the same noise."""
     body, course = np.random.default_rng(seed).spawn(2)
     robot = kr150.true_robot(load_robot(ROBOT), body, effects)
     sensor = kr150.sphere_sensor(effects)
     plan = ShiftPlan(
-        reference=poses("cycle", "reference"),
-        cycle=poses("cycle"),
-        check=poses("check"),
+        reference=read_poses(POSES, "cycle", "reference"),
+        cycle=read_poses(POSES, "cycle"),
+        check=read_poses(POSES, "check"),
         phases=PHASES,
         duty=DUTY,
         period_s=PERIOD_S,

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from docs.examples.make_thermal import MEASURING, poses
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
 from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
@@ -32,10 +31,12 @@ from robocal_ros.core.thermal.tracking import DriftTracker
 from robocal_ros.sim import kr150
 from robocal_ros.sim.drift import (
     LENGTHS,
+    MEASURING,
     DriftingCell,
     DriftPlan,
     DriftRecord,
     drifting_cell,
+    poses,
     record,
 )
 from robocal_ros.sim.robot import Effects

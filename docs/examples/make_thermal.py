@@ -18,24 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import DriftRecord, drifting_cell, record
+from robocal_ros.sim.drift import MEASURING, DriftRecord, drifting_cell, poses, record
 from robocal_ros.storage.robots import load_robot
 
-ROOT = Path(__file__).parents[2]
-POSES = ROOT / "bags" / "drift_poses.csv"
 ROBOT, SEED = "kr150_r3100", 1
-MEASURING = (5, 1, 11, 8, 10, 4)
 SHOWN = (5, 30, 89)
 HEADER = ["pose", "cycle", "sample", *(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"]
 
 Array = NDArray[np.float64]
-
-
-def poses(kind: str) -> Array:
-    """Poses (m, 6) of a kind from the file, rad."""
-    with POSES.open(newline="") as stream:
-        rows = [row[1:] for row in csv.reader(stream) if row[0] == kind]
-    return np.radians(np.array(rows, dtype=np.float64))
 
 
 def write(path: Path, q: Array, position: Array, cycles: Iterable[int], own: Iterable[int]) -> None:

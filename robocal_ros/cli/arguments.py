@@ -1,6 +1,7 @@
 """Kinds of arguments and messages that several commands share."""
 
 import argparse
+import math
 import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -31,6 +32,17 @@ def parts(value: str) -> tuple[str, ...]:
     return tuple(name for name in PARTS if name in names)
 
 
+def positive(value: str) -> float:
+    """Type of a finite number above zero.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    return _between(value, math.inf, "a number above 0")
+
+
 def share(value: str) -> float:
     """Type of a share between 0 and 1.
 
@@ -39,13 +51,29 @@ def share(value: str) -> float:
     argparse.ArgumentTypeError
         For anything else.
     """
+    return _between(value, 1.0, "a share between 0 and 1")
+
+
+def _between(value: str, most: float, what: str) -> float:
+    """A number above zero and below ``most``."""
     try:
         number = float(value)
     except ValueError:
         number = 0.0
-    if not 0.0 < number < 1.0:
-        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a share between 0 and 1")
+    if not 0.0 < number < most:
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not {what}")
     return number
+
+
+def count(value: str) -> int:
+    """Type of an argument that counts something: a whole number from 1.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        For anything else.
+    """
+    return _whole(value, 1)
 
 
 def seed(value: str) -> int:
@@ -56,9 +84,28 @@ def seed(value: str) -> int:
     argparse.ArgumentTypeError
         For anything else.
     """
-    if not (value.isascii() and value.isdigit()):
-        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a whole number from 0")
+    return _whole(value, 0)
+
+
+def _whole(value: str, least: int) -> int:
+    if not (value.isascii() and value.isdigit()) or int(value) < least:
+        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a whole number from {least}")
     return int(value)
+
+
+def text(value: str) -> str:
+    """Type of an argument that is kept as text.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        Bytes that are no text in the terminal's encoding.
+    """
+    try:
+        value.encode()
+    except UnicodeEncodeError as error:
+        raise argparse.ArgumentTypeError("holds bytes that are not text") from error
+    return value
 
 
 def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":

@@ -9,9 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robocal_ros.cli.arguments import count, text
 from robocal_ros.cli.history_view import show_decision, show_entry, show_list
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.cli.parsing import count, text
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import THERMAL, Decision, Entry
 from robocal_ros.storage.files import quoted

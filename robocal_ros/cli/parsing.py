@@ -1,13 +1,11 @@
 """The command line: argparse with usage errors and help as results instead of exits."""
 
 import argparse
-import math
 import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted
 
 _NEGATIVE = re.compile(r"-\.?\d")
 
@@ -86,48 +84,3 @@ def with_negative_values(arguments: Sequence[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
-
-
-def count(value: str) -> int:
-    """Type of an argument that counts something: a whole number from 1.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        It is none.
-    """
-    if not value.isdecimal() or int(value) < 1:
-        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a whole number from 1")
-    return int(value)
-
-
-def text(value: str) -> str:
-    """Type of an argument that is kept as text.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        Bytes that are no text in the terminal's encoding.
-    """
-    try:
-        value.encode()
-    except UnicodeEncodeError as error:
-        raise argparse.ArgumentTypeError("holds bytes that are not text") from error
-    return value
-
-
-def positive(value: str) -> float:
-    """Type of a finite number above zero.
-
-    Raises
-    ------
-    argparse.ArgumentTypeError
-        For anything else.
-    """
-    try:
-        number = float(value)
-    except ValueError:
-        number = 0.0
-    if not 0.0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{quoted(value)} is not a number above 0")
-    return number

@@ -4,10 +4,9 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
+from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, text, warn
 from robocal_ros.cli.identify_view import show_identification
 from robocal_ros.cli.output import Outcome
-from robocal_ros.cli.parsing import positive, text
 from robocal_ros.core.errors import InputError
 
 NAME = "identify"

@@ -5,9 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
+from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.cli.parsing import positive
 from robocal_ros.cli.thermal_identify import SIGMA_MM
 from robocal_ros.core.errors import InputError
 

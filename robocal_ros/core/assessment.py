@@ -15,6 +15,7 @@ SAME_POSE_RAD = 1e-3
 FEWEST_GROUPS = 5
 SIGNIFICANCE = 0.05
 LARGEST_RMS_M = 5e-3
+SPREAD_POSES = "spread them and turn every joint, the wrist too"
 GROSS_RATIO = 10.0
 SMALLEST_GROSS_M = 1e-4
 
@@ -41,6 +42,30 @@ class Verdict:
     def accept(self) -> bool:
         """Whether the candidate may be accepted."""
         return self.code is Code.ACCEPT
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A candidate's figures on data that were not used to solve, and the decision.
+
+    Attributes
+    ----------
+    nominal, current, candidate : held-out errors of the nominal model (for a drift: the cold
+        one), of the model in force and of the identified one.
+    predicted_rms_m : the candidate's error expected from its covariance alone.
+    predicted_total_rms_m : the same with the noise of the measurements added.
+    workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
+    held_out_rejected : samples left out of the judgement because no model can fit them.
+    """
+
+    nominal: ErrorSummary
+    current: ErrorSummary
+    candidate: ErrorSummary
+    predicted_rms_m: float
+    predicted_total_rms_m: float
+    workspace_rms_m: float
+    held_out_rejected: tuple[str, ...]
+    verdict: Verdict
 
 
 def summarise(error: Array) -> ErrorSummary:
@@ -141,6 +166,28 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
             Code.NO_SIGNIFICANT_GAIN, f"{what}; chance alone would give this in {p:.0%} of cases"
         )
     return Verdict(Code.ACCEPT, what)
+
+
+def too_narrow(error_m: float, change_m: float, current_rms_m: float, remedy: str) -> str:
+    """Say why measured poses do not carry over to the whole workspace; empty when they do.
+
+    Parameters
+    ----------
+    error_m : rms error, throughout the joint limits, that the candidate's covariance leaves.
+    change_m : rms displacement there by which the candidate differs from the model in force.
+    current_rms_m : error of the model in force at the check poses.
+    remedy : which poses would do.
+
+    The error must be at most twice the present one at the check poses (elsewhere the present one
+    is not known, and may be that large), or clearly below what the candidate changes: noise
+    cannot pass for a change.
+    """
+    if error_m <= max(2.0 * current_rms_m, change_m / np.sqrt(3.0)):
+        return ""
+    return (
+        f"over the whole workspace the measured poses leave an error of {error_m * 1e3:.3f} mm "
+        f"rms, for a change of {change_m * 1e3:.3f} mm: {remedy}"
+    )
 
 
 def _one_sided_p(gain: Array) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.assessment import ErrorSummary, Verdict
+from robocal_ros.core.assessment import ErrorSummary, Judgement, Verdict
 from robocal_ros.core.identification import CellModel, Identification, JudgedIdentification
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
@@ -29,6 +29,22 @@ def errors_document(errors: ErrorSummary) -> Document:
         "p95_mm": errors.p95_m * 1e3,
         "max_mm": errors.max_m * 1e3,
         "n": errors.n,
+    }
+
+
+def judged_errors_document(judged: Judgement) -> Document:
+    """Held-out errors before and after, and those that the candidate's covariance predicts."""
+    return {
+        "nominal": {"held_out": errors_document(judged.nominal)},
+        "in_force": {"held_out": errors_document(judged.current)},
+        "calibrated": {
+            "held_out": errors_document(judged.candidate),
+            "predicted": {
+                "model_rms_mm": judged.predicted_rms_m * 1e3,
+                "total_rms_mm": judged.predicted_total_rms_m * 1e3,
+                "workspace_rms_mm": judged.workspace_rms_m * 1e3,
+            },
+        },
     }
 
 
@@ -112,16 +128,7 @@ def identification_document(judged: JudgedIdentification) -> Document:
         "robot": result.nominal.name,
         "model_hash": result.nominal.model_hash,
         "method": result.method,
-        "nominal": {"held_out": errors_document(judged.nominal)},
-        "in_force": {"held_out": errors_document(judged.current)},
-        "calibrated": {
-            "held_out": errors_document(judged.candidate),
-            "predicted": {
-                "model_rms_mm": judged.predicted_rms_m * 1e3,
-                "total_rms_mm": judged.predicted_total_rms_m * 1e3,
-                "workspace_rms_mm": judged.workspace_rms_m * 1e3,
-            },
-        },
+        **judged_errors_document(judged),
         "parameters": parameters_document(result.nominal, result.cell.arm, result.sigma()),
         **cell_document(result.cell),
         "noise_mm": result.noise_m * 1e3,

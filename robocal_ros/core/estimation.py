@@ -53,6 +53,16 @@ class Estimate(Generic[S]):
     iterations: int
     converged: bool
 
+    @property
+    def creeping(self) -> str:
+        """Say why the state is no solution; empty when it is one."""
+        if self.converged:
+            return ""
+        return (
+            f"the solution still crept after {self.iterations} iterations along directions that "
+            "the poses hardly show"
+        )
+
 
 def solve(
     problem: Problem[S],

@@ -7,12 +7,15 @@ scaled, before any estimator sees it, to what was published for a KR 150 R3100: 
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.thermal.drift_history import share_within
 from robocal_ros.sim import kr150
 from robocal_ros.sim.motion import COUNT_RAD
+from robocal_ros.sim.poses import read_poses
 from robocal_ros.sim.robot import TrueRobot
 from robocal_ros.sim.sensor import SphereSensor
 from robocal_ros.sim.shift import SERVO_RAD
@@ -20,12 +23,11 @@ from robocal_ros.sim.thermal import Warmth
 
 Array = NDArray[np.float64]
 
-THRESHOLD_M = 1e-4
+MEASURING = (5, 1, 11, 8, 10, 4)  # the six of the sphere poses that estimators are given
 UNCORRECTED = 0.45  # the middle of the published 43 to 49 %
 SIX_LENGTHS = (0.70, 0.88)
 PERIOD_S = 300.0
 LENGTHS = ("d1_mm", "d4_mm", "d6_mm", "a1_mm", "a2_mm", "a3_mm")
-TEMPERATURE_NOISE_K = 0.1
 _COARSE = 6  # scaling looks at every sixth cycle
 _BISECTIONS = 12
 
@@ -103,7 +105,6 @@ class DriftRecord:
     time_s : (t,) of each cycle.
     cold_q, cold : (r, s, n) readings and (r, s, 3) measured centres of the cold rounds.
     q, position : (t, s, n) and (t, s, 3) of the cycles.
-    temperature_s, temperature : (u,) and (u, n) of the motors above cold, K.
     """
 
     time_s: Array
@@ -111,15 +112,18 @@ class DriftRecord:
     cold: Array
     q: Array
     position: Array
-    temperature_s: Array
-    temperature: Array
+
+
+def poses(kind: str) -> Array:
+    """The cell's twenty poses of the ``sphere``, or 34 of ``check``: (m, 6), rad."""
+    return read_poses(Path(__file__).with_name("drift_poses.csv"), kind)
 
 
 def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell:
     """Scale a robot's drift, and each further shift's level, to the published size."""
 
     def share(robot: TrueRobot, plan: DriftPlan) -> float:
-        return within(_displacement(robot, check, kr150.TOOL, plan, coarse=True))
+        return share_within(_displacement(robot, check, kr150.TOOL, plan, coarse=True))
 
     factor = _bisect(lambda f: share(_scaled(robot, f), PLANS[0]))
     robot = _scaled(robot, factor)
@@ -131,11 +135,6 @@ def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell
         check,
         tuple(_with_lengths(robot, sphere, check, plan) for plan in plans),
     )
-
-
-def within(displacement: Array) -> float:
-    """Share of directions (x, y, z apart) within 0.1 mm."""
-    return float(np.mean(np.abs(displacement) < THRESHOLD_M))
 
 
 def _bisect(share: Callable[[float], float]) -> float:
@@ -186,7 +185,7 @@ def _with_lengths(robot: TrueRobot, sphere: Array, check: Array, plan: DriftPlan
     moved = _displacement(robot, sphere, kr150.BALL, plan, coarse=True)
     lengths = moved.reshape(len(moved), -1) @ np.linalg.pinv(seen).T
     truth = _displacement(robot, check, kr150.TOOL, plan, coarse=True).reshape(len(moved), -1)
-    return within(truth - lengths @ told.T)
+    return share_within(truth - lengths @ told.T)
 
 
 def record(
@@ -198,16 +197,12 @@ def record(
     before = [_visit(cell, sensor, cold, 0.0, rng) for _ in range(rounds)]
     states = list(plan.warmths())
     after = [_visit(cell, sensor, state, time_s, rng) for time_s, state in states]
-    times = np.array([time_s for time_s, _ in states])
-    rise = np.array([state.motor for _, state in states])
     return DriftRecord(
-        time_s=times,
+        time_s=np.array([time_s for time_s, _ in states]),
         cold_q=np.array([q for q, _ in before]),
         cold=np.array([p for _, p in before]),
         q=np.array([q for q, _ in after]),
         position=np.array([p for _, p in after]),
-        temperature_s=times,
-        temperature=rise + TEMPERATURE_NOISE_K * rng.standard_normal(rise.shape),
     )
 
 

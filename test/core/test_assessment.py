@@ -14,6 +14,7 @@ from robocal_ros.core.assessment import (
     judge,
     pose_groups,
     summarise,
+    too_narrow,
 )
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import TooFewSamplesError
@@ -174,3 +175,11 @@ def test_a_real_gain_is_found():
         before, after = np.linalg.norm(noise * [[[1.0]], [[0.9]]], axis=2)
         accepted += judge(before, after, apart(300)).accept
     assert accepted > 180
+
+
+def test_poses_carry_over_where_the_rest_is_known_well_enough():
+    """An error of 0.3 mm: against twice the present one, and against a change of sqrt(3) times."""
+    assert not too_narrow(3e-4, 0.0, 1.6e-4, "turn")
+    assert not too_narrow(3e-4, 5.3e-4, 0.0, "turn")
+    words = too_narrow(3e-4, 5.1e-4, 1.4e-4, "turn")
+    assert words.endswith("an error of 0.300 mm rms, for a change of 0.510 mm: turn")

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
+from robocal_ros.core.assessment import Judgement
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, ResidualError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.cycle_verdict import JudgedCycle, judge_cycle
+from robocal_ros.core.thermal.cycle_verdict import judge_cycle
 from robocal_ros.core.thermal.identification import CycleDrift, identify_cycle
 from robocal_ros.core.thermal.priors import drift_prior, learned_prior
 from robocal_ros.core.thermal.reference import ColdReference, capture_reference
@@ -55,7 +56,7 @@ def visit(arm: SerialArm, q: np.ndarray, rng: np.random.Generator, noise: float 
 
 def identified(
     reference: ColdReference, warm: Measurements, prior: np.ndarray, *, in_force: SerialArm
-) -> tuple[CycleDrift, JudgedCycle]:
+) -> tuple[CycleDrift, Judgement]:
     """The set-up stands still here, so nothing is laid to it."""
     spots = reference.spots
     found = identify_cycle(spots, warm, prior_covariance=prior, sigma_m=SIGMA_M, setup_sigma_m=1e-9)

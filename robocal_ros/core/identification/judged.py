@@ -7,13 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import (
-    ErrorSummary,
+    SPREAD_POSES,
+    Judgement,
     Verdict,
     gross,
     hold_out,
     judge,
     pose_groups,
     summarise,
+    too_narrow,
 )
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
@@ -37,28 +39,10 @@ LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this muc
 
 
 @dataclass(frozen=True)
-class JudgedIdentification:
-    """An identification with its figures on data that were not used to solve.
-
-    Attributes
-    ----------
-    nominal, current, candidate : held-out errors of the nominal model (for a drift: the cold
-        one), of the model in force and of the identified one.
-    predicted_rms_m : the candidate's error expected from its covariance alone.
-    predicted_total_rms_m : the same with the noise of the measurements added.
-    workspace_rms_m : the same as ``predicted_rms_m`` over postures throughout the joint limits.
-    held_out_rejected : samples left out of the judgement because no model can fit them.
-    """
+class JudgedIdentification(Judgement):
+    """An identification with its judgement."""
 
     identification: Identification
-    nominal: ErrorSummary
-    current: ErrorSummary
-    candidate: ErrorSummary
-    predicted_rms_m: float
-    predicted_total_rms_m: float
-    workspace_rms_m: float
-    held_out_rejected: tuple[str, ...]
-    verdict: Verdict
 
 
 def identify_and_judge(
@@ -93,7 +77,7 @@ def identify_and_judge(
     predicted, total = _predicted(result, check, check_refit)
     doubt = still_joints(arm, train) and still_joints(arm, check)
     sound = ~gross(before, after)
-    doubt = doubt or uninformative(result, summarise(before[sound]).rms_m, in_force or arm)
+    doubt = doubt or _doubt(result, summarise(before[sound]).rms_m, in_force or arm)
     verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
     if "geometry" not in fit:
         verdict = _of_placement(verdict)
@@ -149,26 +133,11 @@ def identify_and_hold_out(
     return identify_and_judge(arm, train, check, method=method, in_force=in_force)
 
 
-def uninformative(result: Identification, current_rms_m: float, in_force: SerialArm) -> str:
-    """Say why the poses do not carry over to the workspace; empty when they do.
-
-    The error expected throughout the joint limits must be at most twice the present one at the
-    check poses (elsewhere the present one is not known, and may be that large), or clearly below
-    what the candidate changes there: noise cannot pass for a change.
-    """
-    if not result.estimate.converged:
-        return (
-            f"the solution still crept after {result.estimate.iterations} iterations along "
-            "directions that the poses hardly show"
-        )
+def _doubt(result: Identification, current_rms_m: float, in_force: SerialArm) -> str:
+    """Say why the poses do not carry over to the workspace; empty when they do."""
     error = result.workspace_rms(result.estimate.covariance)
     change = result.workspace_change(in_force)
-    if error <= max(2.0 * current_rms_m, change / np.sqrt(3.0)):
-        return ""
-    return (
-        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
-        f"for a change of {change * 1e3:.3f} mm: spread them and turn every joint, the wrist too"
-    )
+    return result.estimate.creeping or too_narrow(error, change, current_rms_m, SPREAD_POSES)
 
 
 def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:

@@ -1,11 +1,16 @@
 """Is the model that a cycle gives better than the one in force, in mm, throughout the workspace?"""
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import ErrorSummary, Verdict, gross, judge, summarise
+from robocal_ros.core.assessment import (
+    SPREAD_POSES,
+    Judgement,
+    gross,
+    judge,
+    summarise,
+    too_narrow,
+)
 from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
@@ -15,33 +20,6 @@ from robocal_ros.core.thermal.spots import ColdSpots
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class JudgedCycle:
-    """A cycle's drift with its figures on measurements that were not used to solve.
-
-    Attributes
-    ----------
-    cold, current, candidate : errors of the cold model, of the one in force and of the
-        identified one.
-    predicted_rms_m, predicted_total_rms_m : the candidate's error expected from its covariance,
-        alone and with the noise of both visits.
-    workspace_rms_m : the same as the first over postures throughout the joint limits.
-    """
-
-    cold: ErrorSummary
-    current: ErrorSummary
-    candidate: ErrorSummary
-    predicted_rms_m: float
-    predicted_total_rms_m: float
-    workspace_rms_m: float
-    held_out_rejected: tuple[str, ...]
-    verdict: Verdict
-
-    def with_verdict(self, verdict: Verdict) -> "JudgedCycle":
-        """Return the same figures with another verdict."""
-        return replace(self, verdict=verdict)
-
-
 def judge_cycle(
     found: CycleDrift,
     spots: ColdSpots,
@@ -49,7 +27,7 @@ def judge_cycle(
     in_force: SerialArm,
     check: Measurements | None = None,
     sigma_m: float,
-) -> JudgedCycle:
+) -> Judgement:
     """Judge at the poses of ``check``, else at each pose of the cycle from the others.
 
     ``in_force`` is an arm of the cold model's type. A drift that the cycle's poses do not show
@@ -84,7 +62,7 @@ def conclude(
     after: Array,
     spread: Array,
     usable: NDArray[np.bool_],
-) -> JudgedCycle:
+) -> Judgement:
     """Judge from the errors (m,) of the model in force and of the candidate at ``data``.
 
     ``spread`` (m,) is what the covariances expect of ``after``; ``usable`` (m,) what may judge.
@@ -96,8 +74,8 @@ def conclude(
     moved = rows @ (found.drift - chosen.read(in_force.mdh - cold.mdh))
     change = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
     doubt = _doubt(found, rows, summarise(current[sound]).rms_m, change)
-    return JudgedCycle(
-        cold=summarise(np.linalg.norm(spots.drift(data), axis=1)[sound]),
+    return Judgement(
+        nominal=summarise(np.linalg.norm(spots.drift(data), axis=1)[sound]),
         current=summarise(current[sound]),
         candidate=summarise(after[sound]),
         predicted_rms_m=_rms(A, found.covariance),
@@ -118,12 +96,7 @@ def _doubt(found: CycleDrift, rows: Array, current_rms_m: float, change_m: float
     prior = found.prior_covariance
     if prior is not None and error <= 0.5 * _rms(rows, prior):
         return ""
-    if error <= max(2.0 * current_rms_m, change_m / np.sqrt(3.0)):
-        return ""
-    return (
-        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
-        f"for a change of {change_m * 1e3:.3f} mm: spread them and turn every joint, the wrist too"
-    )
+    return too_narrow(error, change_m, current_rms_m, SPREAD_POSES)
 
 
 def _rms(rows: Array, covariance: Array) -> float:

@@ -4,16 +4,16 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.core.assessment import summarise
+from robocal_ros.core.assessment import Judgement, summarise
 from robocal_ros.core.documents import (
     cell_document,
     errors_document,
+    judged_errors_document,
     parameters_document,
     transform_document,
     verdict_document,
 )
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.cycle_verdict import JudgedCycle
 from robocal_ros.core.thermal.flange_identification import JudgedFlangeSensor
 from robocal_ros.core.thermal.identification import CycleDrift
 from robocal_ros.core.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict
@@ -51,7 +51,7 @@ def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
 
 
 def cycle_document(
-    found: CycleDrift, judged: JudgedCycle, spots: ColdSpots, nominal: SerialArm, method: str
+    found: CycleDrift, judged: Judgement, spots: ColdSpots, nominal: SerialArm, method: str
 ) -> Document:
     """A cycle's drift in the form of ``identify``; the nominal model is the cold one here."""
     names = nominal.parameters.names
@@ -62,16 +62,7 @@ def cycle_document(
         "robot": nominal.name,
         "model_hash": nominal.model_hash,
         "method": method,
-        "nominal": {"held_out": errors_document(judged.cold)},
-        "in_force": {"held_out": errors_document(judged.current)},
-        "calibrated": {
-            "held_out": errors_document(judged.candidate),
-            "predicted": {
-                "model_rms_mm": judged.predicted_rms_m * 1e3,
-                "total_rms_mm": judged.predicted_total_rms_m * 1e3,
-                "workspace_rms_mm": judged.workspace_rms_m * 1e3,
-            },
-        },
+        **judged_errors_document(judged),
         "parameters": parameters_document(nominal, found.arm, solved),
         **cell_document(spots.cell),
         "noise_mm": found.noise_m * 1e3,
@@ -100,16 +91,7 @@ def flange_sensor_document(judged: JudgedFlangeSensor) -> Document:
         "robot": result.nominal.name,
         "model_hash": result.nominal.model_hash,
         "method": "map",
-        "nominal": {"held_out": errors_document(judged.nominal)},
-        "in_force": {"held_out": errors_document(judged.nominal)},
-        "calibrated": {
-            "held_out": errors_document(judged.candidate),
-            "predicted": {
-                "model_rms_mm": judged.predicted_rms_m * 1e3,
-                "total_rms_mm": judged.predicted_total_rms_m * 1e3,
-                "workspace_rms_mm": judged.workspace_rms_m * 1e3,
-            },
-        },
+        **judged_errors_document(judged),
         "parameters": parameters_document(result.nominal, result.cell.arm, sigma),
         "T_flange_sensor": transform_document(result.cell.T_flange_sensor),
         "spheres": {

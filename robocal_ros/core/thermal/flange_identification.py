@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import estimation, frames
 from robocal_ros.core.assessment import (
-    ErrorSummary,
-    Verdict,
+    Judgement,
     gross,
     hold_out,
     judge,
     pose_groups,
     summarise,
+    too_narrow,
 )
 from robocal_ros.core.identification.priors import default_prior, fitted_prior
 from robocal_ros.core.identification.solve import random_postures
@@ -147,28 +147,14 @@ def identify_flange_sensor(
 
 
 @dataclass(frozen=True)
-class JudgedFlangeSensor:
-    """An identified measuring robot with its figures on measurements not used to solve.
+class JudgedFlangeSensor(Judgement):
+    """An identified measuring robot with its judgement.
 
     Errors are distances of each measured centre, in base, from its sphere's mean over the session.
-
-    Attributes
-    ----------
-    nominal, candidate : with the nominal geometry and its own hand-eye pose, and with the
-        identified ones.
-    predicted_rms_m, predicted_total_rms_m : the candidate's error expected from its covariance,
-        alone and with the noise of the measurements.
-    workspace_rms_m : the same as the first over postures throughout the joint limits.
+    The nominal model, with a hand-eye pose of its own, is the one in force.
     """
 
     identification: FlangeSensorIdentification
-    nominal: ErrorSummary
-    candidate: ErrorSummary
-    predicted_rms_m: float
-    predicted_total_rms_m: float
-    workspace_rms_m: float
-    held_out_rejected: tuple[str, ...]
-    verdict: Verdict
 
 
 def identify_and_judge_flange_sensor(
@@ -199,10 +185,12 @@ def identify_and_judge_flange_sensor(
     sound = ~gross(before, after)
     model = float(result.predicted_variance(check).mean())
     noise = result.noise_m if check.sigma is None else float(np.sqrt(np.mean(check.sigma**2)))
-    doubt = _doubt(result, summarise(before[sound]).rms_m)
+    plain_error = summarise(before[sound])
+    doubt = _doubt(result, plain_error.rms_m)
     return JudgedFlangeSensor(
         identification=result,
-        nominal=summarise(before[sound]),
+        nominal=plain_error,
+        current=plain_error,
         candidate=summarise(after[sound]),
         predicted_rms_m=float(np.sqrt(model)),
         predicted_total_rms_m=float(np.sqrt(model + 3.0 * noise**2)),
@@ -214,16 +202,6 @@ def identify_and_judge_flange_sensor(
 
 def _doubt(result: FlangeSensorIdentification, current_rms_m: float) -> str:
     """Say why the poses do not carry over to other ones; empty when they do."""
-    if not result.estimate.converged:
-        return (
-            f"the solution still crept after {result.estimate.iterations} iterations along "
-            "directions that the poses hardly show"
-        )
+    remedy = "look at the spheres from more sides, and turn every joint"
     error, change = result.workspace_rms(), result.workspace_change()
-    if error <= max(2.0 * current_rms_m, change / np.sqrt(3.0)):
-        return ""
-    return (
-        f"over the whole workspace the measured poses leave an error of {error * 1e3:.3f} mm rms, "
-        f"for a change of {change * 1e3:.3f} mm: look at the spheres from more sides, and turn "
-        "every joint"
-    )
+    return result.estimate.creeping or too_narrow(error, change, current_rms_m, remedy)

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.observability import Observability, describe, observability
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.agreement import agreeing, left_out
 from robocal_ros.core.thermal.process import SETUP_SIGMA_M
 from robocal_ros.core.thermal.spots import ColdSpots
+from robocal_ros.core.thermal.subset import subset_drift
 
 Array = NDArray[np.float64]
 
@@ -143,53 +144,42 @@ def identify_subset(
     warm = spots.average(warm, sigma_m)
     spot, arm = spots.match(warm), spots.cell.arm
     require_parameters(arm, names)
-    chosen = np.array([name in names for name in arm.parameters.names], dtype=np.bool_)
-    A = spots.rows(warm.q, spots.target[spot])[0].reshape(3 * len(warm), -1)[:, chosen]
-    few = TooFewSamplesError(
-        f"{len(warm)} poses give {len(A)} equations for {A.shape[1]} parameters: measure more"
-    )
-    if len(A) < A.shape[1]:
-        raise few
-    seen = observability(A)
-    if seen.null.shape[1]:
-        words = [describe(column, tuple(names)) for column in seen.null.T]
-        raise RankDeficientError(f"not determined by these poses: {'; '.join(words)}", words)
-    if len(A) < A.shape[1] + 3:  # without any pose the others must still determine all
-        raise few
+    rows = spots.rows(warm.q, spots.target[spot])[0].reshape(3 * len(warm), -1)
+    chosen = [i for i, name in enumerate(arm.parameters.names) if name in names]
+    y = spots.drift(warm).ravel()
+    fit = subset_drift(y[None], rows, chosen, arm.parameters.names)
+    if len(y) < len(chosen) + 3:
+        raise TooFewSamplesError(
+            f"{len(warm)} poses give {len(y)} equations for {len(chosen)} parameters, and without "
+            "any of them the others must still determine all: measure more"
+        )
     variance = float(visit_variance(spots, spot, warm, sigma_m).mean())
-    return _least_squares(spots, warm, A, chosen, variance, seen)
-
-
-def _least_squares(
-    spots: ColdSpots,
-    warm: Measurements,
-    A: Array,
-    chosen: NDArray[np.bool_],
-    variance: float,
-    seen: Observability,
-) -> CycleDrift:
-    """By singular values; each pose is forecast from the others by its leverage."""
-    y, arm = spots.drift(warm).ravel(), spots.cell.arm
-    U, s, Vt = np.linalg.svd(A, full_matrices=False)
-    drift, covariance = np.zeros(len(chosen)), np.zeros((len(chosen),) * 2)
-    drift[chosen] = Vt.T @ ((U.T @ y) / s)
-    covariance[np.ix_(chosen, chosen)] = variance * (Vt.T / s**2) @ Vt
-    residual = (y - U @ (U.T @ y)).reshape(-1, 3)
-    rows = U.reshape(len(warm), 3, -1)
-    own = np.linalg.inv(np.eye(3) - rows @ np.swapaxes(rows, 1, 2))
+    drift, covariance = np.zeros(rows.shape[1]), np.zeros((rows.shape[1],) * 2)
+    drift[chosen] = fit.drift[0]
+    covariance[np.ix_(chosen, chosen)] = variance * fit.inverse @ fit.inverse.T
+    left, spread = _forecasts(y, fit.basis, variance)
     return CycleDrift(
         drift=drift,
         covariance=covariance,
         prior_covariance=None,
         arm=arm.with_mdh(arm.parameters.add(arm.mdh, drift)),
         warm=warm,
-        left_out=np.einsum("mij,mj->mi", own, residual),
-        left_out_sigma=np.sqrt(variance * np.trace(own, axis1=1, axis2=2)),
+        left_out=left,
+        left_out_sigma=spread,
         rejected=np.zeros(len(warm), dtype=np.bool_),
         noise_m=float(np.sqrt(variance)),
-        seen=seen,
+        seen=observability(rows[:, chosen]),
         unobservable=(),
     )
+
+
+def _forecasts(y: Array, basis: Array, variance: float) -> tuple[Array, Array]:
+    """Each pose less its forecast from the others (m, 3), and its rms length (m,); by leverage."""
+    residual = (y - basis @ (basis.T @ y)).reshape(-1, 3)
+    rows = basis.reshape(len(residual), 3, -1)
+    own = np.linalg.inv(np.eye(3) - rows @ np.swapaxes(rows, 1, 2))
+    spread = np.sqrt(variance * np.trace(own, axis1=1, axis2=2))
+    return np.einsum("mij,mj->mi", own, residual), spread
 
 
 def visit_variance(

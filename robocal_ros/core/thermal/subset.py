@@ -26,12 +26,19 @@ class SubsetDrift:
     ----------
     chosen : (p,) columns of the parameters.
     drift : (t, p) since the cold visit, SI.
-    gain : (p,) standard deviation of each per unit of noise in a coordinate of the displacement.
+    basis : (3m, p) orthonormal, of the displacements that the chosen parameters can cause.
+    inverse : (p, p) from coordinates in that basis to parameters.
     """
 
     chosen: Index
     drift: Array
-    gain: Array
+    basis: Array
+    inverse: Array
+
+    @property
+    def gain(self) -> Array:
+        """(p,) standard deviation of each per unit of noise in a coordinate of a displacement."""
+        return np.asarray(np.linalg.norm(self.inverse, axis=1))
 
     @property
     def size(self) -> Array:
@@ -70,12 +77,8 @@ def subset_drift(
         raise RankDeficientError(f"not determined by these poses: {'; '.join(words)}", words)
     length = np.linalg.norm(A, axis=0)
     U, s, Vt = np.linalg.svd(A / length, full_matrices=False)
-    inverse = (Vt.T / s) / length[:, None]  # of A, but for U
-    return SubsetDrift(
-        chosen=columns,
-        drift=displacement @ U @ inverse.T,
-        gain=np.linalg.norm(inverse, axis=1),
-    )
+    inverse = (Vt.T / s) / length[:, None]
+    return SubsetDrift(columns, displacement @ U @ inverse.T, U, inverse)
 
 
 def open_directions(rows: Array, chosen: Sequence[int], names: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,17 +1,17 @@
 """A measuring cycle through the tracker: what the robot's parameters are now, and the verdict."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.assessment import Judgement, Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.observability import describe, observability
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.cycle_verdict import JudgedCycle, conclude
+from robocal_ros.core.thermal.cycle_verdict import conclude
 from robocal_ros.core.thermal.identification import FEWEST_POSES, CycleDrift
 from robocal_ros.core.thermal.steps import FixedSphere, possible_causes, step_words
 from robocal_ros.core.thermal.tracking import DriftTracker, Innovation, TrackerState
@@ -31,7 +31,7 @@ class TrackedCycle:
     """
 
     found: CycleDrift
-    judged: JudgedCycle
+    judged: Judgement
     innovation: Innovation
 
 
@@ -83,7 +83,7 @@ def track_cycle(
         usable=innovation.kept,
     )
     if moved:
-        judged = judged.with_verdict(_refusal(tracker, warm, innovation, fixed))
+        judged = replace(judged, verdict=_refusal(tracker, warm, innovation, fixed))
     return TrackedCycle(found, judged, innovation)
 
 

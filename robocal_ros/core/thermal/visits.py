@@ -45,10 +45,6 @@ class Visits:
         """Return the visits of one cycle."""
         return self.take(np.array([cycle == name for cycle in self.cycle], dtype=np.bool_))
 
-    def of_poses(self, names: frozenset[str]) -> "Visits":
-        """Return the visits of these poses."""
-        return self.take(np.array([pose in names for pose in self.pose], dtype=np.bool_))
-
 
 def require_cold_counterparts(cold: Visits, warm: Visits, file: str | None = None) -> None:
     """Refuse warm visits of a pose that was not visited cold, or at other joints.

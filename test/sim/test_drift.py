@@ -1,0 +1,20 @@
+"""The robots of whole shifts: scaled to what was published, and chosen by it alone."""
+
+import numpy as np
+import pytest
+
+from bench.thermal import SEEDS
+from robocal_ros.core.thermal.drift_history import share_within
+from robocal_ros.sim import kr150
+from robocal_ros.sim.drift import UNCORRECTED, drifting_cell, poses
+from robocal_ros.storage.robots import load_robot
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_a_robot_counts_where_six_lengths_do_as_published(seed):
+    robot = kr150.true_robot(load_robot("kr150_r3100"), np.random.default_rng(seed))
+    cell = drifting_cell(robot, poses("sphere"), poses("check"))
+    assert cell.as_published == (seed in SEEDS)
+    # Scaled at every sixth cycle of 90: the others may differ by a cycle's share on either side.
+    for plan in cell.plans:
+        assert share_within(cell.truth(plan)) == pytest.approx(UNCORRECTED, abs=2.0 / 90.0)
