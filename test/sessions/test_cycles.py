@@ -1,0 +1,364 @@
+"""Measuring cycles of the session: bracketed, timed out, broken off, repeated, and what follows."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shift import T_SENSOR_BASE, Shift, built, of_kind, postures, warmed
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.core.samples import REFERENCE_SPHERE, JointSample, PointSample
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.sessions import events
+from robocal_ros.sessions.drift_following import CHECKPOINT_EVERY
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+NS = 1_000_000_000
+POSES = 8
+CONFIG = ThermalConfig(sigma_m=2e-5, cycle_timeout_s=60.0)
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    return load_robot("kr150_r3100")
+
+
+class Cell:
+    """A robot with its session; time runs on in one shift."""
+
+    def __init__(self, nominal, folder: Path, config: ThermalConfig = CONFIG) -> None:
+        self.nominal, self.folder, self.config = nominal, folder, config
+        self.shift = Shift(nominal.joint_names)
+        self.cold, self.q = built(nominal), postures(nominal, POSES)
+        self.session = self.start()
+
+    def start(self) -> ThermalSession:
+        """A node that starts: it knows the history alone."""
+        history = CalibrationHistory.open(
+            "s1", model_hash=self.nominal.model_hash, state_dir=self.folder
+        )
+        self.session = ThermalSession(self.nominal, history, self.config, "test")
+        return self.session
+
+    def feed(self, samples: Iterable[JointSample | PointSample]) -> None:
+        for sample in samples:
+            self.session.add(sample)
+
+    def visit(self, kelvin: float = 0.0, poses: slice = slice(None), after_h: float = 0.0) -> None:
+        self.feed(self.shift.visit(warmed(self.cold, kelvin), self.q[poses], after_h))
+
+    def ask(self, name: str, **arguments) -> Outcome:
+        self.session.submit(Command(name, arguments))
+        return self.session.advance(wall_ns=self.shift.now_ns, force=True)[-1]
+
+    def capture(self) -> None:
+        self.visit()
+        assert self.ask(events.CAPTURE_REFERENCE).done
+
+    def idle(self, seconds: float) -> None:
+        """The robot stands elsewhere and is not measured."""
+        self.shift.now_ns += round(seconds * NS)
+        for sample in self.shift.visit(self.cold, self.q[:1] + 1.0):
+            if isinstance(sample, JointSample):
+                self.session.add(sample)
+
+
+@pytest.fixture
+def cell(nominal, tmp_path) -> Cell:
+    made = Cell(nominal, tmp_path)
+    made.capture()
+    return made
+
+
+def test_a_bracketed_cycle_takes_what_was_measured_within(cell):
+    cell.visit(15.0, slice(3), after_h=2.0)  # before the cycle began
+    assert cell.ask(events.BEGIN_CYCLE, cycle_id="c1").done
+    cell.visit(15.0)
+    found = cell.ask(events.END_CYCLE, cycle_id="c1")
+    assert (found.status, found.samples) == (Code.ACCEPT, POSES)
+    assert found.document["cycle_id"] == "c1"
+    assert found.document["poses"] == {"visited": POSES, "missing": []}
+    assert cell.session.cycle.id == ""
+
+
+def test_begin_and_end_may_be_called_again(cell):
+    cell.visit(15.0, after_h=2.0)
+    begun = cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    cell.visit(15.0)
+    again = cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    assert again.done
+    assert (begun.repeated, again.repeated) == (False, True)
+    first = cell.ask(events.END_CYCLE, cycle_id="c1")
+    second = cell.ask(events.END_CYCLE, cycle_id="c1")
+    assert second.repeated
+    assert (second.calibration_id, second.status) == (first.calibration_id, first.status)
+    assert first.samples == POSES  # the second begin dropped nothing
+    reused = cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    assert reused.status is Code.CONFLICT
+    assert "has ended already" in reused.message
+
+
+def test_the_answer_is_known_after_a_restart(cell):
+    cell.visit(15.0, after_h=2.0)
+    first = cell.ask(events.END_CYCLE, cycle_id="c1")
+    cell.start()
+    second = cell.ask(events.END_CYCLE, cycle_id="c1")
+    assert (second.repeated, second.calibration_id) == (True, first.calibration_id)
+    assert second.status is first.status
+
+
+def test_only_the_open_cycle_ends(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    refused = cell.ask(events.END_CYCLE, cycle_id="c2")
+    assert refused.status is Code.CONFLICT
+    assert "'c1' is open, not 'c2'" in refused.message
+    assert cell.session.cycle.id == "c1"
+
+
+def test_a_new_cycle_breaks_off_the_open_one(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    cell.visit(40.0, slice(2), after_h=2.0)  # what is left of it must not be used
+    begun = cell.ask(events.BEGIN_CYCLE, cycle_id="c2")
+    assert "cycle 'c1' is broken off" in begun.message
+    cell.visit(15.0)
+    found = cell.ask(events.END_CYCLE)
+    assert (found.status, found.samples) == (Code.ACCEPT, POSES)
+    assert found.document["cycle_id"] == "c2"
+
+
+def test_a_cycle_needs_a_cold_reference(nominal, tmp_path):
+    cell = Cell(nominal, tmp_path)
+    for name in (events.BEGIN_CYCLE, events.END_CYCLE):
+        refused = cell.ask(name, cycle_id="c1")
+        assert refused.status is Code.CONFLICT
+        assert "no cold reference" in refused.message
+
+
+def test_missing_poses_are_named_by_their_number(cell):
+    cell.visit(15.0, slice(2, 7), after_h=2.0)
+    found = cell.ask(events.END_CYCLE)
+    assert found.document["poses"] == {"visited": 5, "missing": [1, 2, 8]}
+    assert found.samples == 5
+
+
+def test_a_failed_end_leaves_the_cycle_open(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    refused = cell.ask(events.END_CYCLE, cycle_id="c1")
+    assert refused.status is Code.TOO_FEW_SAMPLES
+    cell.visit(15.0, after_h=2.0)
+    assert cell.ask(events.END_CYCLE, cycle_id="c1").samples == POSES
+
+
+def test_time_ends_a_cycle_with_and_without_a_beginning(cell):
+    for begins in (True, False):
+        if begins:
+            cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+        cell.visit(15.0, slice(6), after_h=0.0 if begins else 2.0)
+        assert cell.session.overdue() is None
+        cell.idle(61.0)
+        command = cell.session.overdue()
+        assert command is not None
+        cell.session.submit(command)
+        outcome = cell.session.advance(wall_ns=1, force=True)[-1]
+        assert outcome.samples == 6
+        assert outcome.command.arguments["by"] == "time-out"
+        assert cell.session.overdue() is None
+        assert cell.session.cycle.id == ""
+
+
+def test_an_empty_cycle_times_out_too(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    cell.idle(61.0)
+    cell.session.submit(cell.session.overdue())
+    (outcome,) = cell.session.advance(wall_ns=1, force=True)
+    assert outcome.status is Code.TOO_FEW_SAMPLES
+    assert cell.session.cycle.id == ""
+    assert cell.session.overdue() is None
+
+
+def test_some_stray_measurements_are_no_cycle(cell):
+    cell.visit(0.0, slice(3))
+    cell.idle(61.0)
+    assert cell.session.overdue() is None
+    cell.visit(15.0, after_h=2.0)  # nor do they get into the next one
+    assert cell.ask(events.IDENTIFY).samples == POSES
+
+
+def test_other_poses_are_left_out(cell):
+    other = postures(cell.nominal, 2, seed=99)
+    cell.feed(cell.shift.visit(cell.cold, other, after_h=2.0))
+    cell.visit(15.0)
+    found = cell.ask(events.END_CYCLE)
+    assert (found.status, found.samples) == (Code.ACCEPT, POSES)
+    assert sum(c.total() for c in cell.session.desk.ignored.values()) == 2
+    cell.feed(cell.shift.visit(cell.cold, other))
+    refused = cell.ask(events.END_CYCLE)
+    assert refused.status is Code.BAD_INPUT
+    assert "none of the 2 measured poses" in refused.message
+
+
+def test_a_visit_counts_once_however_often_it_is_measured(cell):
+    samples = list(cell.shift.visit(warmed(cell.cold, 15.0), cell.q, after_h=2.0))
+    often = []
+    for sample in samples:
+        often.append(sample)
+        if isinstance(sample, PointSample):
+            often += [replace(sample, stamp_ns=sample.stamp_ns + i * NS // 100) for i in (1, 2)]
+    cell.feed(often)
+    found = cell.ask(events.END_CYCLE)
+    assert found.samples == POSES
+    inputs = cell.session._history.inputs(found.calibration_id)
+    assert inputs["sigma"] == pytest.approx(np.full(POSES, CONFIG.sigma_m))
+
+
+def test_a_restart_goes_on_from_the_same_state(nominal, tmp_path):
+    """Cycles with restarts in between, beyond a kept state: the same bits as without."""
+    cells = [Cell(nominal, tmp_path / name) for name in ("steady", "restarted")]
+    for cell in cells:
+        cell.capture()
+    for number in range(CHECKPOINT_EVERY + 3):
+        for cell in cells:
+            cell.visit(0.3 * number, slice(4), after_h=0.2)
+            assert cell.ask(events.IDENTIFY).calibration_id
+        if number in (1, 7, CHECKPOINT_EVERY - 1, CHECKPOINT_EVERY + 1):
+            cells[1].start()
+    steady, restarted = (cell.session.follower.state for cell in cells)
+    assert steady.cycles == restarted.cycles == CHECKPOINT_EVERY + 3
+    assert steady.stamp_ns == restarted.stamp_ns
+    assert np.array_equal(steady.tracker.mean, restarted.tracker.mean)
+    assert np.array_equal(steady.tracker.covariance, restarted.tracker.covariance)
+
+
+def test_what_could_not_be_kept_was_not_taken(cell):
+    """The disk is full, then it is not: the cycle counts once."""
+    cell.visit(15.0, after_h=2.0)
+    before = cell.session.follower.state
+    path = cell.session._history.path
+    path.rename(path.with_suffix(".away"))
+    refused = cell.ask(events.END_CYCLE, cycle_id="c1")
+    assert refused.status is Code.STORAGE_FAILED
+    assert cell.session.follower.state is before
+    path.with_suffix(".away").rename(path)
+    found = cell.ask(events.END_CYCLE, cycle_id="c1")
+    assert (found.status, found.samples) == (Code.ACCEPT, POSES)
+
+
+def knocked(samples: Iterable[JointSample | PointSample]) -> list[JointSample | PointSample]:
+    """The sensor was moved by a millimetre: every point it measures is off the same way."""
+    T = frames.transform(frames.exp_rotation([0.0, 1e-3, 0.0]), [8e-4, 0.0, 5e-4])
+    return [
+        replace(s, position_m=T[:3, :3] @ s.position_m + T[:3, 3])
+        if isinstance(s, PointSample)
+        else s
+        for s in samples
+    ]
+
+
+def fixed_points(samples: list, moved: bool) -> list:
+    """A sphere on the floor is measured together with the one on the flange."""
+    centre = (T_SENSOR_BASE @ [1.0, -1.0, 0.0, 1.0])[:3]
+    rng, found = np.random.default_rng(4), []
+    for sample in samples:
+        found.append(sample)
+        if isinstance(sample, PointSample):
+            at = centre + 2e-5 * rng.normal(size=3)
+            found.append(PointSample(sample.stamp_ns, sample.frame, "floor", at, REFERENCE_SPHERE))
+    return knocked(found) if moved else found
+
+
+def test_a_knocked_sensor_freezes_the_model(cell):
+    cell.visit(15.0, after_h=2.0)
+    assert cell.ask(events.END_CYCLE, cycle_id="c1").done
+    accepted = cell.ask(events.ACCEPT, id=2)
+    assert accepted.done
+    state = cell.session.follower.state
+    assert cell.session.accuracy(cell.shift.now_ns).level is AccuracyLevel.OK
+    cell.feed(knocked(cell.shift.visit(warmed(cell.cold, 15.0), cell.q)))
+    refused = cell.ask(events.END_CYCLE, cycle_id="c2")
+    assert refused.status is Code.SENSOR_OR_ROBOT_MOVED
+    assert "sensor and robot base moved against each other" in refused.message
+    assert "reference_sphere_center, would decide" in refused.message
+    now = cell.session.follower.state
+    assert now.tracker is state.tracker
+    accuracy = cell.session.accuracy(cell.shift.now_ns)
+    assert accuracy.level is AccuracyLevel.FAULT
+    assert accuracy.reason == refused.message
+    denied = cell.ask(events.ACCEPT, id=refused.calibration_id)
+    assert denied.status is Code.SENSOR_OR_ROBOT_MOVED
+    cell.start()  # it is known after a restart
+    assert cell.session.accuracy(cell.shift.now_ns).level is AccuracyLevel.FAULT
+    cell.visit(15.0)  # the sensor is back
+    again = cell.ask(events.END_CYCLE, cycle_id="c3")
+    assert again.status is not Code.SENSOR_OR_ROBOT_MOVED
+    assert cell.session.accuracy(cell.shift.now_ns).level is AccuracyLevel.OK
+
+
+@pytest.mark.parametrize("what", ["sensor", "sphere"])
+def test_a_fixed_sphere_decides(nominal, tmp_path, what):
+    cell = Cell(nominal, tmp_path)
+    cell.feed(fixed_points(list(cell.shift.visit(cell.cold, cell.q)), moved=False))
+    assert cell.ask(events.CAPTURE_REFERENCE).samples == POSES
+    warm = list(cell.shift.visit(warmed(cell.cold, 15.0), cell.q, after_h=2.0))
+    if what == "sphere":
+        warm = fixed_points(knocked(warm), moved=False)
+    else:
+        warm = fixed_points(warm, moved=True)
+    cell.feed(warm)
+    refused = cell.ask(events.END_CYCLE)
+    assert refused.status is Code.SENSOR_OR_ROBOT_MOVED
+    words = "so the sensor did" if what == "sensor" else "stands where it was, so the sensor too"
+    assert words in refused.message
+
+
+def test_accuracy_ages(cell):
+    levels = [
+        cell.session.accuracy(cell.shift.now_ns + round(hours * 3600 * NS)).level
+        for hours in (0.0, 7.95, 9.0)
+    ]
+    assert levels[0] is AccuracyLevel.OK
+    assert levels[1] in (AccuracyLevel.DUE, AccuracyLevel.DEGRADED)
+    assert levels[2] is AccuracyLevel.EXPIRED
+
+
+def test_without_a_reference_nothing_is_known(nominal, tmp_path):
+    found = Cell(nominal, tmp_path).session.accuracy(5)
+    assert found.level is AccuracyLevel.EXPIRED
+    assert found.error is None
+    assert "no cold reference" in found.reason
+
+
+def test_a_tight_tolerance_is_missed(nominal, tmp_path):
+    cell = Cell(nominal, tmp_path, replace(CONFIG, tolerance_m=1e-7))
+    cell.capture()
+    found = cell.session.accuracy(cell.shift.now_ns)
+    assert found.level is AccuracyLevel.DEGRADED
+    assert found.due_in_s < 0.0
+    assert "of 0.00 mm allowed" in found.reason
+
+
+def test_a_clock_that_jumps_back_does_not_stop_the_cycles(cell):
+    cell.visit(15.0, after_h=2.0)
+    assert cell.ask(events.END_CYCLE, cycle_id="c1").done
+    cell.shift.now_ns -= 3600 * NS
+    cell.visit(15.0)
+    found = cell.ask(events.END_CYCLE, cycle_id="c2")
+    assert found.samples == POSES
+    assert found.status is not Code.SENSOR_OR_ROBOT_MOVED
+    assert cell.session.desk.jumps == 1
+    assert cell.session.accuracy(cell.shift.now_ns).error is not None
+
+
+def test_stamps_of_joints_alone_do_not_end_a_cycle_early(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    newest = cell.session.desk.newest_ns[JOINTS]
+    joints = of_kind(list(cell.shift.visit(cell.cold, cell.q[:1])), JointSample)
+    cell.feed(joints)
+    assert cell.session.desk.newest_ns[JOINTS] > newest
+    assert cell.session.overdue() is None
