@@ -7,12 +7,19 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseStamped
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from robocal_msgs.msg import CalibrationQuality, KinematicModel, SessionEvent
-from robocal_msgs.srv import CaptureReference, Decide, Identify, ListCalibrations
+from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel, SessionEvent
+from robocal_msgs.srv import (
+    BeginCycle,
+    CaptureReference,
+    Decide,
+    EndCycle,
+    Identify,
+    ListCalibrations,
+)
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from robocal_ros.core.samples import JointSample, PointSample
+from robocal_ros.core.samples import REFERENCE_SPHERE, JointSample, PointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.thermal_outputs import EVENTS
@@ -24,7 +31,11 @@ LATCHED_EVENTS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
-TOPICS = {"joint_states": JointState, "measured_point": PointStamped}
+TOPICS = {
+    "joint_states": JointState,
+    "measured_point": PointStamped,
+    REFERENCE_SPHERE: PointStamped,
+}
 LOSSLESS = {
     f"qos_overrides./{topic}.subscription.{policy}": value
     for topic in TOPICS
@@ -37,6 +48,8 @@ SERVICES = {
     "reject": Decide,
     "rollback": Decide,
     "list": ListCalibrations,
+    "begin_cycle": BeginCycle,
+    "end_cycle": EndCycle,
 }
 
 
@@ -62,10 +75,12 @@ class Cell:
         self.models = graph.collect(KinematicModel, "/thermal_node/model", qos.LATCHED)
         self.candidates = graph.collect(KinematicModel, "/thermal_node/candidate", qos.LATCHED)
         self.qualities = graph.collect(CalibrationQuality, "/thermal_node/quality", qos.LATCHED)
+        self.accuracies = graph.collect(AccuracyState, "/thermal_node/accuracy", qos.LATCHED)
         self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
         probe = graph.probe
         self.joints = probe.create_publisher(JointState, "/joint_states", DEEP)
         self.points = probe.create_publisher(PointStamped, "/measured_point", DEEP)
+        self.fixed = probe.create_publisher(PointStamped, f"/{REFERENCE_SPHERE}", DEEP)
         self.poses = probe.create_publisher(PoseStamped, "/measured_pose", DEEP)
         self.clients = {
             name: probe.create_client(kind, f"/thermal_node/{name}")
@@ -82,7 +97,7 @@ class Cell:
         self.models.clear()
         self.sent = 0
         process = self.graph.start("thermal_node", self.parameters)
-        publishers = (self.joints, self.points, self.poses)
+        publishers = (self.joints, self.points, self.poses, self.fixed)
         self.graph.spin_until(
             lambda: (
                 self.models
@@ -102,12 +117,16 @@ class Cell:
     def play(self, samples: Iterable[Any]) -> None:
         """Publish as fast as it goes; nothing is lost, the node keeps all."""
         for sample in samples:
-            publisher = self.joints if isinstance(sample, JointSample) else self.points
-            publisher.publish(message_of(sample))
+            self._publisher(sample).publish(message_of(sample))
             self.sent += isinstance(sample, JointSample)
         self.graph.spin_until(
             lambda: self.value("joint_states received") == str(self.sent), "all joints taken"
         )
+
+    def _publisher(self, sample: JointSample | PointSample) -> Any:
+        if isinstance(sample, JointSample):
+            return self.joints
+        return self.fixed if sample.topic == REFERENCE_SPHERE else self.points
 
     def status(self) -> Any:
         """The node's last diagnostic status, None before the first."""

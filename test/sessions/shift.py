@@ -1,13 +1,13 @@
 """A small simulated shift: a robot moves from pose to pose, a ball on it is measured at rest."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import JointSample, PointSample
+from robocal_ros.core.samples import REFERENCE_SPHERE, JointSample, PointSample
 
 NS = 1_000_000_000
 PERIOD_NS = 10_000_000
@@ -85,3 +85,27 @@ class Shift:
 
 def of_kind(samples: Sequence[Sample], kind: type) -> list[Sample]:
     return [sample for sample in samples if isinstance(sample, kind)]
+
+
+def knocked(samples: Iterable[Sample]) -> list[Sample]:
+    """The sensor was moved by a millimetre: every point it measures is off the same way."""
+    T = frames.transform(frames.exp_rotation([0.0, 1e-3, 0.0]), [8e-4, 0.0, 5e-4])
+    return [
+        replace(s, position_m=T[:3, :3] @ s.position_m + T[:3, 3])
+        if isinstance(s, PointSample)
+        else s
+        for s in samples
+    ]
+
+
+def fixed_points(samples: Sequence[Sample], moved: bool) -> list[Sample]:
+    """A sphere on the floor is measured together with the one on the flange."""
+    centre = (T_SENSOR_BASE @ [1.0, -1.0, 0.0, 1.0])[:3]
+    rng = np.random.default_rng(4)
+    found: list[Sample] = []
+    for sample in samples:
+        found.append(sample)
+        if isinstance(sample, PointSample):
+            at = centre + 2e-5 * rng.normal(size=3)
+            found.append(PointSample(sample.stamp_ns, sample.frame, "floor", at, REFERENCE_SPHERE))
+    return knocked(found) if moved else found

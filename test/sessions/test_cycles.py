@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from shift import T_SENSOR_BASE, Shift, built, of_kind, postures, warmed
+from shift import Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
-from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import REFERENCE_SPHERE, JointSample, PointSample
+from robocal_ros.core.samples import JointSample, PointSample
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions import events
 from robocal_ros.sessions.drift_following import CHECKPOINT_EVERY
@@ -248,29 +247,6 @@ def test_what_could_not_be_kept_was_not_taken(cell):
     path.with_suffix(".away").rename(path)
     found = cell.ask(events.END_CYCLE, cycle_id="c1")
     assert (found.status, found.samples) == (Code.ACCEPT, POSES)
-
-
-def knocked(samples: Iterable[JointSample | PointSample]) -> list[JointSample | PointSample]:
-    """The sensor was moved by a millimetre: every point it measures is off the same way."""
-    T = frames.transform(frames.exp_rotation([0.0, 1e-3, 0.0]), [8e-4, 0.0, 5e-4])
-    return [
-        replace(s, position_m=T[:3, :3] @ s.position_m + T[:3, 3])
-        if isinstance(s, PointSample)
-        else s
-        for s in samples
-    ]
-
-
-def fixed_points(samples: list, moved: bool) -> list:
-    """A sphere on the floor is measured together with the one on the flange."""
-    centre = (T_SENSOR_BASE @ [1.0, -1.0, 0.0, 1.0])[:3]
-    rng, found = np.random.default_rng(4), []
-    for sample in samples:
-        found.append(sample)
-        if isinstance(sample, PointSample):
-            at = centre + 2e-5 * rng.normal(size=3)
-            found.append(PointSample(sample.stamp_ns, sample.frame, "floor", at, REFERENCE_SPHERE))
-    return knocked(found) if moved else found
 
 
 def test_a_knocked_sensor_freezes_the_model(cell):
