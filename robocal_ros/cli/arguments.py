@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 PARTS = ("base", "tool", "geometry")
 ROBOT_HELP = "robot file, or name of a shipped robot (ur10, kr150_r3100 …)"
 
+SIGMA_MM = 0.03
+
 
 def parts(value: str) -> tuple[str, ...]:
     """Type of a list such as ``base,tool``; in the order of ``PARTS``.
@@ -106,6 +108,17 @@ def text(value: str) -> str:
     except UnicodeEncodeError as error:
         raise argparse.ArgumentTypeError("holds bytes that are not text") from error
     return value
+
+
+def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
+    """Offer ``--sigma-mm``, the noise of a visit; ``more`` says what else about it."""
+    parser.add_argument(
+        "--sigma-mm",
+        type=positive,
+        default=SIGMA_MM,
+        metavar="S",
+        help=f"noise of a coordinate of one visit{more}; default {SIGMA_MM}",
+    )
 
 
 def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":

@@ -4,7 +4,7 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, text, warn
+from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, text, warn
 from robocal_ros.cli.identify_view import show_identification
 from robocal_ros.cli.output import Outcome
 from robocal_ros.core.errors import InputError
@@ -14,7 +14,6 @@ HELP = "identify a thermal drift, or the geometry of a measuring robot, and judg
 
 FIXED, FLANGE = "fixed-sensor", "flange-sensor"
 _FIXED_ONLY = ("sensor", "cold", "warm", "prior", "parameters")
-SIGMA_MM = 0.03
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,14 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     fixed.add_argument(
         "--parameters", type=text, metavar="NAMES", help="for subset: d4_mm,a1_mm,beta2_deg …"
     )
-    fixed.add_argument(
-        "--sigma-mm",
-        type=positive,
-        default=SIGMA_MM,
-        metavar="S",
-        help="noise of a coordinate of one visit, sensor and repeatability, where the tables "
-        f"have no sigma_mm; default {SIGMA_MM}",
-    )
+    add_sigma(fixed, ", sensor and repeatability, where the tables have no sigma_mm")
     flange = parser.add_argument_group(FLANGE)
     flange.add_argument(
         "--data",

@@ -5,9 +5,16 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.arguments import ROBOT_HELP, count, describe_robot, positive, seed, warn
+from robocal_ros.cli.arguments import (
+    ROBOT_HELP,
+    add_sigma,
+    count,
+    describe_robot,
+    positive,
+    seed,
+    warn,
+)
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.cli.thermal_identify import SIGMA_MM
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,13 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--own", type=Path, metavar="CSV", help="a table of your own measuring poses, to compare"
     )
     parser.add_argument("--prior", type=Path, metavar="P.yaml", help="from learn-prior")
-    parser.add_argument(
-        "--sigma-mm",
-        type=positive,
-        default=SIGMA_MM,
-        metavar="S",
-        help=f"noise of a coordinate of one visit; default {SIGMA_MM}",
-    )
+    add_sigma(parser)
     parser.add_argument(
         "--candidates", type=count, default=CANDIDATES, metavar="N", help=f"default {CANDIDATES}"
     )

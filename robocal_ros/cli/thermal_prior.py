@@ -5,9 +5,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
+from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.cli.thermal_identify import SIGMA_MM
 from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,13 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="CSV",
             help=f"{words}; repeat both for several shifts",
         )
-    parser.add_argument(
-        "--sigma-mm",
-        type=positive,
-        default=SIGMA_MM,
-        metavar="S",
-        help=f"noise of a coordinate of one visit; default {SIGMA_MM}",
-    )
+    add_sigma(parser)
     parser.add_argument("--output", type=Path, metavar="FILE", help="write the prior file")
 
 

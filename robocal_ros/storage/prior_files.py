@@ -4,13 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import InputError, WrongRobotError
+from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.storage.files import read_text, write_text
-from robocal_ros.storage.robot_fields import Fields, load_yaml
+from robocal_ros.storage.made_files import read_made, write_made
+from robocal_ros.storage.robot_fields import Fields
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -21,9 +20,7 @@ SYMMETRY = 1e-9  # of the largest element
 
 def write_prior(path: Path, document: Document) -> None:
     """Write the parts of a learned prior's document that an estimator needs."""
-    kept = {key: document[key] for key in KEYS}
-    text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None, width=2**16)
-    write_text(path, f"# Written by robocal thermal learn-prior.\n{text}")
+    write_made(path, document, KEYS, "thermal learn-prior")
 
 
 def read_prior(path: Path, arm: SerialArm) -> Array:
@@ -36,14 +33,7 @@ def read_prior(path: Path, arm: SerialArm) -> Array:
     WrongRobotError
         When it was learned for another nominal model.
     """
-    file = str(path)
-    top = Fields(load_yaml(read_text(path, "prior file"), file), file, "")
-    top.only(*KEYS)
-    if top.text("model_hash") != arm.model_hash:
-        raise WrongRobotError(
-            f"{path} was learned for {top.text('robot')} with the model {top.text('model_hash')}, "
-            f"not for {arm.name} ({arm.model_hash}): learn it with this robot file"
-        )
+    file, top = str(path), read_made(path, arm, KEYS, "prior file", "learn it")
     if top.values.get("parameters") != list(arm.parameters.names):
         raise InputError(
             f"parameters must be {', '.join(arm.parameters.names)}, in this order", file=file

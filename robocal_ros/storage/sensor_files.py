@@ -5,14 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, WrongRobotError
+from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.storage.files import read_text, write_text
-from robocal_ros.storage.robot_fields import Fields, load_yaml
+from robocal_ros.storage.made_files import read_made, write_made
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -31,9 +29,7 @@ class PlacedSensor:
 
 def write_sensor(path: Path, document: Document) -> None:
     """Write the parts of a sensor's document that place it; the file appears whole or not."""
-    kept = {key: document[key] for key in KEYS}
-    text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None)
-    write_text(path, f"# Written by robocal thermal calibrate-sensor.\n{text}")
+    write_made(path, document, KEYS, "thermal calibrate-sensor")
 
 
 def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
@@ -46,14 +42,7 @@ def read_sensor(path: Path, arm: SerialArm) -> PlacedSensor:
     WrongRobotError
         When it was made for another nominal model.
     """
-    top = Fields(load_yaml(read_text(path, "sensor file"), str(path)), str(path), "")
-    top.only(*KEYS)
-    made_for = top.text("model_hash")
-    if made_for != arm.model_hash:
-        raise WrongRobotError(
-            f"{path} was made for {top.text('robot')} with the model {made_for}, not for "
-            f"{arm.name} ({arm.model_hash}): calibrate the sensor with this robot file"
-        )
+    top = read_made(path, arm, KEYS, "sensor file", "calibrate the sensor")
     pose = top.below("T_sensor_base")
     quat = np.array(pose.numbers("quat_xyzw", 4))
     if abs(float(np.linalg.norm(quat)) - 1.0) > QUATERNION_TOLERANCE:

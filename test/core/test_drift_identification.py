@@ -99,7 +99,10 @@ def test_a_real_drift_is_accepted_and_noise_alone_is_not(arm):
             accepted[moved] += judged.verdict.accept
             if judged.verdict.accept:
                 assert judged.candidate.rms_m < judged.current.rms_m
-    assert accepted[True] >= 30
+    # A drift displaces each pose at random in three directions: gains like chi-square, 3 of each.
+    # The mean of eight then exceeds the t test's limit in 99.7 % of cases (by simulation); more
+    # than two failures of 40 have a chance of 3e-4.
+    assert accepted[True] >= 38
     assert accepted[False] <= 6  # 5 % of 40, within three standard deviations
 
 

@@ -1,0 +1,39 @@
+"""Files that a command made for one robot: YAML, with the nominal model they belong to."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from robocal_ros.core.errors import WrongRobotError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.storage.files import read_text, write_text
+from robocal_ros.storage.robot_fields import Fields, load_yaml
+
+
+def write_made(path: Path, document: dict[str, Any], keys: Sequence[str], command: str) -> None:
+    """Write the parts of a document that a later command needs; the file appears whole or not."""
+    kept = {key: document[key] for key in keys}
+    text = yaml.safe_dump(kept, sort_keys=False, default_flow_style=None, width=2**16)
+    write_text(path, f"# Written by robocal {command}.\n{text}")
+
+
+def read_made(path: Path, arm: SerialArm, keys: Sequence[str], what: str, remedy: str) -> Fields:
+    """Read the keys of such a file, made for ``arm``.
+
+    Raises
+    ------
+    InputError
+        When there is no such file, it is not YAML or has other keys.
+    WrongRobotError
+        When it was made for another nominal model.
+    """
+    top = Fields(load_yaml(read_text(path, what), str(path)), str(path), "")
+    top.only(*keys)
+    if top.text("model_hash") != arm.model_hash:
+        raise WrongRobotError(
+            f"{path} was made for {top.text('robot')} with the model {top.text('model_hash')}, "
+            f"not for {arm.name} ({arm.model_hash}): {remedy} with this robot file"
+        )
+    return top
