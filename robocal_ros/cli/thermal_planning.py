@@ -9,17 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cli.output import Document
-from robocal_ros.core import frames
-from robocal_ros.core.identification.cell import CellModel
-from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.pose_planning import (
-    Design,
-    PosePlan,
-    SensorField,
-    candidate_poses,
-    plan_poses,
-)
+from robocal_ros.core.thermal.cycle_planning import plan_cycle
+from robocal_ros.core.thermal.pose_planning import PosePlan, SensorField
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.storage.files import write_text
 from robocal_ros.storage.prior_files import read_prior
@@ -27,8 +19,6 @@ from robocal_ros.storage.sensor_files import read_sensor
 from robocal_ros.storage.tables import read_measurements
 
 Array = NDArray[np.float64]
-
-COLD_VISITS = 3
 
 
 def plan_files(arm: SerialArm, args: argparse.Namespace) -> Document:
@@ -42,25 +32,24 @@ def plan_files(arm: SerialArm, args: argparse.Namespace) -> Document:
         When the sphere cannot be brought into the field often enough.
     """
     sensor = read_sensor(args.sensor, arm)
-    tool = frames.transform(np.eye(3), sensor.sphere_in_flange)[None]
-    cell = CellModel(arm, sensor.T_sensor_base, ("sphere",), tool)
-    width, height, at, near, far = (1e-3 * x for x in args.field_mm)
-    rng = np.random.default_rng(args.seed)
-    field = SensorField(width, height, at, near, far)
-    candidates = candidate_poses(cell, field, args.candidates, rng)
-    working = random_postures(arm) if args.working is None else _joints(args.working, arm)
     own = None if args.own is None else _joints(args.own, arm)
-    every = candidates if own is None else np.vstack([candidates, own])
-    prior = drift_prior(arm) if args.prior is None else read_prior(args.prior, arm)
-    sigma_m = args.sigma_mm * 1e-3
-    point = arm.T_flange_tool[:3, 3]
-    design = Design.of(cell, every, working, point, prior, sigma_m, COLD_VISITS)
-    plan = plan_poses(design.of_first(len(candidates)), candidates, args.poses, rng)
-    theirs = None if own is None else list(range(len(candidates), len(every)))
-    document = _document(arm, plan) | {
-        "working_poses": len(working),
-        "candidates": len(candidates),
-        "own_mm": None if theirs is None else design.error(theirs) * 1e3,
+    found = plan_cycle(
+        arm,
+        sensor.T_sensor_base,
+        sensor.sphere_in_flange,
+        SensorField(*(1e-3 * x for x in args.field_mm)),
+        prior=drift_prior(arm) if args.prior is None else read_prior(args.prior, arm),
+        sigma_m=args.sigma_mm * 1e-3,
+        count=args.poses,
+        candidates=args.candidates,
+        working=None if args.working is None else _joints(args.working, arm),
+        own=own,
+        seed=args.seed,
+    )
+    document = _document(arm, found.plan) | {
+        "working_poses": found.working,
+        "candidates": found.candidates,
+        "own_mm": None if found.own_rms_m is None else found.own_rms_m * 1e3,
         "own_poses": None if own is None else len(own),
         "output": None,
     }

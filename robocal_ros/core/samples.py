@@ -33,6 +33,20 @@ class JointSample:
     names: tuple[str, ...]
     position: Array
 
+    def order(self, names: tuple[str, ...]) -> NDArray[np.int64]:
+        """Places (n,) of these joints among the sample's.
+
+        Raises
+        ------
+        InputError
+            Naming the joints that are not there.
+        """
+        missing = [name for name in names if name not in self.names]
+        if missing:
+            there = ", ".join(self.names)
+            raise InputError(f"joint state lacks {', '.join(missing)}; it has {there}")
+        return np.array([self.names.index(name) for name in names], dtype=np.int64)
+
 
 @dataclass(frozen=True, slots=True)
 class PointSample:

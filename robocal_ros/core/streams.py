@@ -102,7 +102,7 @@ class JointStream:
         """
         order = self._order.get(sample.names)
         if order is None:
-            order = self._order[sample.names] = self._column_order(sample.names)
+            order = self._order[sample.names] = sample.order(self._names)
         stamp_ns, near_ns = sample.stamp_ns, max(CLOCK_JUMP_NS, gap_ns)
         held, newest = self._held, self.newest_ns
         began_ns = lone_ns = None
@@ -135,12 +135,6 @@ class JointStream:
             self._size = self._capacity
         self._stamp[self._size], self._q[self._size] = stamp_ns, q
         self._size += 1
-
-    def _column_order(self, names: tuple[str, ...]) -> NDArray[np.int64]:
-        missing = [name for name in self._names if name not in names]
-        if missing:
-            raise InputError(f"joint state lacks {', '.join(missing)}; it has {', '.join(names)}")
-        return np.array([names.index(name) for name in self._names], dtype=np.int64)
 
     def standstill(self, stamp_ns: int, rule: StandstillRule) -> Reading | None:
         """Joints at an instant at which the robot stands still; None while readings are to come.

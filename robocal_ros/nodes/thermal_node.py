@@ -5,19 +5,25 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PointStamped, PoseStamped
+from numpy.typing import NDArray
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
+from robocal_ros.core import frames
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.identification import require_parameters
 from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.data_clock import DataClock
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.run import run
+from robocal_ros.nodes.set_up_services import SetUpServices
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.thermal_outputs import ThermalOutputs
 from robocal_ros.nodes.thermal_services import ThermalServices
@@ -25,10 +31,13 @@ from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
 from robocal_ros.sessions.events import CYCLE, Command, Outcome
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
+from robocal_ros.sessions.proposing import SENSOR
 from robocal_ros.sessions.records import configuration
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
+
+Array = NDArray[np.float64]
 
 NO_SERIAL = "unset"
 POLL_S = 0.5
@@ -46,22 +55,6 @@ INPUTS = {
 STREAM = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT
 )
-
-
-class DataClock:
-    """The samples' clock, read between them too: ROS time runs on where they pause."""
-
-    def __init__(self) -> None:
-        self._newest_ns: int | None = None
-        self._read_ns = 0
-
-    def at(self, newest_ns: int | None, now_ns: int) -> int:
-        """Time of the samples' clock at ROS time ``now_ns``; that itself before the first."""
-        if newest_ns is None:
-            return now_ns
-        if newest_ns != self._newest_ns:
-            self._newest_ns, self._read_ns = newest_ns, now_ns
-        return newest_ns + max(now_ns - self._read_ns, 0)
 
 
 class ThermalNode(HouseNode):
@@ -98,6 +91,9 @@ class ThermalNode(HouseNode):
         for kind, message_type in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), STREAM)
         ThermalServices(self.add_service, self._ask, self._history)
+        SetUpServices(
+            self.add_service, self._ask, self._history, self._nominal, settings, self._prior
+        )
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
         self._deadline = self.add_timer(settings["command_timeout_s"], self._force, steady=True)
@@ -156,6 +152,11 @@ class ThermalNode(HouseNode):
         self._session.submit(command, self.now_ns())
         self._step()
         return future
+
+    def _prior(self) -> Array:
+        if self._session is None:
+            raise NotActiveError("no session: activate the node")
+        return self._session.prior
 
     def _force(self) -> None:
         self._step(force=True)
@@ -221,13 +222,18 @@ class ThermalNode(HouseNode):
             return
         head, follower = session.in_force, session.follower
         cycles = 0 if follower is None else follower.state.cycles
-        shown = (head.revision, session.reference_id, cycles)
+        sensor = history.head(SENSOR)
+        shown = (head.revision, session.reference_id, cycles, sensor.revision)
         if self._shown == shown:
             return
         if self._shown[:1] != shown[:1]:
             stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
             model = model_document(self._nominal) if head.model is None else head.model
             self._outputs.model(model, head.revision, stamp)
+        if sensor.model is not None and sensor.calibration_id and self._shown[3:] != shown[3:]:
+            T_sensor_base, _ = placed_of(sensor.model)
+            stamp = history.get(sensor.calibration_id).stamp_ns
+            self._outputs.sensor(frames.invert(T_sensor_base), sensor.model["frame"], stamp)
         self._shown = shown
         self._outputs.event(configuration(session, self._topics), None)
 

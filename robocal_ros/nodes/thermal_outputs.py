@@ -3,6 +3,9 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel, SessionEvent
 
@@ -19,6 +22,7 @@ EVENTS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
+Array = NDArray[np.float64]
 AddOutput = Callable[[type, str, QoSProfile], Any]
 
 
@@ -38,6 +42,7 @@ class ThermalOutputs:
         self._model = add(KinematicModel, "~/model", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
         self._accuracy = add(AccuracyState, "~/accuracy", qos.LATCHED)
+        self._sensor = add(TransformStamped, "~/sensor", qos.LATCHED)
         self._events = add(SessionEvent, "~/session_events", EVENTS)
 
     def model(self, model: Mapping[str, Any], revision: int, stamp_ns: int) -> None:
@@ -66,6 +71,16 @@ class ThermalOutputs:
                 robot=self._nominal.name,
                 serial=self._serial,
                 stamp=conversions.header(stamp_ns, self._base_frame),
+            )
+        )
+
+    def sensor(self, T_base_sensor: Array, frame: str, stamp_ns: int) -> None:
+        """Say where the placed sensor stands."""
+        self._sensor.publish(
+            TransformStamped(
+                header=conversions.header(stamp_ns, self._base_frame),
+                child_frame_id=frame,
+                transform=conversions.transform_message(T_base_sensor),
             )
         )
 

@@ -11,6 +11,13 @@ from robocal_ros.core.streams import StandstillRule
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sessions.thermal_config import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
 
+
+def _field_fault(field: list[float]) -> str | None:
+    if len(field) != 5:
+        return "five lengths are wanted"
+    return None if field[3] < field[4] else "the nearest distance must be below the farthest"
+
+
 SETTINGS = (
     Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
     Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
@@ -55,6 +62,15 @@ SETTINGS = (
         unit="mm",
         low=1e-3,
         high=5.0,
+    ),
+    Setting(
+        "sensor_field_mm",
+        [570.0, 430.0, 700.0, 550.0, 850.0],
+        "Where the sensor measures: width, height, at what distance; nearest and farthest distance",
+        unit="mm",
+        low=1.0,
+        high=20000.0,
+        check=_field_fault,
     ),
     Setting(
         "hold_out",

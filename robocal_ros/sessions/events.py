@@ -7,6 +7,7 @@ from typing import Any
 from robocal_ros.core.codes import Code
 
 CONFIGURE = "configure"
+CALIBRATE_SENSOR = "calibrate_sensor"
 CAPTURE_REFERENCE = "capture_reference"
 IDENTIFY = "identify"
 BEGIN_CYCLE = "begin_cycle"
@@ -15,7 +16,8 @@ ACCEPT = "accept"
 REJECT = "reject"
 ROLLBACK = "rollback"
 CYCLE = (IDENTIFY, END_CYCLE)
-MEASURED = (IDENTIFY, END_CYCLE, CAPTURE_REFERENCE)  # wait for the last measurements
+SET_UP = (CALIBRATE_SENSOR, CAPTURE_REFERENCE)  # with the cold robot
+MEASURED = (IDENTIFY, END_CYCLE, *SET_UP)  # wait for the last measurements
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,14 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Proposal
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.cycle_verdict import judge_cycle
-from robocal_ros.core.thermal.documents import cycle_document
+from robocal_ros.core.thermal.documents import cycle_document, sensor_document
 from robocal_ros.core.thermal.identification import identify_subset
 from robocal_ros.core.thermal.reference import ColdReference, capture_reference
+from robocal_ros.core.thermal.sensor_calibration import (
+    SensorMethod,
+    calibrate_sensor,
+    sensor_verdict,
+)
 from robocal_ros.core.thermal.steps import FixedSphere, fixed_sphere
 from robocal_ros.sessions.drift_following import DriftFollower, Following
 from robocal_ros.sessions.events import Command, Outcome
@@ -31,6 +36,9 @@ from robocal_ros.sessions.in_force import REFERENCE, InForce
 from robocal_ros.sessions.thermal_config import METHODS, ThermalConfig
 
 Array = NDArray[np.float64]
+
+SENSOR = "sensor"
+SENSOR_METHODS: tuple[SensorMethod, ...] = ("ml", "classic")
 
 
 @dataclass(frozen=True)
@@ -93,14 +101,35 @@ class Proposer:
         chosen = self._propose(
             REFERENCE, command, wall_ns, "lsq", verdict, document, model, data.arrays()
         )
-        self._history.accept(
-            chosen,
-            by=str(command.arguments.get("by", "")),
-            reason="captured",
-            expected_head=None,
-            wall_ns=wall_ns,
-        )
+        self._accept(chosen, command, "captured", wall_ns)
         return Outcome(command, Code.ACCEPT, message, calibration_id=chosen, samples=len(data))
+
+    def place_sensor(
+        self, command: Command, data: Measurements, frame: str, wall_ns: int
+    ) -> Outcome:
+        """Place the sensor of a frame, and bring it into force where the verdict accepts.
+
+        Raises
+        ------
+        RobocalError
+            When the measurements cannot place them, or the history refuses.
+        """
+        named = str(command.arguments.get("method") or SENSOR_METHODS[0])
+        method = next((m for m in SENSOR_METHODS if m == named), None)
+        if method is None:
+            raise InputError(f"method '{named}' is not one of {', '.join(SENSOR_METHODS)}")
+        found = calibrate_sensor(self._current.arm, data, method)
+        verdict, document = sensor_verdict(found), sensor_document(found, self._nominal)
+        inputs, model = data.arrays(), document | {"frame": frame}
+        chosen = self._propose(SENSOR, command, wall_ns, method, verdict, document, model, inputs)
+        if verdict.accept:
+            self._accept(chosen, command, "placed", wall_ns)
+        return Outcome(command, verdict.code, verdict.reason, document, chosen, samples=len(data))
+
+    def _accept(self, chosen: int, command: Command, reason: str, wall_ns: int) -> None:
+        """A step of the set-up, which moves nothing, is in force when it is done."""
+        by = str(command.arguments.get("by", ""))
+        self._history.accept(chosen, by=by, reason=reason, expected_head=None, wall_ns=wall_ns)
 
     def method(self, command: Command) -> Method:
         """Tell the estimator that a command names, else the configured one.

@@ -179,6 +179,7 @@ class ThermalSession:
 
     def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
         handlers: dict[str, Callable[[Command, int], Outcome]] = {
+            events.CALIBRATE_SENSOR: self._calibrate_sensor,
             events.CAPTURE_REFERENCE: self._capture_reference,
             events.IDENTIFY: self._identify,
             events.BEGIN_CYCLE: self._begin_cycle,
@@ -193,6 +194,11 @@ class ThermalSession:
             return handlers[command.name](command, wall_ns)
         except RobocalError as error:
             return Outcome(command, error.code, str(error))
+
+    def _calibrate_sensor(self, command: Command, wall_ns: int) -> Outcome:
+        """Place the sensor; the samples stay, for the cold reference."""
+        data, _ = self.windows.of(command)
+        return self._proposer.place_sensor(command, data, self.desk.frame or "", wall_ns)
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         data, fixed = self.windows.of(command)

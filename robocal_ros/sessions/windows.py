@@ -29,7 +29,7 @@ class Windows:
 
     def from_ns(self, command: Command) -> int:
         """Stamp of the first measurement that counts: a cycle holds no pause of its time-out."""
-        calibrates = self._current.reference is None or command.name == events.CAPTURE_REFERENCE
+        calibrates = self._current.reference is None or command.name in events.SET_UP
         if calibrates or self._cycle.id:
             return self._desk.from_ns
         return self._desk.last_run_ns(self._pause_ns)
@@ -44,7 +44,7 @@ class Windows:
         InputError
             When a cycle holds no pose of the cold reference.
         """
-        desk, captures = self._desk, command.name == events.CAPTURE_REFERENCE
+        desk, sets_up = self._desk, command.name in events.SET_UP
         desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", desk.from_ns)) - 1
         observed = desk.window(after, command.stamp_ns or 0, command.marks or {})
@@ -52,8 +52,8 @@ class Windows:
         found = [o for o in observed if o.topic != FIXED]
         if not found:
             raise TooFewSamplesError(desk.why_nothing())
-        drift = self._current.reference is not None and not captures
-        if drift or captures:
+        drift = self._current.reference is not None and not sets_up
+        if drift or sets_up:
             found = one_per_visit(found, self._config.standstill.tolerance_rad)
         if drift:
             found = self._at_cold_poses(found)

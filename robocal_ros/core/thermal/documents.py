@@ -1,9 +1,12 @@
 """Thermal results as plain documents (JSON), in the units people read."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from robocal_ros.core import frames
 from robocal_ros.core.assessment import Judgement, summarise
 from robocal_ros.core.documents import (
     cell_document,
@@ -19,6 +22,7 @@ from robocal_ros.core.thermal.identification import CycleDrift
 from robocal_ros.core.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict
 from robocal_ros.core.thermal.spots import ColdSpots
 
+Array = NDArray[np.float64]
 Document = dict[str, Any]
 
 
@@ -48,6 +52,14 @@ def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
         "rejected": list(found.rejected),
         "verdict": verdict_document(sensor_verdict(found)),
     }
+
+
+def placed_of(document: Mapping[str, Any]) -> tuple[Array, Array]:
+    """T_sensor_base (4, 4) and the sphere in the flange's frame (3,), m, of a sensor's document."""
+    pose = document["T_sensor_base"]
+    xyz = np.array(pose["xyz_mm"]) * 1e-3
+    T_sensor_base = frames.transform_from_quat(xyz, pose["quat_xyzw"])
+    return T_sensor_base, np.array(document["sphere_in_flange_mm"]) * 1e-3
 
 
 def cycle_document(
