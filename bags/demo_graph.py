@@ -102,20 +102,21 @@ class CellController:
         self._status: deque[String] = deque(maxlen=1)
         self._diagnostics: deque[DiagnosticArray] = deque(maxlen=30)
         reliable, latched = qos.RELIABLE, qos.LATCHED
-        self._listen(String, "cycle_done", self.done, reliable)
-        self._listen(String, "/truth/check_points", self.truth, reliable)
-        self._listen(CalibrationQuality, "/thermal_node/quality", self.quality, latched)
-        self._listen(KinematicModel, "/thermal_node/model", self.model, latched)
-        self._listen(String, "/replay_node/status", self._status, latched)
-        self._listen(DiagnosticArray, "/diagnostics", self._diagnostics, reliable)
-        self._listen(
+        self.listen(String, "cycle_done", self.done, reliable)
+        self.listen(String, "/truth/check_points", self.truth, reliable)
+        self.listen(CalibrationQuality, "/thermal_node/quality", self.quality, latched)
+        self.listen(KinematicModel, "/thermal_node/model", self.model, latched)
+        self.listen(String, "/replay_node/status", self._status, latched)
+        self.listen(DiagnosticArray, "/diagnostics", self._diagnostics, reliable)
+        self.listen(
             JointTrajectory, "/joint_correction_node/joint_trajectory", self.corrected, reliable
         )
         self._targets = self._node.create_publisher(
             JointTrajectory, "joint_trajectory", qos.own(reliable)
         )
 
-    def _listen(self, kind: type, topic: str, inbox: deque[Any], profile: Any) -> None:
+    def listen(self, kind: type, topic: str, inbox: deque[Any], profile: Any) -> None:
+        """Gather what comes on a topic in ``inbox``."""
         self._node.create_subscription(
             kind, topic, lambda message: inbox.append(message), qos.own(profile)
         )
