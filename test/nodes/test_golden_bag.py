@@ -1,4 +1,4 @@
-"""The golden thermal bag through the live node: cycles, a knock; the replay's result, bit for bit."""
+"""The golden thermal bag through the live node: the replay's result, bit for bit."""
 
 import json
 import os
