@@ -12,10 +12,11 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bench import thermal_tracking
 from bench.tables import Goal, Table
-from docs.examples.make_thermal import MEASURING, poses
+from bench.thermal_shifts import MEASURING, PARTS, SEEDS, SIGMA_M, Measured
+from docs.examples.make_thermal import poses
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.drift_history import DriftHistory, share_within
@@ -23,7 +24,6 @@ from robocal_ros.core.thermal.identification import identify_cycle, judge_cycle
 from robocal_ros.core.thermal.learning import learn_drift
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess
-from robocal_ros.core.thermal.reference import capture_reference
 from robocal_ros.core.thermal.screening import screen
 from robocal_ros.core.thermal.spots import ColdSpots
 from robocal_ros.core.thermal.subset import subset_drift
@@ -33,7 +33,6 @@ from robocal_ros.sim.drift import (
     LENGTHS,
     DriftingCell,
     DriftPlan,
-    DriftRecord,
     drifting_cell,
     record,
 )
@@ -43,48 +42,13 @@ from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
 
-SEEDS = (1, 2, 3, 8, 13, 25, 26, 30, 33, 41)  # the first ten whose drift is as published
-SIGMA_M = float(np.hypot(2e-5, 2e-5))
 PUBLISHED = {  # KR 150 R3100, three test runs, judged by measurement
     "no correction": (43.18, 49.41, 48.05),
     "six lengths": (73.86, 80.00, 87.01),
     "screened": (90.91, 96.47, 94.81),
 }
-PARTS = 5  # between two cycles
 WANTED_SHARE = 97.0  # %
 WANTED_BEYOND = 0.4  # of the share of directions that the screened subset leaves beyond 0.1 mm
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A shift as the estimators see it: cold spots and cycles of the six measuring poses."""
-
-    spots: ColdSpots
-    cycles: list[Measurements]
-    time_s: Array
-
-    @classmethod
-    def of(cls, arm: SerialArm, shift: DriftRecord, own: Sequence[int]) -> "Measured":
-        """Take some of the poses; all cold ones place base and sphere."""
-        rounds, count, _ = shift.cold_q.shape
-        cold = _visits(shift.cold_q.reshape(-1, arm.n), shift.cold.reshape(-1, 3), "cold")
-        cell: CellModel = capture_reference(arm, cold).cell
-        rows = np.add.outer(count * np.arange(rounds), list(own)).ravel()
-        cycles = [
-            _visits(q[list(own)], p[list(own)], f"{i}")
-            for i, (q, p) in enumerate(zip(shift.q, shift.position, strict=True))
-        ]
-        return cls(ColdSpots.of(cell, cold.take(rows)), cycles, shift.time_s)
-
-
-def _visits(q: Array, position: Array, name: str) -> Measurements:
-    return Measurements(
-        q=q,
-        position=position,
-        target=("ball",) * len(q),
-        sample=tuple(f"{name}/{i}" for i in range(len(q))),
-        sigma=np.full(len(q), SIGMA_M),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,29 +211,6 @@ def share_table(seeds: Sequence[int], effects: Effects, name: str, title: str) -
     return table
 
 
-def between_table(seeds: Sequence[int]) -> Table:
-    """Rms error between cycles of what was held, and of what the tracker says."""
-    table = Table(
-        "thermal_between",
-        "Between cycles (5 min), rms error in mm over check poses and time",
-        ("robot", "last MAP model held", "tracker", "ratio"),
-        "Simulated, all effects; three shifts each.",
-    )
-    for seed in seeds:
-        held, tracked = [], []
-        for judged in prepare(seed, Effects()):
-            model = _map(judged, judged.prior)
-            for part in range(1, PARTS):
-                truth = judged.between[PARTS - 1 + part :: PARTS]
-                count = len(truth)
-                for drift, into in ((model, held), (_tracked(judged, part * 60.0), tracked)):
-                    moved = np.einsum("cik,tk->tci", judged.rows, drift[:count])
-                    into.append(np.mean((truth - moved) ** 2))
-        a, b = (float(np.sqrt(np.mean(values))) * 1e3 for values in (held, tracked))
-        table.add(f"seed {seed}", a, b, b / a)
-    return table
-
-
 def speed_table() -> Table:
     """What a cycle costs on line, and a screening off line."""
     table = Table(
@@ -321,6 +262,6 @@ def tables() -> Sequence[Table]:
             "thermal_shares_modelled",
             "The same without what no estimator knows of",
         ),
-        between_table(SEEDS),
+        *thermal_tracking.tables(),
         speed_table(),
     ]
