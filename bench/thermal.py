@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from bench import thermal_tracking
 from bench.tables import Goal, Table
-from bench.thermal_shifts import MEASURING, PARTS, SEEDS, SIGMA_M, Measured
-from docs.examples.make_thermal import poses
+from bench.thermal_shifts import MEASURING, PARTS, SEEDS, SIGMA_M, Measured, cell_of
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
@@ -33,7 +32,6 @@ from robocal_ros.sim.drift import (
     LENGTHS,
     DriftingCell,
     DriftPlan,
-    drifting_cell,
     record,
 )
 from robocal_ros.sim.robot import Effects
@@ -73,8 +71,7 @@ class Judged:
 def prepare(seed: int, effects: Effects) -> list[Judged]:
     """The three shifts of one robot, each with the one before as its teacher."""
     arm = load_robot("kr150_r3100")
-    robot = kr150.true_robot(arm, np.random.default_rng(seed), effects)
-    cell = drifting_cell(robot, poses("sphere"), poses("check"))
+    cell = cell_of(seed, effects)
     records = [
         record(cell, plan, np.random.default_rng([seed, i])) for i, plan in enumerate(cell.plans)
     ]

@@ -2,23 +2,35 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from docs.examples.make_thermal import MEASURING as MEASURING
+from docs.examples.make_thermal import poses
 from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.reference import capture_reference
 from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.sim.drift import DriftRecord
+from robocal_ros.sim import kr150
+from robocal_ros.sim.drift import DriftingCell, DriftRecord, drifting_cell
+from robocal_ros.sim.robot import Effects
+from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
 
 SEEDS = (1, 2, 3, 8, 13, 25, 26, 30, 33, 41)  # the first ten whose drift is as published
 SIGMA_M = float(np.hypot(2e-5, 2e-5))
 PARTS = 5  # between two cycles
+
+
+@cache
+def cell_of(seed: int, effects: Effects) -> DriftingCell:
+    """One robot in its cell, its drift as published."""
+    robot = kr150.true_robot(load_robot("kr150_r3100"), np.random.default_rng(seed), effects)
+    return drifting_cell(robot, poses("sphere"), poses("check"))
 
 
 @dataclass(frozen=True, eq=False)

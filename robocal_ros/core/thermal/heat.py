@@ -15,7 +15,6 @@ from robocal_ros.core.thermal.priors import PLAUSIBLE_WARMING_K, drift_prior
 
 Array = NDArray[np.float64]
 
-LAG_S = 3600.0
 SOURCES = 3  # of each parameter: its joint's motor, the same lagged, the next motor lagged
 SWING_K = 20.0  # where a temperature may go once it is no longer read
 SWING_TIME_S = 3600.0
@@ -29,16 +28,18 @@ class Heat:
     ----------
     time_s : of the last reading.
     motor, lagged : (n,).
+    lag_s : time constant of the lag.
     """
 
     time_s: float
     motor: Array
     lagged: Array
+    lag_s: float
 
     @classmethod
-    def cold(cls, n: int, time_s: float) -> "Heat":
+    def cold(cls, n: int, time_s: float, lag_s: float) -> "Heat":
         """At the cold visit."""
-        return cls(time_s, np.zeros(n), np.zeros(n))
+        return cls(time_s, np.zeros(n), np.zeros(n), lag_s)
 
     def read(self, temperature: Array, time_s: float) -> "Heat":
         """After a reading (n,), the course since the last one taken as straight.
@@ -61,9 +62,9 @@ class Heat:
             )
         if step == 0.0:
             return replace(self, motor=given)
-        fade, slope = np.exp(-step / LAG_S), (given - self.motor) / step
-        behind = self.lagged - self.motor + slope * LAG_S
-        return Heat(time_s, given, given - slope * LAG_S + fade * behind)
+        fade, behind = np.exp(-step / self.lag_s), (given - self.motor) / step * self.lag_s
+        lagged = given - behind + fade * (self.lagged - self.motor + behind)
+        return Heat(time_s, given, lagged, self.lag_s)
 
     def held(self, time_s: float) -> "Heat":
         """At a later time, the motors as last read; an earlier one changes nothing."""
@@ -90,22 +91,23 @@ class HeatGains:
     Attributes
     ----------
     mean, covariance : (3k,) and (3k, 3k), SI per K; parameter by parameter.
+    lag_s : how slowly links follow the motors.
     """
 
     mean: Array
     covariance: Array
+    lag_s: float
 
     @classmethod
-    def expected(cls, arm: SerialArm, length: float = 1.0, angle: float = 1.0) -> "HeatGains":
+    def expected(cls, arm: SerialArm, lag_s: float, length: float, angle: float) -> "HeatGains":
         """Before any is learned: none, within the default drift per plausible warming.
 
         ``length``, ``angle``: what the gains of either kind are of that.
         """
-        chosen = arm.parameters
-        scale = np.where(chosen.is_length, length, angle) / PLAUSIBLE_WARMING_K
+        scale = np.where(arm.parameters.is_length, length, angle) / PLAUSIBLE_WARMING_K
         sigma = np.sqrt(np.diag(drift_prior(arm))) * scale
         variance = np.repeat(sigma**2, SOURCES) / SOURCES
-        return cls(np.zeros(len(variance)), np.diag(variance))
+        return cls(np.zeros(len(variance)), np.diag(variance), lag_s)
 
 
 def joints_of(arm: SerialArm) -> NDArray[np.int64]:

@@ -21,13 +21,14 @@ from robocal_ros.core.thermal.tracking import DriftTracker
 
 Array = NDArray[np.float64]
 
-SCALES = tuple(2.0**-i for i in range(6))  # of variances
+SCALES = tuple(2.0**-i for i in range(6))
+STEADY_S = (7200.0, 14400.0, 28800.0)
+LAGS_S = (1800.0, 3600.0, 7200.0)
 FEWEST_CYCLES = 10
-THINNED = 3  # widths are judged by every third cycle
-LEFT_OVER = (1e-2, 1e-3, 1e-4)  # share of the default prior's variance that gains leave
-NORMAL_MEDIAN_SQUARE = 0.4549364
-OUTLYING = 4.0  # standard deviations
-STRETCH = 1.2
+THINNED = 5  # widths are judged by every fifth cycle
+LEFT_OVER = (1e-2, 1e-3, 1e-4, 1e-5)  # share of the default prior's variance that gains leave
+MEDIAN_SQUARE = 2.3659739  # of three standard normal numbers
+OUTLYING = 5.0  # standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ def visit_noise(shifts: Sequence[EarlierShift]) -> float:
     """Standard deviation, m, of one coordinate of one visit.
 
     From second differences over three cycles in a row, in which a drift all but cancels (Gasser,
-    Sroka and Jennen-Steinmetz 1986), without those far beyond their median: outliers.
+    Sroka and Jennen-Steinmetz 1986), without points far beyond the median: outliers.
 
     Raises
     ------
@@ -87,15 +88,16 @@ def visit_noise(shifts: Sequence[EarlierShift]) -> float:
         time = np.array([at for at, _ in whole])
         share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None, None]
         miss = y[1:-1] - (1.0 - share) * y[:-2] - share * y[2:]
-        found.append((miss**2 / (1.0 + share**2 + (1.0 - share) ** 2)).ravel())
+        miss /= np.sqrt(1.0 + share**2 + (1.0 - share) ** 2)
+        found.append(np.sum(miss**2, axis=2).ravel())
     squares = np.concatenate(found)
     if not len(squares):
         raise TooFewSamplesError(
             f"no shift has {FEWEST_CYCLES} cycles that visit all its cold poses: the noise of a "
             "visit does not show"
         )
-    likely = squares <= OUTLYING**2 * np.median(squares) / NORMAL_MEDIAN_SQUARE
-    return float(np.sqrt(np.mean(squares[likely])))
+    likely = squares <= OUTLYING**2 * np.median(squares) / MEDIAN_SQUARE
+    return float(np.sqrt(np.mean(squares[likely]) / 3.0))
 
 
 def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
@@ -113,22 +115,29 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     """
     sigma_m = visit_noise(shifts)
 
-    def covariance(of: Sequence[EarlierShift]) -> Array:
-        return learn_drift([(s.spots, s.cycles) for s in of], sigma_m=sigma_m).covariance
+    def covariance(of: Sequence[EarlierShift], every: int) -> Array:
+        histories = [(shift.spots, shift.cycles[::every]) for shift in of]
+        return learn_drift(histories, sigma_m=sigma_m).covariance
 
     pairs = [
-        (covariance([s for s in shifts if s is not judged] or [judged]), judged)
+        (covariance([s for s in shifts if s is not judged] or [judged], THINNED), judged)
         for judged in shifts
     ]
 
-    def likely(scale: float) -> float:
+    def likely(scale: float, steady_s: float) -> float:
         return sum(
-            _follow(LearnedProcess(DriftProcess(scale * learned), sigma_m), judged, THINNED)[1]
+            _follow(
+                LearnedProcess(DriftProcess(scale * learned, steady_s=steady_s), sigma_m),
+                judged,
+                THINNED,
+            )[1]
             for learned, judged in pairs
         )
 
-    scale = _first_peak(likely, SCALES)
-    return LearnedProcess(DriftProcess(scale * covariance(shifts), stretch=STRETCH), sigma_m)
+    steady_s = max(STEADY_S, key=lambda x: likely(SCALES[2], x))
+    scale = _first_peak(lambda x: likely(x, steady_s), SCALES)
+    process = DriftProcess(scale * covariance(shifts, 1), steady_s=steady_s)
+    return LearnedProcess(process, sigma_m)
 
 
 def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
@@ -146,18 +155,20 @@ def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     """
     sigma_m, arm = visit_noise(shifts), shifts[0].spots.cell.arm
 
-    def start(left: float, length: float, angle: float) -> LearnedProcess:
-        gains = HeatGains.expected(arm, length, angle)
-        process = DriftProcess(left * drift_prior(arm), stretch=STRETCH)
+    def start(left: float, lag_s: float, length: float, angle: float) -> LearnedProcess:
+        gains = HeatGains.expected(arm, lag_s, length, angle)
+        process = DriftProcess(left * drift_prior(arm))
         return LearnedProcess(process, sigma_m, gains)
 
-    def likely(first: LearnedProcess) -> float:
-        return _pass(first, shifts, THINNED)[1]
+    def likely(*settings: float) -> float:
+        return _pass(start(*settings), shifts, THINNED)[1]
 
-    angle = _first_peak(lambda a: likely(start(LEFT_OVER[1], 1.0, a)), SCALES)
-    length = _first_peak(lambda b: likely(start(LEFT_OVER[1], b, angle)), SCALES)
-    left = _first_peak(lambda c: likely(start(c, length, angle)), LEFT_OVER)
-    return _pass(start(left, length, angle), shifts, 1)[0]
+    left, lag_s = LEFT_OVER[1], LAGS_S[1]
+    angle = _first_peak(lambda x: likely(left, lag_s, 1.0, x), SCALES)
+    length = _first_peak(lambda x: likely(left, lag_s, x, angle), SCALES)
+    lag_s = max(LAGS_S, key=lambda x: likely(left, x, length, angle))
+    left = _first_peak(lambda x: likely(x, lag_s, length, angle), LEFT_OVER)
+    return _pass(start(left, lag_s, length, angle), shifts, 1)[0]
 
 
 def _pass(

@@ -2,8 +2,9 @@
 
 State: drift of the k parameters and its steady state, the gains of the motors' temperatures where
 those are given, the error of each cold spot (the noise of the cold visit is in every later
-comparison), and the set-up's six coordinates. Absolute: the drift is against the cold model,
-whatever is in force. A cycle that the process cannot explain is not applied.
+comparison), and the set-up's six coordinates with their steady state. Absolute: the drift is
+against the cold model, whatever is in force. A cycle that the process cannot explain is not
+applied.
 """
 
 from dataclasses import dataclass
@@ -82,18 +83,21 @@ class DriftTracker:
         self.spots, self.process, self.sigma_m = spots, process, sigma_m
         arm, self.count = spots.cell.arm, len(process.covariance)
         self._joint = joints_of(arm)
-        self._heat = None if gains is None else Heat.cold(arm.n, time_s)
+        self._heat = None if gains is None else Heat.cold(arm.n, time_s, gains.lag_s)
         k, cold = self.count, 3 * len(spots.visits)
         learned = 0 if gains is None else SOURCES * k
         self._gains = slice(2 * k, 2 * k + learned)
-        size = self._gains.stop + cold + SETUP
+        self._setup = self._gains.stop + cold
+        size = self._setup + 2 * SETUP
         mean, covariance = np.zeros(size), np.zeros((size, size))
         covariance[k : 2 * k, k : 2 * k] = process.covariance
         if gains is not None:
             mean[self._gains] = gains.mean
             covariance[self._gains, self._gains] = gains.covariance
-        own = np.arange(self._gains.stop, self._gains.stop + cold)
+        own = np.arange(self._gains.stop, self._setup)
         covariance[own, own] = np.repeat(sigma_m**2 / spots.visits, 3)
+        own = np.arange(self._setup + SETUP, size)
+        covariance[own, own] = process.setup_sigma_m**2
         self.state = TrackerState(time_s, mean, covariance)
 
     @property
@@ -102,7 +106,8 @@ class DriftTracker:
         if self._heat is None:
             return None
         own, state = self._gains, self.state
-        return HeatGains(state.mean[own].copy(), state.covariance[own, own].copy())
+        mean, covariance = state.mean[own].copy(), state.covariance[own, own].copy()
+        return HeatGains(mean, covariance, self._heat.lag_s)
 
     def read_temperatures(self, temperature: Array, time_s: float) -> None:
         """Take motor temperatures (n,) above those at the cold visit, K; in order of time.
@@ -133,15 +138,16 @@ class DriftTracker:
             )
         if step == 0.0:
             return state
-        F, noise = self.process.transition(step)
-        fade = self.process.setup_fade(step)
         mean, P = state.mean.copy(), state.covariance.copy()
-        for rows in (mean[:, None], P, P.T):  # F P F^T by blocks: the rest of F is the unit matrix
-            rows[: 2 * k] = np.tensordot(F, rows[: 2 * k].reshape(2, k, -1), 1).reshape(2 * k, -1)
-            rows[-SETUP:] *= fade
-        P[: 2 * k, : 2 * k] += np.kron(noise, self.process.covariance)
-        own = np.arange(len(P) - SETUP, len(P))
-        P[own, own] += self.process.setup_sigma_m**2 * (1.0 - fade**2)
+        process, setup = self.process, slice(self._setup, None)
+        for part, (F, noise), variance in (
+            (slice(2 * k), process.transition(step), process.covariance),
+            (setup, process.setup_transition(step), process.setup_sigma_m**2 * np.eye(SETUP)),
+        ):
+            for rows in (mean[:, None], P, P.T):  # F P F^T by blocks: the rest of F is one
+                before = rows[part].reshape(2, len(variance), -1)
+                rows[part] = np.tensordot(F, before, 1).reshape(2 * len(variance), -1)
+            P[part, part] += np.kron(noise, variance)
         return TrackerState(time_s, mean, P)
 
     def drift(self, time_s: float) -> tuple[Array, Array]:
@@ -158,7 +164,7 @@ class DriftTracker:
             sigma = swing_k(time_s - self._heat.time_s) * gain
             same = self._joint[:, None] == self._joint
             covariance += same * np.outer(sigma, sigma)
-        return rows @ state.mean, self.process.stretch**2 * covariance
+        return rows @ state.mean, covariance
 
     def _drift_rows(self, time_s: float) -> Array:
         """Drift (k, d) of the parameters by the state."""
@@ -226,7 +232,7 @@ class DriftTracker:
         parameters, setup = spots.rows(cycle.q, spots.target[spot])
         H = np.zeros((m, 3, len(self.state.mean)))
         H[:] = parameters @ self._drift_rows(time_s)
-        H[:, :, -SETUP:] = setup
+        H[:, :, self._setup : self._setup + SETUP] = setup
         columns = self._gains.stop + 3 * spot[:, None] + np.arange(3)
         H[np.arange(m)[:, None], np.arange(3), columns] = -1.0
         sigma = np.full(m, self.sigma_m) if cycle.sigma is None else cycle.sigma
