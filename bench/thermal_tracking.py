@@ -152,8 +152,9 @@ def between_table(seeds: Sequence[int]) -> Table:
     for seed, number in shifts:
         figures = list(_between(seed, number).values())
         squares += np.square(figures)
-        table.add(f"seed {seed}{', other work' if number else ''}", *figures, figures[1] / figures[0], None,
-                  figures[2] / figures[0], None)  # fmt: skip
+        name = f"seed {seed}{', other work' if number else ''}"
+        ratios = figures[1] / figures[0], figures[2] / figures[0]
+        table.add(name, *figures, ratios[0], None, ratios[1], None)
     held, tracked, warm = np.sqrt(squares / len(shifts)).tolist()
     goals = Goal(tracked / held, 0.5), Goal(warm / held, min(0.5, tracked / held))
     table.add("all", held, tracked, warm, tracked / held, goals[0], warm / held, goals[1])
