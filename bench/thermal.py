@@ -6,15 +6,16 @@ same robot.
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench import thermal_setup, thermal_tracking
 from bench.tables import Goal, Table
+from bench.thermal_shifts import PARTS, SEEDS, SIGMA_M, Measured, cell_of
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.identification import CellModel
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.cycle_verdict import judge_cycle
@@ -22,21 +23,16 @@ from robocal_ros.core.thermal.drift_history import DriftHistory, share_within
 from robocal_ros.core.thermal.identification import identify_cycle
 from robocal_ros.core.thermal.learning import learn_drift
 from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process import DriftProcess
-from robocal_ros.core.thermal.reference import capture_reference
+from robocal_ros.core.thermal.process_learning import EarlierShift, LearnedProcess, learn_process
 from robocal_ros.core.thermal.screening import screen
 from robocal_ros.core.thermal.spots import ColdSpots
 from robocal_ros.core.thermal.subset import subset_drift
-from robocal_ros.core.thermal.tracking import DriftTracker
 from robocal_ros.sim import kr150
 from robocal_ros.sim.drift import (
     LENGTHS,
     MEASURING,
     DriftingCell,
     DriftPlan,
-    DriftRecord,
-    drifting_cell,
-    poses,
     record,
 )
 from robocal_ros.sim.robot import Effects
@@ -45,48 +41,13 @@ from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
 
-SEEDS = (1, 2, 3, 8, 13, 25, 26, 30, 33, 41)  # the first ten whose drift is as published
-SIGMA_M = float(np.hypot(2e-5, 2e-5))
 PUBLISHED = {  # KR 150 R3100, three test runs, judged by measurement
     "no correction": (43.18, 49.41, 48.05),
     "six lengths": (73.86, 80.00, 87.01),
     "screened": (90.91, 96.47, 94.81),
 }
-PARTS = 5  # between two cycles
 WANTED_SHARE = 97.0  # %
 WANTED_BEYOND = 0.4  # of the share of directions that the screened subset leaves beyond 0.1 mm
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A shift as the estimators see it: cold spots and cycles of the six measuring poses."""
-
-    spots: ColdSpots
-    cycles: list[Measurements]
-    time_s: Array
-
-    @classmethod
-    def of(cls, arm: SerialArm, shift: DriftRecord, own: Sequence[int]) -> "Measured":
-        """Take some of the poses; all cold ones place base and sphere."""
-        rounds, count, _ = shift.cold_q.shape
-        cold = _visits(shift.cold_q.reshape(-1, arm.n), shift.cold.reshape(-1, 3), "cold")
-        cell: CellModel = capture_reference(arm, cold).cell
-        rows = np.add.outer(count * np.arange(rounds), list(own)).ravel()
-        cycles = [
-            _visits(q[list(own)], p[list(own)], f"{i}")
-            for i, (q, p) in enumerate(zip(shift.q, shift.position, strict=True))
-        ]
-        return cls(ColdSpots.of(cell, cold.take(rows)), cycles, shift.time_s)
-
-
-def _visits(q: Array, position: Array, name: str) -> Measurements:
-    return Measurements(
-        q=q,
-        position=position,
-        target=("ball",) * len(q),
-        sample=tuple(f"{name}/{i}" for i in range(len(q))),
-        sigma=np.full(len(q), SIGMA_M),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +62,8 @@ class Judged:
     prior: Array
     history: DriftHistory  # of the teacher's shift
     screened: tuple[int, ...]
+    learned: LearnedProcess
+    planned: Measured  # the same shift, measured in as many planned poses
 
     def left(self, drift: Array) -> Array:
         """Residual (t, c, 3) at the check poses after a correction with drifts (t, k)."""
@@ -111,10 +74,14 @@ class Judged:
 def prepare(seed: int, effects: Effects) -> list[Judged]:
     """The three shifts of one robot, each with the one before as its teacher."""
     arm = load_robot("kr150_r3100")
-    robot = kr150.true_robot(arm, np.random.default_rng(seed), effects)
-    cell = drifting_cell(robot, poses("sphere"), poses("check"))
+    cell = cell_of(seed, effects)
     records = [
         record(cell, plan, np.random.default_rng([seed, i])) for i, plan in enumerate(cell.plans)
+    ]
+    planned = replace(cell, sphere=thermal_setup.planned().q)
+    others = [
+        record(planned, plan, np.random.default_rng([seed, 10 + i]))
+        for i, plan in enumerate(cell.plans)
     ]
     rows = arm.parameter_jacobian(cell.check, kr150.TOOL)[:, :3]
     everything = range(len(cell.sphere))
@@ -135,9 +102,16 @@ def prepare(seed: int, effects: Effects) -> list[Judged]:
                 prior=learned.covariance,
                 history=history,
                 screened=tuple(arm.parameters.names.index(name) for name in chosen),
+                learned=learn_process([_earlier(teacher)]),
+                planned=Measured.of(arm, others[i], range(len(planned.sphere))),
             )
         )
     return found
+
+
+def _earlier(teacher: Measured) -> EarlierShift:
+    cycles = [replace(cycle, sigma=None) for cycle in teacher.cycles]
+    return EarlierShift(teacher.spots, cycles, teacher.time_s)
 
 
 def _history(
@@ -183,14 +157,13 @@ def _map(judged: Judged, prior: Array) -> Array:
     )
 
 
-def _tracked(judged: Judged, ahead_s: float = 0.0) -> Array:
-    """Drifts (t, k) right after each cycle, or so long after it."""
-    measured = judged.measured
-    tracker = DriftTracker(measured.spots, DriftProcess(judged.prior), SIGMA_M)
+def _tracked(measured: Measured, learned: LearnedProcess) -> Array:
+    """Drifts (t, k) right after each cycle."""
+    tracker = learned.tracker(measured.spots)
     drifts = []
     for cycle, time_s in zip(measured.cycles, measured.time_s.tolist(), strict=True):
-        tracker.take(cycle, time_s)
-        drifts.append(tracker.drift(time_s + ahead_s)[0])
+        tracker.take(replace(cycle, sigma=None), time_s)
+        drifts.append(tracker.drift(time_s)[0])
     return np.array(drifts)
 
 
@@ -202,7 +175,8 @@ def _drifts(judged: Judged) -> dict[str, Array]:
         "screened": _subset(judged, judged.screened),
         "MAP, default prior": _map(judged, drift_prior(judged.measured.spots.cell.arm)),
         "MAP, learned prior": _map(judged, judged.prior),
-        "MAP and tracker": _tracked(judged),
+        "MAP and tracker": _tracked(judged.measured, judged.learned),
+        "MAP, tracker, planned poses": _tracked(judged.planned, judged.learned),
     }
 
 
@@ -232,7 +206,7 @@ def share_table(seeds: Sequence[int], effects: Effects, name: str, title: str) -
         f"{len(seeds)} simulated robots, six poses a cycle, 90 cycles a shift; 34 check poses, "
         "x, y, z apart. True residuals without noise: mean over the robots (worst). As measured: "
         "mean over all, judged with noise, as the published row had to be. Prior and parameters "
-        "come from the shift before.",
+        "come from the shift before; the planned poses from the default prior.",
     )
     found = shares(seeds, effects)
     beyond = 100.0 - found["screened"][:, :, 0].mean()
@@ -241,34 +215,11 @@ def share_table(seeds: Sequence[int], effects: Effects, name: str, title: str) -
         cells = [f"{true[:, i].mean():.1f} ({true[:, i].min():.1f})" for i in range(3)]
         published = PUBLISHED.get(method)
         goal = None
-        if method == "MAP and tracker":
+        if method == "MAP, tracker, planned poses":
             limit = max(WANTED_SHARE, 100.0 - WANTED_BEYOND * beyond)
             goal = Goal(float(true.mean(axis=0).min()), limit, at_least=True)
         words = None if published is None else " ".join(f"{x:.2f}" for x in published)
         table.add(method, *cells, float(values[:, :, 1].mean()), words, goal)
-    return table
-
-
-def between_table(seeds: Sequence[int]) -> Table:
-    """Rms error between cycles of what was held, and of what the tracker says."""
-    table = Table(
-        "thermal_between",
-        "Between cycles (5 min), rms error in mm over check poses and time",
-        ("robot", "last MAP model held", "tracker", "ratio"),
-        "Simulated, all effects; three shifts each.",
-    )
-    for seed in seeds:
-        held, tracked = [], []
-        for judged in prepare(seed, Effects()):
-            model = _map(judged, judged.prior)
-            for part in range(1, PARTS):
-                truth = judged.between[PARTS - 1 + part :: PARTS]
-                count = len(truth)
-                for drift, into in ((model, held), (_tracked(judged, part * 60.0), tracked)):
-                    moved = np.einsum("cik,tk->tci", judged.rows, drift[:count])
-                    into.append(np.mean((truth - moved) ** 2))
-        a, b = (float(np.sqrt(np.mean(values))) * 1e3 for values in (held, tracked))
-        table.add(f"seed {seed}", a, b, b / a)
     return table
 
 
@@ -323,6 +274,7 @@ def tables() -> Sequence[Table]:
             "thermal_shares_modelled",
             "The same without what no estimator knows of",
         ),
-        between_table(SEEDS),
+        *thermal_setup.tables(),
+        *thermal_tracking.tables(),
         speed_table(),
     ]

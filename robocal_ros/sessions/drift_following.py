@@ -193,7 +193,7 @@ class DriftFollower:
     def _time_s(self, stamp_ns: int) -> float:
         """The same for a cycle; how long ago the last one was is not known after a jump back."""
         step_ns = stamp_ns - self.state.stamp_ns
-        step_s = step_ns * 1e-9 if step_ns >= 0 else self._process.time_s
+        step_s = step_ns * 1e-9 if step_ns >= 0 else self._process.steady_s
         return self.state.tracker.time_s + step_s
 
     def _take_again(self, cycle: Measurements, moved: str) -> None:

@@ -28,7 +28,8 @@ UNCORRECTED = 0.45  # the middle of the published 43 to 49 %
 SIX_LENGTHS = (0.70, 0.88)
 PERIOD_S = 300.0
 LENGTHS = ("d1_mm", "d4_mm", "d6_mm", "a1_mm", "a2_mm", "a3_mm")
-_COARSE = 6  # scaling looks at every sixth cycle
+TEMPERATURE_NOISE_K = 0.1
+_COARSE = slice(3, None, 6)  # scaling looks at every sixth cycle
 _BISECTIONS = 12
 
 
@@ -91,9 +92,13 @@ class DriftingCell:
         """Whether six lengths do as well as published in each shift."""
         return all(SIX_LENGTHS[0] <= share <= SIX_LENGTHS[1] for share in self.lengths)
 
-    def truth(self, plan: DriftPlan, parts: int = 1) -> Array:
-        """True displacement (t, c, 3) of the tool at the check poses since the cold robot, m."""
-        return _displacement(self.robot, self.check, kr150.TOOL, plan, parts)
+    def truth(self, plan: DriftPlan, parts: int = 1, every: int = 1) -> Array:
+        """True displacement (t, c, 3) of the tool at the check poses since the cold robot, m.
+
+        At each of ``parts`` steps of each cycle's period; of these every so many.
+        """
+        chosen = slice(every - 1, None, every)
+        return _displacement(self.robot, self.check, kr150.TOOL, plan, parts, chosen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +128,7 @@ def drifting_cell(robot: TrueRobot, sphere: Array, check: Array) -> DriftingCell
     """Scale a robot's drift, and each further shift's level, to the published size."""
 
     def share(robot: TrueRobot, plan: DriftPlan) -> float:
-        return share_within(_displacement(robot, check, kr150.TOOL, plan, coarse=True))
+        return share_within(_displacement(robot, check, kr150.TOOL, plan, chosen=_COARSE))
 
     factor = _bisect(lambda f: share(_scaled(robot, f), PLANS[0]))
     robot = _scaled(robot, factor)
@@ -165,15 +170,12 @@ def _displacement(
     point: Array,
     plan: DriftPlan,
     parts: int = 1,
-    *,
-    coarse: bool = False,
+    chosen: slice = slice(None),
 ) -> Array:
     """True displacement (t, m, 3) of a point of the flange since the cold robot, m."""
     cold = robot.point(q, Warmth.cold(robot.nominal.n), point)
     states = [state for _, state in plan.warmths(parts)]
-    if coarse:
-        states = states[_COARSE // 2 :: _COARSE]
-    return np.array([robot.point(q, state, point) - cold for state in states])
+    return np.array([robot.point(q, state, point) - cold for state in states[chosen]])
 
 
 def _with_lengths(robot: TrueRobot, sphere: Array, check: Array, plan: DriftPlan) -> float:
@@ -182,9 +184,9 @@ def _with_lengths(robot: TrueRobot, sphere: Array, check: Array, plan: DriftPlan
     chosen = [arm.parameters.names.index(name) for name in LENGTHS]
     seen = arm.parameter_jacobian(sphere, kr150.BALL)[:, :3, chosen].reshape(-1, len(chosen))
     told = arm.parameter_jacobian(check, kr150.TOOL)[:, :3, chosen].reshape(-1, len(chosen))
-    moved = _displacement(robot, sphere, kr150.BALL, plan, coarse=True)
+    moved = _displacement(robot, sphere, kr150.BALL, plan, chosen=_COARSE)
     lengths = moved.reshape(len(moved), -1) @ np.linalg.pinv(seen).T
-    truth = _displacement(robot, check, kr150.TOOL, plan, coarse=True).reshape(len(moved), -1)
+    truth = _displacement(robot, check, kr150.TOOL, plan, chosen=_COARSE).reshape(len(moved), -1)
     return share_within(truth - lengths @ told.T)
 
 

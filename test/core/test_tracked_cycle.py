@@ -165,7 +165,7 @@ def test_leaving_a_pose_out_is_taking_the_cycle_without_it(arm):
     for i in range(POSES):
         part = DriftTracker(spots, process, SIGMA)
         part.take(warm.take(np.arange(POSES) != i), 7200.0)
-        y, H, _ = part.observation(warm.take(np.array([i])))
+        y, H, _ = part.observation(warm.take(np.array([i])), 7200.0)
         assert whole.found.left_out[spots.match(warm)[i]] == pytest.approx(
             y - H @ part.state.mean, abs=1e-12
         )

@@ -28,8 +28,7 @@ def sample_path(process: DriftProcess, count: int, rng: np.random.Generator) -> 
     """Drifts (count, k) drawn from the process, from a cold start, every five minutes."""
     k = len(process.covariance)
     root = np.linalg.cholesky(process.covariance)
-    rate = np.sqrt(3.0) / process.time_s
-    state = np.stack([np.zeros(k), rate * (root @ rng.standard_normal(k))])
+    state = np.stack([np.zeros(k), root @ rng.standard_normal(k)])
     F, noise = process.transition(PERIOD_S)
     step = np.linalg.cholesky(noise)
     path = []
@@ -39,20 +38,23 @@ def sample_path(process: DriftProcess, count: int, rng: np.random.Generator) -> 
     return np.array(path)
 
 
-def test_the_process_is_stationary_and_smooth():
-    """Stepping twice is stepping once, and the long run has variance 1 (Matern 3/2)."""
-    process = DriftProcess(np.eye(1), 3600.0)
+def test_the_process_approaches_what_it_should():
+    """Stepping twice is stepping once; small steps follow the differential equation."""
+    process = DriftProcess(np.eye(1), 1800.0, 9000.0)
     F1, Q1 = process.transition(100.0)
     F2, Q2 = process.transition(200.0)
     assert pytest.approx(F2, rel=1e-12, abs=1e-12) == F1 @ F1
     assert pytest.approx(Q2, rel=1e-9) == F1 @ Q1 @ F1.T + Q1
     far, all_noise = process.transition(1e6)
     assert np.abs(far).max() < 1e-12
-    rate = np.sqrt(3.0) / 3600.0
-    assert all_noise == pytest.approx(np.diag([1.0, rate**2]))
-    lag = 700.0
-    correlation = process.transition(lag)[0][0, 0]
-    assert correlation == pytest.approx((1.0 + rate * lag) * np.exp(-rate * lag))
+    assert all_noise[1, 1] == pytest.approx(1.0)
+    # var x = cov(x, u) = steady / (steady + approach): d/dt E[x u] = 0 and d/dt E[x^2] = 0
+    assert all_noise[0] == pytest.approx([9000.0 / 10800.0] * 2)
+    step, noise = process.transition(0.1)
+    assert (step - np.eye(2)) / 0.1 == pytest.approx(
+        np.array([[-1.0 / 1800.0, 1.0 / 1800.0], [0.0, -1.0 / 9000.0]]), rel=1e-3, abs=1e-9
+    )
+    assert noise[1, 1] / 0.1 == pytest.approx(2.0 / 9000.0, rel=1e-3)
 
 
 def test_errors_and_innovations_are_what_the_filter_says(arm):

@@ -8,42 +8,47 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SETUP_SIGMA_M = 1e-5
-SETUP_TIME_S = 1800.0
-DRIFT_TIME_S = 4.0 * 3600.0
+SETUP_APPROACH_S = 1800.0
+APPROACH_S = 3600.0  # a link follows what heats it
+STEADY_TIME_S = 8.0 * 3600.0  # what heats it changes with the work
 
 
 @dataclass(frozen=True, eq=False)
 class DriftProcess:
-    """A smooth random drift that begins at zero, and a set-up that is never quite still.
+    """A drift that begins at zero and approaches a steady state, and a set-up never quite still.
 
-    The parameters follow a Gaussian process with Matern-3/2 correlation in time: what a body does
-    that is heated at a rate which changes. As a state it is the drift and its rate (Hartikainen
-    and Sarkka 2010). The set-up (sensor, and sphere on the flange) wanders by its own small
-    amount: sensors warm up and stems expand, and neither may pass for a drift of the arm.
+    ``approach_s dx/dt = u - x`` for each parameter x; its steady state u is a first-order process
+    that forgets what it was within ``steady_s``: work changes. The set-up (sensor, and sphere on
+    the flange) does the same in its own small way: sensors warm up and stems expand, and neither
+    may pass for a drift of the arm.
 
     Attributes
     ----------
-    covariance : (k, k) of the parameters' drift in the long run, SI.
-    time_s : correlation time of the drift.
-    setup_sigma_m, setup_time_s : standard deviation of each of the set-up's six coordinates, and
-        its correlation time.
+    covariance : (k, k) of the parameters' steady state, SI.
+    approach_s, steady_s : time constants; they must differ.
+    setup_sigma_m, setup_approach_s : standard deviation of the steady state of each of the
+        set-up's six coordinates, and how fast they approach it.
     """
 
     covariance: Array
-    time_s: float = DRIFT_TIME_S
+    approach_s: float = APPROACH_S
+    steady_s: float = STEADY_TIME_S
     setup_sigma_m: float = SETUP_SIGMA_M
-    setup_time_s: float = SETUP_TIME_S
+    setup_approach_s: float = SETUP_APPROACH_S
 
     def transition(self, step_s: float) -> tuple[Array, Array]:
-        """Transition (2, 2) of a drift and its rate over a step, and its noise for variance 1."""
-        rate = np.sqrt(3.0) / self.time_s
-        fade = np.exp(-rate * step_s)
-        F = fade * np.array(
-            [[1.0 + rate * step_s, step_s], [-(rate**2) * step_s, 1.0 - rate * step_s]]
-        )
-        steady = np.diag([1.0, rate**2])
-        return F, steady - F @ steady @ F.T
+        """Transition (2, 2) of a drift and its steady state, and its noise for variance 1."""
+        return _transition(step_s, self.approach_s, self.steady_s)
 
-    def setup_fade(self, step_s: float) -> float:
-        """What is left of the set-up's deviation after a step."""
-        return float(np.exp(-step_s / self.setup_time_s))
+    def setup_transition(self, step_s: float) -> tuple[Array, Array]:
+        """The same of a coordinate of the set-up."""
+        return _transition(step_s, self.setup_approach_s, self.steady_s)
+
+
+def _transition(step_s: float, approach_s: float, steady_s: float) -> tuple[Array, Array]:
+    near, far = np.exp(-step_s / approach_s), np.exp(-step_s / steady_s)
+    share = steady_s / (steady_s - approach_s)
+    F = np.array([[near, share * (far - near)], [0.0, far]])
+    reached = steady_s / (steady_s + approach_s)
+    long_run = np.array([[reached, reached], [reached, 1.0]])
+    return F, long_run - F @ long_run @ F.T

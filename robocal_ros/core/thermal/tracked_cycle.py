@@ -125,9 +125,10 @@ def _left_out(
     All else: the earlier cycles and the other poses of this one that agree. Cold visit and set-up
     are estimated along, so that model in force and candidate differ by the drift alone.
     """
-    _, H, _ = tracker.observation(warm)
+    _, H, _ = tracker.observation(warm, before.time_s)
+    D = tracker.drift_rows(before.time_s)
     v, S, k, count = innovation.deviation, innovation.covariance, tracker.count, len(warm)
-    PH = before.covariance[:k] @ H.T
+    forecast, PH = D @ before.mean, D @ before.covariance @ H.T
     kept = np.repeat(innovation.kept, 3)
     miss, spread, drifts = np.empty((count, 3)), np.empty(count), np.empty((count, k))
     for i in range(count):
@@ -137,7 +138,7 @@ def _left_out(
         gain = np.linalg.solve(S[np.ix_(others, others)], np.column_stack([v[others], across]))
         miss[i] = v[own] - across.T @ gain[:, 0]
         spread[i] = np.sqrt(np.trace(S[own, own] - across.T @ gain[:, 1:]))
-        drifts[i] = before.mean[:k] + PH[:, others] @ gain[:, 0]
+        drifts[i] = forecast + PH[:, others] @ gain[:, 0]
     return miss, spread, drifts
 
 

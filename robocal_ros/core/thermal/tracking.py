@@ -1,7 +1,8 @@
 """The model between measuring cycles: a Kalman filter over the parameters' drift.
 
-State: drift of the k parameters and its rate, the error of each cold spot (the noise of the cold
-visit is in every later comparison), and the set-up's six coordinates. Absolute: the drift is
+State: drift of the k parameters and its steady state, the gains of the motors' temperatures where
+those are given, the error of each cold spot (the noise of the cold visit is in every later
+comparison), and the set-up's six coordinates with their steady state. Absolute: the drift is
 against the cold model, whatever is in force. A cycle that the process cannot explain is not
 applied.
 """
@@ -12,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.descent import chi2_quantile
-from robocal_ros.core.errors import StaleError
+from robocal_ros.core.errors import InputError, StaleError
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.agreement import agreeing
+from robocal_ros.core.thermal.heat import SOURCES, Heat, HeatGains, joints_of, swing_k
 from robocal_ros.core.thermal.process import DriftProcess
 from robocal_ros.core.thermal.spots import ColdSpots
 
@@ -23,6 +25,8 @@ Array = NDArray[np.float64]
 FALSE_ALARM = 0.001  # chance that a sound cycle is not applied
 FEWEST_SHARE = 0.5  # of a cycle's samples that must agree
 SETUP = 6
+OUTLIER_M = 1e-3  # a sample that fits nothing lies anywhere within so much
+LONGEST_SILENCE_S = 900.0  # a cycle needs motor temperatures that are no older
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,8 @@ class Innovation:
     kept : (m,) samples that agree with the others.
     deviation, covariance : (3m,) measured less expected displacement, m, and (3m, 3m) what the
         tracker expected of it.
+    log_likelihood : of all samples; those that do not fit lie anywhere within a millimetre.
+    whitened : (freedom,) the innovation in units of its own spread: standard normal.
     """
 
     squared: float
@@ -55,6 +61,8 @@ class Innovation:
     kept: NDArray[np.bool_]
     deviation: Array
     covariance: Array
+    log_likelihood: float
+    whitened: Array
 
 
 class DriftTracker:
@@ -64,21 +72,58 @@ class DriftTracker:
     ----------
     sigma_m : standard deviation of one coordinate of one visit (repeatability and sensor), of
         the cold visits and of warm ones that bring no covariance of their own.
+    gains : of the motors' temperatures, which ``read_temperatures`` then brings; the process is
+        what they leave. The cold visit is at ``time_s``.
     """
 
     def __init__(
-        self, spots: ColdSpots, process: DriftProcess, sigma_m: float, time_s: float = 0.0
+        self,
+        spots: ColdSpots,
+        process: DriftProcess,
+        sigma_m: float,
+        time_s: float = 0.0,
+        gains: HeatGains | None = None,
     ) -> None:
         self.spots, self.process, self.sigma_m = spots, process, sigma_m
-        self.count = len(process.covariance)
+        arm, self.count = spots.cell.arm, len(process.covariance)
+        self._joint = joints_of(arm)
+        self._heat = None if gains is None else Heat.cold(arm.n, time_s, gains.lag_s)
         k, cold = self.count, 3 * len(spots.visits)
-        size = 2 * k + cold + SETUP
-        covariance = np.zeros((size, size))
-        rate = np.sqrt(3.0) / process.time_s
-        covariance[k : 2 * k, k : 2 * k] = rate**2 * process.covariance
-        own = np.arange(2 * k, 2 * k + cold)
+        learned = 0 if gains is None else SOURCES * k
+        self._gains = slice(2 * k, 2 * k + learned)
+        self._setup = self._gains.stop + cold
+        size = self._setup + 2 * SETUP
+        mean, covariance = np.zeros(size), np.zeros((size, size))
+        covariance[k : 2 * k, k : 2 * k] = process.covariance
+        if gains is not None:
+            mean[self._gains] = gains.mean
+            covariance[self._gains, self._gains] = gains.covariance
+        own = np.arange(self._gains.stop, self._setup)
         covariance[own, own] = np.repeat(sigma_m**2 / spots.visits, 3)
-        self.state = TrackerState(time_s, np.zeros(size), covariance)
+        own = np.arange(self._setup + SETUP, size)
+        covariance[own, own] = process.setup_sigma_m**2
+        self.state = TrackerState(time_s, mean, covariance)
+
+    @property
+    def gains(self) -> HeatGains | None:
+        """The temperatures' gains as known by now."""
+        if self._heat is None:
+            return None
+        own, state = self._gains, self.state
+        mean, covariance = state.mean[own].copy(), state.covariance[own, own].copy()
+        return HeatGains(mean, covariance, self._heat.lag_s)
+
+    def read_temperatures(self, temperature: Array, time_s: float) -> None:
+        """Take motor temperatures (n,) above those at the cold visit, K; in order of time.
+
+        Raises
+        ------
+        InputError
+            When they are not one finite number per joint, come out of order, or have no gains.
+        """
+        if self._heat is None:
+            raise InputError("this tracker has no gains for motor temperatures: learn them first")
+        self._heat = self._heat.read(temperature, time_s)
 
     def at(self, time_s: float) -> TrackerState:
         """The state at a later time, without new measurements.
@@ -97,25 +142,42 @@ class DriftTracker:
             )
         if step == 0.0:
             return state
-        (f, g), noise = self.process.transition(step)
-        fade = self.process.setup_fade(step)
         mean, P = state.mean.copy(), state.covariance.copy()
-        drift, rate = mean[:k].copy(), mean[k : 2 * k].copy()
-        mean[:k], mean[k : 2 * k] = f[0] * drift + f[1] * rate, g[0] * drift + g[1] * rate
-        for rows in (P, P.T):  # F P F^T, block by block: the rest of F is the unit matrix
-            drift, rate = rows[:k].copy(), rows[k : 2 * k].copy()
-            rows[:k], rows[k : 2 * k] = f[0] * drift + f[1] * rate, g[0] * drift + g[1] * rate
-            rows[-SETUP:] *= fade
-        P[: 2 * k, : 2 * k] += np.kron(noise, self.process.covariance)
-        own = np.arange(len(P) - SETUP, len(P))
-        P[own, own] += self.process.setup_sigma_m**2 * (1.0 - fade**2)
-        mean[-SETUP:] *= fade
+        process, setup = self.process, slice(self._setup, None)
+        for part, (F, noise), variance in (
+            (slice(2 * k), process.transition(step), process.covariance),
+            (setup, process.setup_transition(step), process.setup_sigma_m**2 * np.eye(SETUP)),
+        ):
+            for rows in (mean[:, None], P, P.T):  # F P F^T by blocks: the rest of F is one
+                before = rows[part].reshape(2, len(variance), -1)
+                rows[part] = np.tensordot(F, before, 1).reshape(2 * len(variance), -1)
+            P[part, part] += np.kron(noise, variance)
         return TrackerState(time_s, mean, P)
 
     def drift(self, time_s: float) -> tuple[Array, Array]:
-        """Parameters' drift (k,) since the cold reference and its covariance (k, k), SI."""
+        """Parameters' drift (k,) since the cold reference and its covariance (k, k), SI.
+
+        Where motor temperatures are in use, those after the last reading are held, with a doubt
+        that grows.
+        """
         state, k = self.at(time_s), self.count
-        return state.mean[:k], state.covariance[:k, :k]
+        rows = self.drift_rows(time_s)
+        covariance = rows @ state.covariance @ rows.T
+        if self._heat is not None:
+            gain = state.mean[self._gains].reshape(k, SOURCES)[:, 0]
+            sigma = swing_k(time_s - self._heat.time_s) * gain
+            same = self._joint[:, None] == self._joint
+            covariance += same * np.outer(sigma, sigma)
+        return rows @ state.mean, covariance
+
+    def drift_rows(self, time_s: float) -> Array:
+        """Drift (k, d) of the parameters by the state."""
+        k = self.count
+        rows = np.zeros((k, len(self.state.mean)))
+        rows[:, :k] = np.eye(k)
+        if self._heat is not None:
+            rows[:, self._gains] = self._heat.held(time_s).rows(self._joint)
+        return rows
 
     def take(self, cycle: Measurements, time_s: float) -> Innovation:
         """Update with a cycle, unless the process cannot explain it.
@@ -127,15 +189,18 @@ class DriftTracker:
         InputError
             When a sample has no cold counterpart.
         StaleError
-            When the cycle is older than the last one.
+            When the cycle is older than the last one, or the motor temperatures much older.
         """
         state = self.at(time_s)
-        y, H, R = self.observation(cycle)
+        self._require_temperatures(time_s)
+        y, H, R = self.observation(cycle, time_s)
         deviation, expected = y - H @ state.mean, H @ state.covariance @ H.T + R
         keep = agreeing(deviation, expected, len(cycle))
         rows = np.repeat(keep, 3)
         v, PH, S = deviation[rows], state.covariance @ H[rows].T, expected[np.ix_(rows, rows)]
-        squared = float(v @ np.linalg.solve(S, v))
+        root = np.linalg.cholesky(S)
+        whitened = np.linalg.solve(root, v)
+        squared = float(whitened @ whitened)
         limit = chi2_quantile(1.0 - FALSE_ALARM, len(v))
         applied = squared <= limit and np.mean(keep) >= FEWEST_SHARE
         if applied:
@@ -150,16 +215,30 @@ class DriftTracker:
             kept=keep,
             deviation=deviation,
             covariance=expected,
+            log_likelihood=-0.5 * squared
+            - float(np.log(np.sqrt(2.0 * np.pi) * np.diag(root)).sum())
+            - 3.0 * float(np.sum(~keep)) * np.log(OUTLIER_M),
+            whitened=whitened,
         )
 
-    def observation(self, cycle: Measurements) -> tuple[Array, Array, Array]:
+    def _require_temperatures(self, time_s: float) -> None:
+        """Refuse a cycle without recent temperatures: the process alone would not explain it."""
+        if self._heat is None or time_s - self._heat.time_s <= LONGEST_SILENCE_S:
+            return
+        raise StaleError(
+            f"the motor temperatures are {time_s - self._heat.time_s:.0f} s old, a cycle needs "
+            f"them within {LONGEST_SILENCE_S:.0f} s: check their topic, or track without them"
+        )
+
+    def observation(self, cycle: Measurements, time_s: float) -> tuple[Array, Array, Array]:
         """Drift of the spots (3m,), its rows (3m, d) in the state, and its noise (3m, 3m)."""
-        spots, k, m = self.spots, self.count, len(cycle)
+        spots, m = self.spots, len(cycle)
         spot = spots.match(cycle)
         parameters, setup = spots.rows(cycle.q, spots.target[spot])
         H = np.zeros((m, 3, len(self.state.mean)))
-        H[:, :, :k], H[:, :, -SETUP:] = parameters, setup
-        columns = 2 * k + 3 * spot[:, None] + np.arange(3)
+        H[:] = parameters @ self.drift_rows(time_s)
+        H[:, :, self._setup : self._setup + SETUP] = setup
+        columns = self._gains.stop + 3 * spot[:, None] + np.arange(3)
         H[np.arange(m)[:, None], np.arange(3), columns] = -1.0
         sigma = np.full(m, self.sigma_m) if cycle.sigma is None else cycle.sigma
         return spots.drift(cycle).ravel(), H.reshape(3 * m, -1), np.diag(np.repeat(sigma**2, 3))
