@@ -23,7 +23,7 @@ from robocal_ros.sim.shift import REFERENCE
 from robocal_ros.storage.bags import BagReader, BagWriter
 
 SERIAL = "SIM-KR150-2"
-INPUTS = ("joint_states", "sphere_cloud", "reference_sphere_center")
+INPUTS = ("joint_states", "sphere_cloud", "reference_sphere_center", "motor_temperatures")
 EVENT_TOPIC = "/thermal_node/session_events"
 RECORDED = "recorded.mcap"
 RATE = 1000.0  # recorded seconds per second

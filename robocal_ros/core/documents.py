@@ -159,6 +159,7 @@ def reference_document(reference: ColdReference) -> Document:
         "sample": list(data.sample),
         "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
         "fixed": reference.fixed.tolist(),
+        "temperature": None if reference.temperature is None else reference.temperature.tolist(),
     }
 
 
@@ -178,4 +179,10 @@ def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
         sample=tuple(document["sample"]),
         stamp_ns=None if stamps is None else np.array(stamps, dtype=np.int64),
     )
-    return ColdReference(cell, data, fixed=np.array(document["fixed"]).reshape(-1, 3))
+    warmth = document["temperature"]
+    return ColdReference(
+        cell,
+        data,
+        fixed=np.array(document["fixed"]).reshape(-1, 3),
+        temperature=None if warmth is None else np.array(warmth),
+    )

@@ -74,6 +74,15 @@ class PoseSample:
     T_frame_target: Array
 
 
+@dataclass(frozen=True, slots=True)
+class TemperatureSample:
+    """A joint's motor temperature."""
+
+    stamp_ns: int
+    joint: str
+    celsius: float
+
+
 @dataclass(frozen=True)
 class Measurements:
     """Joint readings paired with measured positions or poses of named targets on the flange.
@@ -223,6 +232,21 @@ def cloud_sample(
     fit = fit_sphere(cloud_points(message), rule)
     sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
     return PointSample(stamp_ns(message.header.stamp), frame, target, fit.centre, topic, sigma_m)
+
+
+def temperature_sample(message: Any) -> TemperatureSample:
+    """Build a sample from a ``sensor_msgs/Temperature`` whose frame_id names the joint.
+
+    Raises
+    ------
+    InputError
+        When the temperature is not finite, or the stamp is missing.
+    """
+    celsius = _finite(np.array([message.temperature], dtype=np.float64), "motor temperature")
+    at_ns = stamp_ns(message.header.stamp)
+    if at_ns <= 0:
+        raise InputError("no time stamp")
+    return TemperatureSample(at_ns, message.header.frame_id, float(celsius[0]))
 
 
 def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSample:

@@ -19,7 +19,7 @@ from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.pose_planning import SensorField
 from robocal_ros.nodes.conversions import transform_message, trigger_text
 from robocal_ros.sessions.events import CALIBRATE_SENSOR, Command, Outcome
-from robocal_ros.sessions.proposing import SENSOR
+from robocal_ros.sessions.setting_up import SENSOR
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped
 from numpy.typing import NDArray
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.task import Future
-from sensor_msgs.msg import JointState, PointCloud2
+from sensor_msgs.msg import JointState, PointCloud2, Temperature
 
 from robocal_ros import __version__
 from robocal_ros.core import frames
@@ -31,8 +31,9 @@ from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
 from robocal_ros.sessions.events import CYCLE, Command, Outcome
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
-from robocal_ros.sessions.proposing import SENSOR
 from robocal_ros.sessions.records import configuration
+from robocal_ros.sessions.setting_up import SENSOR
+from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
@@ -49,6 +50,7 @@ INPUTS = {
     CLOUD: PointCloud2,
     FIXED: PointStamped,
     POSE: PoseStamped,
+    TEMPERATURES: Temperature,
 }
 
 # Deep enough for the seconds that a large identification takes.
@@ -156,7 +158,7 @@ class ThermalNode(HouseNode):
     def _prior(self) -> Array:
         if self._session is None:
             raise NotActiveError("no session: activate the node")
-        return self._session.prior
+        return self._session.expected.process.covariance
 
     def _force(self) -> None:
         self._step(force=True)

@@ -1,6 +1,10 @@
 """How accurate the robot is believed to be now, for the line."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
@@ -28,9 +32,13 @@ class Accuracy:
 
 
 def accuracy_of(
-    following: Following, current: InForce, config: ThermalConfig, stamp_ns: int
+    following: Following,
+    current: InForce,
+    config: ThermalConfig,
+    temperatures: Sequence[tuple[int, NDArray[np.float64]]],
+    stamp_ns: int,
 ) -> Accuracy:
-    """Judge the model in force at a stamp."""
+    """Judge the model in force at a stamp, by the motors' temperatures (n,) up to then."""
     try:
         follower = following.follower
     except RobocalError as error:
@@ -40,7 +48,8 @@ def accuracy_of(
     if follower is None:
         words = "no cold reference: how far the robot has drifted is not known; capture one"
         return Accuracy(AccuracyLevel.EXPIRED, words)
-    return _judged(follower, current, config, stamp_ns)
+    with follower.looking_ahead(temperatures):
+        return _judged(follower, current, config, stamp_ns)
 
 
 def _judged(

@@ -4,26 +4,28 @@ So it survives a restart: the history holds each cycle's measurements, and every
 tracker's state, from which the later cycles are taken again.
 """
 
-import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.accuracy import AccuracyForecast
+from robocal_ros.core.thermal.heat import Heat
+from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess
+from robocal_ros.core.thermal.process_documents import process_of
+from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.core.thermal.steps import FixedSphere
 from robocal_ros.core.thermal.tracked_cycle import TrackedCycle, track_cycle
-from robocal_ros.core.thermal.tracking import DriftTracker, TrackerState
+from robocal_ros.sessions.follower_state import HEAT, STATE, FollowerState
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce
 
@@ -31,74 +33,7 @@ Array = NDArray[np.float64]
 
 CHECKPOINT_EVERY = 32  # cycles between two kept states: a restart takes at most so many again
 LOOK_BACK = 500
-STATE = ("tracker_mean", "tracker_covariance", "tracker_clock")
-
-
-@dataclass(frozen=True, eq=False)
-class FollowerState:
-    """Where a follower stands.
-
-    Attributes
-    ----------
-    tracker : state of the tracker; its time counts from the cold visit.
-    stamp_ns : of the last cycle that was taken, of the cold visit before the first.
-    cycles : kept since the cold visit, refused ones among them.
-    moved : why the last cycle was refused; empty where it was not.
-    """
-
-    tracker: TrackerState
-    stamp_ns: int
-    cycles: int
-    moved: str = ""
-
-    def document(self) -> dict[str, Any]:
-        """In plain values, bit for bit."""
-        mean, covariance, clock = self.arrays().values()
-        return {
-            "mean": _text(mean),
-            "covariance": _text(covariance),
-            "time_s": self.tracker.time_s,
-            "clock": clock.tolist(),
-            "moved": self.moved,
-        }
-
-    @classmethod
-    def of_document(cls, document: Mapping[str, Any]) -> "FollowerState":
-        """Read it back.
-
-        Raises
-        ------
-        InputError
-            When it is no such document.
-        """
-        try:
-            arrays = {
-                STATE[0]: _array(document["mean"]),
-                STATE[1]: _array(document["covariance"]),
-                STATE[2]: np.array(document["clock"], dtype=np.int64),
-            }
-            return cls.of_arrays(arrays, float(document["time_s"]), str(document["moved"]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"the recorded state of the tracker cannot be read: {error}"
-            ) from error
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """In arrays; the covariance is symmetric to the last bit, one half of it is kept."""
-        P = self.tracker.covariance
-        clock = np.array([self.stamp_ns, self.cycles], dtype=np.int64)
-        return dict(zip(STATE, (self.tracker.mean, P[np.triu_indices(len(P))], clock), strict=True))
-
-    @classmethod
-    def of_arrays(
-        cls, arrays: Mapping[str, NDArray[Any]], time_s: float, moved: str
-    ) -> "FollowerState":
-        """Read it back."""
-        mean, half, clock = (arrays[name] for name in STATE)
-        P = np.zeros((len(mean),) * 2)
-        rows, columns = np.triu_indices(len(mean))
-        P[rows, columns] = P[columns, rows] = half
-        return cls(TrackerState(time_s, mean, P), int(clock[0]), int(clock[1]), moved)
+EXPECTED = "expected"  # of a reference's model: the learned process, None for the default
 
 
 class DriftFollower:
@@ -106,16 +41,18 @@ class DriftFollower:
 
     Parameters
     ----------
-    reference, prior : cold reference, and (k, k) covariance of the expected drift, SI.
+    expected : how the robot is expected to drift; with temperatures where the reference has them.
     """
 
-    def __init__(self, reference: ColdReference, prior: Array, sigma_m: float) -> None:
-        self._process = DriftProcess(prior)
-        self._tracker = DriftTracker(reference.spots, self._process, sigma_m)
+    def __init__(self, reference: ColdReference, expected: LearnedProcess) -> None:
+        if reference.temperature is None:  # what the motors' warmth is against is not known
+            expected = replace(expected, gains=None)
+        self._tracker = expected.tracker(reference.spots)
         self._reference = reference
-        self._sigma_m = sigma_m
         self._forecast: tuple[SerialArm, AccuracyForecast] | None = None
-        self.state = FollowerState(self._tracker.state, reference.data.middle_ns, 0)
+        self.state = FollowerState(
+            self._tracker.state, self._tracker.heat, reference.data.middle_ns, 0
+        )
 
     def take(
         self, cycle: Measurements, in_force: SerialArm, fixed: FixedSphere | None
@@ -133,11 +70,32 @@ class DriftFollower:
         refused = found.judged.verdict.code is Code.SENSOR_OR_ROBOT_MOVED
         self.state = FollowerState(
             tracker=self._tracker.state,
+            heat=self._tracker.heat,
             stamp_ns=self.state.stamp_ns if refused else stamp_ns,
             cycles=self.state.cycles + 1,
             moved=found.judged.verdict.reason if refused else "",
         )
         return found
+
+    def read(self, temperatures: Sequence[tuple[int, Array]]) -> None:
+        """Take motor temperatures (n,), degrees Celsius, that are newer than the last ones."""
+        tracker, cold = self._tracker, self._reference.temperature
+        if tracker.heat is None or cold is None:
+            return
+        for stamp_ns, temperature in temperatures:
+            time_s = self.state.tracker.time_s + 1e-9 * (stamp_ns - self.state.stamp_ns)
+            if time_s > tracker.heat.time_s:
+                tracker.read_temperatures(temperature - cold, time_s)
+
+    @contextmanager
+    def looking_ahead(self, temperatures: Sequence[tuple[int, Array]]) -> Iterator[None]:
+        """Within, the follower knows these temperatures too; then it forgets them again."""
+        heat = self._tracker.heat
+        try:
+            self.read(temperatures)
+            yield
+        finally:
+            self._tracker.heat = heat
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
@@ -151,13 +109,21 @@ class DriftFollower:
 
     def go_on_from(self, state: FollowerState) -> None:
         """Go on from a state of a follower of the same reference."""
-        self.state, self._tracker.state = state, state.tracker
+        self.state, self._tracker.state, self._tracker.heat = state, state.tracker, state.heat
 
-    def checkpoint(self) -> dict[str, NDArray[Any]]:
-        """What to keep with the cycle just taken; empty for most."""
-        if self.state.cycles % CHECKPOINT_EVERY:
-            return {}
-        return {**self.state.arrays(), "tracker_time_s": np.array(self.state.tracker.time_s)}
+    def kept(self, temperature: Array | None) -> dict[str, NDArray[Any]]:
+        """What to keep beside the measurements of the cycle just taken.
+
+        ``temperature`` (n,) of the motors, degrees Celsius, for those who learn from it.
+        """
+        state, kept = self.state, {}
+        if temperature is not None:
+            kept["motor_temperature"] = temperature
+        if state.heat is not None:
+            kept[HEAT] = state.heat.array()
+        if state.cycles % CHECKPOINT_EVERY == 0:
+            kept |= {**state.arrays(), "tracker_time_s": np.array(state.tracker.time_s)}
+        return kept
 
     def catch_up(self, history: History) -> None:
         """Take the kept cycles of this reference again, from the last kept state on."""
@@ -177,7 +143,7 @@ class DriftFollower:
                 break
             waiting.append((arrays, moved))
         for arrays, moved in reversed(waiting):
-            self._take_again(Measurements.of_arrays(arrays), moved)
+            self._take_again(arrays, moved)
 
     def forecast(self, in_force: SerialArm) -> AccuracyForecast:
         """What to expect of a model in force."""
@@ -193,37 +159,43 @@ class DriftFollower:
     def _time_s(self, stamp_ns: int) -> float:
         """The same for a cycle; how long ago the last one was is not known after a jump back."""
         step_ns = stamp_ns - self.state.stamp_ns
-        step_s = step_ns * 1e-9 if step_ns >= 0 else self._process.steady_s
+        step_s = step_ns * 1e-9 if step_ns >= 0 else self._tracker.process.steady_s
         return self.state.tracker.time_s + step_s
 
-    def _take_again(self, cycle: Measurements, moved: str) -> None:
-        state, stamp_ns = self.state, cycle.middle_ns
+    def _take_again(self, arrays: Mapping[str, NDArray[Any]], moved: str) -> None:
+        state, tracker, cycle = self.state, self._tracker, Measurements.of_arrays(arrays)
+        stamp_ns = cycle.middle_ns
+        if HEAT in arrays:
+            tracker.heat = Heat.of_array(arrays[HEAT])
         if not moved:
-            averaged = self._tracker.spots.average(cycle, self._sigma_m)
-            self._tracker.take(averaged, self._time_s(stamp_ns))
+            averaged = tracker.spots.average(cycle, tracker.sigma_m)
+            tracker.take(averaged, self._time_s(stamp_ns))
         self.state = FollowerState(
-            tracker=self._tracker.state,
+            tracker=tracker.state,
+            heat=tracker.heat,
             stamp_ns=state.stamp_ns if moved else stamp_ns,
             cycles=state.cycles + 1,
             moved=moved,
         )
 
 
-def _text(array: NDArray[Any]) -> str:
-    return base64.b64encode(np.ascontiguousarray(array, dtype="<f8").tobytes()).decode()
-
-
-def _array(text: str) -> Array:
-    return np.frombuffer(base64.b64decode(text), dtype="<f8").astype(np.float64)
-
-
 class Following:
-    """The follower of the cold reference in force, made anew where another one comes into force."""
+    """The follower of the cold reference in force, made anew where another one comes into force.
 
-    def __init__(self, history: History, current: InForce, prior: Array, sigma_m: float) -> None:
-        self._history, self._current, self._prior = history, current, prior
-        self._sigma_m = sigma_m
+    ``sigma_m``: of one visit, where none was learned.
+    """
+
+    def __init__(self, history: History, current: InForce, sigma_m: float) -> None:
+        self._history, self._current, self._sigma_m = history, current, sigma_m
         self._followed: tuple[int | None, DriftFollower] | None = None
+
+    @property
+    def expected(self) -> LearnedProcess:
+        """What the reference in force knows of the robot's drift; the default without one."""
+        kept = (self._current.reference_model or {}).get(EXPECTED)
+        if kept is not None:
+            return process_of(kept)
+        return LearnedProcess(DriftProcess(drift_prior(self._current.nominal)), self._sigma_m)
 
     @property
     def follower(self) -> DriftFollower | None:
@@ -238,7 +210,7 @@ class Following:
         if current.reference is None:
             return None
         if self._followed is None or self._followed[0] != current.reference_id:
-            follower = DriftFollower(current.reference, self._prior, self._sigma_m)
+            follower = DriftFollower(current.reference, self.expected)
             follower.catch_up(self._history)
             self._followed = (current.reference_id, follower)
         return self._followed[1]

@@ -21,7 +21,8 @@ class InForce:
     Attributes
     ----------
     head : head of the thermal models.
-    reference, reference_id : the cold reference and its calibration, or None.
+    reference, reference_id, reference_model : the cold reference, its calibration, and what is
+        kept of it; or None.
     fault : why the history could not be read at the last look; empty when it could.
     """
 
@@ -32,7 +33,7 @@ class InForce:
         decided = history.decisions()
         self._seen = decided[-1].seq if decided else 0
         self.head: Head = history.head(THERMAL)
-        self.reference, self.reference_id = self._stored_reference()
+        self._take_reference()
         self.fault = ""
 
     @property
@@ -54,7 +55,7 @@ class InForce:
                 return []
             decided = self._history.decisions(self._seen)
             self.head = self._history.head(THERMAL)
-            self.reference, self.reference_id = self._stored_reference()
+            self._take_reference()
         except RobocalError as error:
             self.fault = str(error)
             return []
@@ -62,10 +63,16 @@ class InForce:
         self._seen = decided[-1].seq if decided else self._seen
         return [d for d in decided if d.kind == THERMAL and d.wall_ns != own_wall_ns]
 
-    def _stored_reference(self) -> tuple[ColdReference | None, int | None]:
+    def _take_reference(self) -> None:
         head = self._history.head(REFERENCE)
         reference = None if head.model is None else reference_of(head.model, self._nominal)
-        return reference, head.calibration_id
+        self.reference: ColdReference | None = reference
+        self.reference_id, self.reference_model = head.calibration_id, head.model
+
+    @property
+    def nominal(self) -> SerialArm:
+        """The arm without any calibration."""
+        return self._nominal
 
 
 def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:

@@ -3,8 +3,15 @@
 from typing import Any
 
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.samples import cloud_sample, joint_sample, point_sample, pose_sample
+from robocal_ros.core.samples import (
+    cloud_sample,
+    joint_sample,
+    point_sample,
+    pose_sample,
+    temperature_sample,
+)
 from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
+from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.sessions.thermal import ThermalSession
 
 
@@ -20,6 +27,8 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
             session.add(point_sample(message, session.config.target, kind))
         elif kind == CLOUD:
             session.add(cloud_sample(message, session.config.sphere, session.config.target))
+        elif kind == TEMPERATURES:
+            session.add(temperature_sample(message))
         elif kind == POSE:
             session.add(pose_sample(message, session.config.target))
     except RobocalError as error:

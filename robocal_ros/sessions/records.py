@@ -84,7 +84,6 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
             "config": asdict(session.config),
             "model": session.in_force.model,
             "reference": session.reference_model,
-            "prior": session.prior.tolist(),
             "tracker": None if session.follower is None else session.follower.state.document(),
         },
         session.desk.newest_ns.get(JOINTS, 0),

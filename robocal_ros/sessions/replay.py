@@ -16,6 +16,7 @@ from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observation import Observation
 from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
 from robocal_ros.sessions.records import digest, read_command
+from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.sessions.thermal import ThermalSession
 
 EVENTS = "session_events"
@@ -106,7 +107,7 @@ def input_topics(topics: Iterable[str], configured: Command | None = None) -> di
     found: dict[str, str] = {}
     for topic in sorted(topics):
         kind = topic_kind(topic)
-        if kind not in (JOINTS, *MEASURING) or UNCORRECTED in topic:
+        if kind not in (JOINTS, TEMPERATURES, *MEASURING) or UNCORRECTED in topic:
             continue
         if kind in found.values():
             other = next(name for name, its in found.items() if its == kind)

@@ -3,14 +3,12 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, WrongRobotError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Proposal
-from robocal_ros.sessions.drift_following import FollowerState
 from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.follower_state import FollowerState
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
 from robocal_ros.sessions.records import config_of
@@ -51,7 +49,7 @@ def session_as_recorded(
     require_robot(nominal, configured)
     arguments = configured.arguments
     try:
-        model, reference, prior = arguments["model"], arguments["reference"], arguments["prior"]
+        model, reference = arguments["model"], arguments["reference"]
         tracker = arguments["tracker"]
     except KeyError as error:
         raise InputError(f"the recorded configuration lacks {error}") from error
@@ -59,7 +57,7 @@ def session_as_recorded(
     if fresh:
         _bring_into_force(history, THERMAL, nominal, model, software)
         _bring_into_force(history, REFERENCE, nominal, reference, software)
-    session = ThermalSession(nominal, history, config_of(arguments), software, np.array(prior))
+    session = ThermalSession(nominal, history, config_of(arguments), software)
     if fresh and tracker is not None and session.follower is not None:
         session.follower.go_on_from(FollowerState.of_document(tracker))
     return session

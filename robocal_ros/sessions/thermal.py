@@ -8,11 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import reference_document
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
-from robocal_ros.core.samples import JointSample, PointSample, PoseSample
+from robocal_ros.core.samples import (
+    JointSample,
+    Measurements,
+    PointSample,
+    PoseSample,
+    TemperatureSample,
+)
+from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.sessions import events
 from robocal_ros.sessions.accuracy import Accuracy, accuracy_of
@@ -22,12 +28,17 @@ from robocal_ros.sessions.drift_following import DriftFollower, Following
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce, outside_decision
+from robocal_ros.sessions.keeping import Keeper
 from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk
 from robocal_ros.sessions.proposing import Proposer
-from robocal_ros.sessions.thermal_config import ThermalConfig, expected_drift
-from robocal_ros.sessions.windows import Windows
+from robocal_ros.sessions.setting_up import SetUp
+from robocal_ros.sessions.temperatures import TEMPERATURES, MotorTemperatures
+from robocal_ros.sessions.thermal_config import ThermalConfig
+from robocal_ros.sessions.windows import Beside, Windows
 
 __all__ = ["ThermalConfig", "ThermalSession"]
+
+Array = NDArray[np.float64]
 
 SAME_CLOCK_NS = 1_000_000_000
 _NO_REFERENCE = "no cold reference: capture it before the first cycle"
@@ -41,7 +52,7 @@ class ThermalSession:
 
     Attributes
     ----------
-    prior : (k, k) covariance of the expected drift, fixed for the life of the session.
+    temperatures : of the motors.
     cycle : the measuring cycle that is open.
     windows : which measurements belong to a cycle.
     """
@@ -52,7 +63,6 @@ class ThermalSession:
         history: History,
         config: ThermalConfig,
         software: str,
-        prior: NDArray[np.float64] | None = None,
     ) -> None:
         self.nominal = nominal
         self.config = config
@@ -62,13 +72,13 @@ class ThermalSession:
         self._history = history
         self._queue: list[Command] = []
         self._current = InForce(history, nominal)
-        self.prior = expected_drift(nominal, history, config) if prior is None else prior
+        self.temperatures = MotorTemperatures(nominal.joint_names)
         self.cycle = CycleBook()
         self.windows = Windows(self.desk, self.cycle, self._current, config)
-        self._following = Following(history, self._current, self.prior, config.sigma_m)
-        self._proposer = Proposer(
-            nominal, history, config, software, self._current, self._following
-        )
+        self._following = Following(history, self._current, config.sigma_m)
+        keeper = Keeper(nominal, history, software, self._current)
+        self._set_up = SetUp(nominal, history, config, self._current, keeper)
+        self._proposer = Proposer(nominal, config, self._current, self._following, keeper)
 
     @property
     def in_force(self) -> Head:
@@ -97,13 +107,24 @@ class ThermalSession:
 
     @property
     def reference_model(self) -> dict[str, Any] | None:
-        """The cold reference's document, or None."""
-        return None if self.reference is None else reference_document(self.reference)
+        """The cold reference as it is kept, or None."""
+        return self._current.reference_model
 
-    def add(self, sample: JointSample | PointSample | PoseSample) -> None:
+    @property
+    def expected(self) -> LearnedProcess:
+        """How the robot is expected to drift: as known when the reference was captured."""
+        return self._following.expected
+
+    def add(self, sample: JointSample | PointSample | PoseSample | TemperatureSample) -> None:
         """Take a sample."""
         if isinstance(sample, JointSample):
+            jumps = self.desk.jumps
             self.desk.add_joints(sample)
+            if self.desk.jumps > jumps:
+                self.temperatures.clear()
+        elif isinstance(sample, TemperatureSample):
+            self.temperatures.add(sample)
+            self.desk.newest_ns[TEMPERATURES] = self.temperatures.newest_ns or 0
         else:
             self.desk.add_measurement(sample)
 
@@ -198,20 +219,27 @@ class ThermalSession:
     def _calibrate_sensor(self, command: Command, wall_ns: int) -> Outcome:
         """Place the sensor; the samples stay, for the cold reference."""
         data, _ = self.windows.of(command)
-        return self._proposer.place_sensor(command, data, self.desk.frame or "", wall_ns)
+        return self._set_up.place_sensor(command, data, self.desk.frame or "", wall_ns)
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         data, fixed = self.windows.of(command)
-        outcome = self._proposer.capture(command, data, fixed, wall_ns)
+        reference = Beside(fixed, self._readings(command, data))
+        outcome = self._set_up.capture(command, data, reference, wall_ns)
         self._close_cycle(command)
         return outcome
 
     def _identify(self, command: Command, wall_ns: int) -> Outcome:
         method = self._proposer.method(command)
         data, fixed = self.windows.of(command)
-        outcome = self._proposer.identify(command, data, fixed, method, wall_ns)
+        beside = Beside(fixed, self._readings(command, data))
+        outcome = self._proposer.identify(command, data, beside, method, wall_ns)
         self._close_cycle(command)
         return outcome
+
+    def _readings(self, command: Command, data: Measurements) -> list[tuple[int, Array]]:
+        """Motor temperatures up to the middle of what was measured."""
+        newest = (command.marks or {}).get(TEMPERATURES, -1)
+        return self.temperatures.until(min(data.middle_ns, newest))
 
     def _close_cycle(self, command: Command) -> None:
         self.cycle.close()
@@ -260,7 +288,8 @@ class ThermalSession:
 
     def accuracy(self, stamp_ns: int) -> Accuracy:
         """How far the tool may be off at a stamp with the model in force."""
-        return accuracy_of(self._following, self._current, self.config, stamp_ns)
+        readings = self.temperatures.until(stamp_ns)
+        return accuracy_of(self._following, self._current, self.config, readings, stamp_ns)
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""

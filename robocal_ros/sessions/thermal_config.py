@@ -1,27 +1,18 @@
-"""Settings of the thermal session, and the drift that it expects."""
+"""Settings of the thermal session."""
 
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.identification import Method
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import State
 from robocal_ros.core.samples import DEFAULT_TARGET
 from robocal_ros.core.streams import StandstillRule
-from robocal_ros.core.thermal.priors import drift_prior, learned_prior
-from robocal_ros.sessions.history import History
 
 Prior = Literal["default", "learned"]
 
 METHODS: tuple[Method, ...] = ("map", "lsq")
 PRIORS: tuple[Prior, ...] = ("default", "learned")
-LEARN_FROM = 500
 SPHERE_RADIUS_M = 0.01905  # 1.5 inches across, the usual reference sphere
-STOOD = (State.IN_FORCE, State.SUPERSEDED)  # what was rolled back was no drift
 
 
 @dataclass(frozen=True)
@@ -31,7 +22,7 @@ class ThermalConfig:
     Attributes
     ----------
     method : estimator where a command names none.
-    prior : ``default``, or ``learned`` from the drifts accepted and not rolled back so far.
+    prior : ``default``, or ``learned`` from the shifts in the history.
     sigma_m : standard deviation of one measured coordinate in one visit of a pose.
     drift_parameters : what ``lsq`` solves of a drift; empty: all, which takes many poses.
     hold_out, seed : share of the poses kept to judge a calibration without reference.
@@ -59,23 +50,3 @@ class ThermalConfig:
     target: str = DEFAULT_TARGET
     standstill: StandstillRule = field(default_factory=StandstillRule)
     sphere: SphereRule = field(default_factory=lambda: SphereRule(SPHERE_RADIUS_M))
-
-
-def expected_drift(
-    nominal: SerialArm, history: History, config: ThermalConfig
-) -> NDArray[np.float64]:
-    """Covariance (k, k), SI, of the drift: the default, or learned from what stood."""
-    default = drift_prior(nominal)
-    if config.prior == "default":
-        return default
-    accepted = [entry.id for entry in history.list(LEARN_FROM) if entry.state in STOOD]
-    models = [history.model(calibration_id) for calibration_id in accepted]
-    drifts = [m for m in models if "reference_mdh" in m]
-    if not drifts:
-        return default
-    changes = [np.array(m["mdh"]) - np.array(m["reference_mdh"]) for m in drifts]
-    return learned_prior(
-        default,
-        np.array([nominal.parameters.read(change) for change in changes]),
-        np.array([m["covariance"] for m in drifts]),
-    )

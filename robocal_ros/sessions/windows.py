@@ -1,5 +1,8 @@
 """Which measurements belong to a command, and when a cycle ends by itself."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +19,23 @@ from robocal_ros.sessions.thermal_config import ThermalConfig
 Array = NDArray[np.float64]
 
 OTHER_POSE = "measured at a pose that the cold reference lacks"
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """What was measured beside the targets.
+
+    ``fixed`` (n, 3): centres of a sphere fixed in the cell, m; ``temperatures``: stamps and
+    temperatures (n,) of all motors up to then, degrees Celsius.
+    """
+
+    fixed: Array
+    temperatures: Sequence[tuple[int, Array]]
+
+    @property
+    def temperature(self) -> Array | None:
+        """The last of them."""
+        return self.temperatures[-1][1] if self.temperatures else None
 
 
 class Windows:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from shift import Shift, built, of_kind, postures, warmed
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import Proposal
 from robocal_ros.core.samples import JointSample, PointSample
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions import events
@@ -22,7 +21,6 @@ from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.observations import JOINTS, POINT
 from robocal_ros.sessions.records import digest
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.sessions.thermal_config import expected_drift
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
@@ -257,42 +255,6 @@ def test_a_history_that_vanishes_is_a_fault_and_not_the_end(nominal, visits, tmp
     (tmp_path / "elsewhere").rename(path)
     session.poll()
     assert session.fault == ""
-
-
-def test_what_was_rolled_back_teaches_nothing(nominal, tmp_path):
-    """A superseded drift still counts, a rolled-back one never."""
-    config = ThermalConfig(prior="learned")
-    chosen = nominal.parameters
-
-    def drift(size: float) -> Proposal:
-        return Proposal(
-            model_hash=nominal.model_hash,
-            based_on=history.head().revision,
-            cycle_id="",
-            stamp_ns=1,
-            created_ns=1,
-            software="test",
-            method="map",
-            code=Code.ACCEPT,
-            reason="",
-            document={},
-            model={
-                "mdh": chosen.add(nominal.mdh, np.full(len(chosen), size)).tolist(),
-                "reference_mdh": nominal.mdh.tolist(),
-                "covariance": (1e-12 * np.eye(len(chosen))).tolist(),
-            },
-        )
-
-    with CalibrationHistory.open(
-        "s1", model_hash=nominal.model_hash, state_dir=tmp_path
-    ) as history:
-        for size in (1e-4, 2e-4):
-            history.accept(history.propose(drift(size)), by="", reason="", wall_ns=1)
-        before = expected_drift(nominal, history, config)
-        history.accept(history.propose(drift(1e-2)), by="", reason="", wall_ns=2)
-        assert expected_drift(nominal, history, config)[0, 0] > 2.0 * before[0, 0]
-        history.rollback(None, by="", reason="wrong", wall_ns=3)
-        np.testing.assert_array_equal(expected_drift(nominal, history, config), before)
 
 
 @pytest.mark.parametrize("wrong", [JointSample, PointSample])

@@ -59,6 +59,10 @@ class AccuracyForecast:
     def _rows(self) -> Array:
         return workspace_rows(self._tracker.spots)
 
+    def drift_at(self, time_s: float) -> tuple[Array, Array]:
+        """Expected drift (k,) since the cold visit and its covariance (k, k), SI."""
+        return self._tracker.drift(time_s)
+
     def at(self, time_s: float) -> ToolError:
         """Expected error at a time of the tracker's.
 
@@ -66,7 +70,7 @@ class AccuracyForecast:
         m'm + tr C and variance 4 m'Cm + 2 tr C^2; over all postures it is taken for a scaled
         chi-square of the same two moments (Satterthwaite 1946).
         """
-        drift, covariance = self._tracker.drift(time_s)
+        drift, covariance = self.drift_at(time_s)
         rows = self._rows
         miss = rows @ (drift - self._in_force)
         C = rows @ covariance @ rows.transpose(0, 2, 1)

@@ -70,6 +70,16 @@ class Heat:
         """At a later time, the motors as last read; an earlier one changes nothing."""
         return self if time_s <= self.time_s else self.read(self.motor, time_s)
 
+    def array(self) -> Array:
+        """Everything in one array (2 + 2n,), for keeping."""
+        return np.concatenate([[self.time_s, self.lag_s], self.motor, self.lagged])
+
+    @classmethod
+    def of_array(cls, kept: Array) -> "Heat":
+        """Read back what ``array`` gave."""
+        motor, lagged = kept[2:].reshape(2, -1)
+        return cls(float(kept[0]), motor, lagged, float(kept[1]))
+
     def rows(self, joint: NDArray[np.int64]) -> Array:
         """Drift (k, 3k) of parameters of these joints (k,) by the gains."""
         next_lagged = np.append(self.lagged[1:], 0.0)

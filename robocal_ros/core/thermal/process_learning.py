@@ -116,7 +116,8 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     sigma_m = visit_noise(shifts)
 
     def covariance(of: Sequence[EarlierShift], every: int) -> Array:
-        histories = [(shift.spots, shift.cycles[::every]) for shift in of]
+        step = min(every, max(1, sum(len(shift.cycles) for shift in of) // FEWEST_CYCLES))
+        histories = [(shift.spots, shift.cycles[::step]) for shift in of]
         return learn_drift(histories, sigma_m=sigma_m).covariance
 
     pairs = [

@@ -27,12 +27,14 @@ class ColdReference:
     cell : the cold model with base and targets as fitted to the cold visit.
     data : the cold measurements.
     rejected : names of those that did not fit the others.
+    temperature : (n,) of the motors, degrees Celsius; None where they were not read.
     fixed : (n, 3) centres of a sphere fixed in the cell, measured at the same visit, m; n may be 0.
     """
 
     cell: CellModel
     data: Measurements
     rejected: tuple[str, ...] = ()
+    temperature: Array | None = None
     fixed: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property

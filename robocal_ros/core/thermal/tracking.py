@@ -87,7 +87,7 @@ class DriftTracker:
         self.spots, self.process, self.sigma_m = spots, process, sigma_m
         arm, self.count = spots.cell.arm, len(process.covariance)
         self._joint = joints_of(arm)
-        self._heat = None if gains is None else Heat.cold(arm.n, time_s, gains.lag_s)
+        self.heat = None if gains is None else Heat.cold(arm.n, time_s, gains.lag_s)
         k, cold = self.count, 3 * len(spots.visits)
         learned = 0 if gains is None else SOURCES * k
         self._gains = slice(2 * k, 2 * k + learned)
@@ -107,11 +107,11 @@ class DriftTracker:
     @property
     def gains(self) -> HeatGains | None:
         """The temperatures' gains as known by now."""
-        if self._heat is None:
+        if self.heat is None:
             return None
         own, state = self._gains, self.state
         mean, covariance = state.mean[own].copy(), state.covariance[own, own].copy()
-        return HeatGains(mean, covariance, self._heat.lag_s)
+        return HeatGains(mean, covariance, self.heat.lag_s)
 
     def read_temperatures(self, temperature: Array, time_s: float) -> None:
         """Take motor temperatures (n,) above those at the cold visit, K; in order of time.
@@ -121,9 +121,9 @@ class DriftTracker:
         InputError
             When they are not one finite number per joint, come out of order, or have no gains.
         """
-        if self._heat is None:
+        if self.heat is None:
             raise InputError("this tracker has no gains for motor temperatures: learn them first")
-        self._heat = self._heat.read(temperature, time_s)
+        self.heat = self.heat.read(temperature, time_s)
 
     def at(self, time_s: float) -> TrackerState:
         """The state at a later time, without new measurements.
@@ -163,9 +163,9 @@ class DriftTracker:
         state, k = self.at(time_s), self.count
         rows = self.drift_rows(time_s)
         covariance = rows @ state.covariance @ rows.T
-        if self._heat is not None:
+        if self.heat is not None:
             gain = state.mean[self._gains].reshape(k, SOURCES)[:, 0]
-            sigma = swing_k(time_s - self._heat.time_s) * gain
+            sigma = swing_k(time_s - self.heat.time_s) * gain
             same = self._joint[:, None] == self._joint
             covariance += same * np.outer(sigma, sigma)
         return rows @ state.mean, covariance
@@ -175,8 +175,8 @@ class DriftTracker:
         k = self.count
         rows = np.zeros((k, len(self.state.mean)))
         rows[:, :k] = np.eye(k)
-        if self._heat is not None:
-            rows[:, self._gains] = self._heat.held(time_s).rows(self._joint)
+        if self.heat is not None:
+            rows[:, self._gains] = self.heat.held(time_s).rows(self._joint)
         return rows
 
     def take(self, cycle: Measurements, time_s: float) -> Innovation:
@@ -223,10 +223,10 @@ class DriftTracker:
 
     def _require_temperatures(self, time_s: float) -> None:
         """Refuse a cycle without recent temperatures: the process alone would not explain it."""
-        if self._heat is None or time_s - self._heat.time_s <= LONGEST_SILENCE_S:
+        if self.heat is None or time_s - self.heat.time_s <= LONGEST_SILENCE_S:
             return
         raise StaleError(
-            f"the motor temperatures are {time_s - self._heat.time_s:.0f} s old, a cycle needs "
+            f"the motor temperatures are {time_s - self.heat.time_s:.0f} s old, a cycle needs "
             f"them within {LONGEST_SILENCE_S:.0f} s: check their topic, or track without them"
         )
 

@@ -1,0 +1,175 @@
+"""What a robot's own history teaches, with and without motor temperatures."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shift import NOISE_M, NS, Shift, built, postures, warmed
+
+from robocal_ros.core.samples import TemperatureSample
+from robocal_ros.core.thermal.priors import drift_prior
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.expectation import earlier_shifts, expected_drift
+from robocal_ros.sessions.follower_state import FollowerState
+from robocal_ros.sessions.temperatures import MotorTemperatures
+from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+POSES, CYCLES = 8, 12
+COLD_C = 21.0
+
+
+def config(prior: str) -> ThermalConfig:
+    return ThermalConfig(prior="learned" if prior == "learned" else "default", sigma_m=NOISE_M)
+
+
+class Robot:
+    """A robot whose links follow its motors at once; shift after shift in one history."""
+
+    def __init__(self, folder: Path, *, prior: str = "default", temperatures: bool = False) -> None:
+        self.nominal = load_robot("kr150_r3100")
+        self.folder, self.temperatures = folder, temperatures
+        self.shift = Shift(self.nominal.joint_names)
+        self.cold, self.q = built(self.nominal), postures(self.nominal, POSES)
+        self.start(prior)
+
+    def start(self, prior: str = "default") -> ThermalSession:
+        self.history = CalibrationHistory.open(
+            "s1", model_hash=self.nominal.model_hash, state_dir=self.folder
+        )
+        self.session = ThermalSession(self.nominal, self.history, config(prior), "test")
+        return self.session
+
+    def warmth(self, kelvin: float) -> None:
+        """All motors are read."""
+        if self.temperatures:
+            for name in self.nominal.joint_names:
+                at = self.shift.now_ns
+                self.session.add(TemperatureSample(at, name, COLD_C + kelvin))
+
+    def visit(self, command: str, kelvin: float, after_h: float) -> Outcome:
+        self.shift.now_ns += round(after_h * 3600 * NS)
+        self.warmth(kelvin)
+        for sample in self.shift.visit(warmed(self.cold, kelvin), self.q):
+            self.session.add(sample)
+        self.session.submit(Command(command))
+        return self.session.advance(wall_ns=1, force=True)[-1]
+
+    def work(self, highest_k: float) -> list[Outcome]:
+        """A night's rest, a cold reference, and a shift that warms up."""
+        assert self.visit(events.CAPTURE_REFERENCE, 0.0, 12.0).done
+        rise = highest_k * (1.0 - np.exp(-np.arange(1, CYCLES + 1) / 4.0))
+        return [self.visit(events.IDENTIFY, kelvin, 0.3) for kelvin in rise]
+
+
+def test_the_history_teaches_what_drift_to_expect(tmp_path):
+    robot = Robot(tmp_path)
+    robot.work(15.0)
+    found, words = expected_drift(robot.nominal, robot.history)
+    assert found is not None
+    assert words == "learned from 1 shifts"
+    default = drift_prior(robot.nominal)
+    assert np.trace(found.process.covariance) < np.trace(default)
+    assert found.sigma_m == pytest.approx(NOISE_M, rel=0.25)
+    assert np.array_equal(robot.session.expected.process.covariance, default)
+    robot.start("learned")
+    assert np.array_equal(robot.session.expected.process.covariance, default)  # of this reference
+    captured = robot.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
+    assert "learned from 1 shifts" in captured.message
+    kept = robot.session.expected
+    assert np.array_equal(kept.process.covariance, found.process.covariance)
+
+
+def test_too_little_teaches_nothing_and_says_so(tmp_path):
+    robot = Robot(tmp_path)
+    robot.visit(events.CAPTURE_REFERENCE, 0.0, 0.0)
+    robot.visit(events.IDENTIFY, 5.0, 1.0)
+    found, words = expected_drift(robot.nominal, robot.history)
+    assert found is None
+    assert words.startswith("default, because no shift has 10 cycles")
+
+
+def test_what_was_rolled_back_or_rejected_teaches_nothing(tmp_path):
+    robot = Robot(tmp_path)
+    outcomes = robot.work(15.0)
+    ids = [o.calibration_id for o in outcomes]
+    robot.history.accept(ids[-1], by="", reason="", wall_ns=1)
+    (shift,) = earlier_shifts(robot.nominal, robot.history)
+    assert len(shift.cycles) == CYCLES
+    robot.history.rollback(None, by="", reason="wrong", wall_ns=2)
+    robot.history.reject(ids[-2], by="", reason="wrong", wall_ns=3)
+    (shift,) = earlier_shifts(robot.nominal, robot.history)
+    assert len(shift.cycles) == CYCLES - 2
+    assert shift.temperature is None
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory) -> Robot:
+    """Three shifts with temperatures, then a session that has learned from them."""
+    robot = Robot(tmp_path_factory.mktemp("learned"), temperatures=True)
+    for highest in (12.0, 20.0, 16.0):
+        robot.work(highest)
+    robot.start("learned")
+    return robot
+
+
+def test_temperatures_tell_the_drift_between_cycles(learned):
+    """Warmer by 6 K since the last cycle, as only the motors tell: most of that drift is seen."""
+    session = learned.session
+    captured = learned.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
+    assert "learned with temperatures from 3 shifts" in captured.message
+    for kelvin in (4.0, 7.0, 9.0):
+        assert learned.visit(events.IDENTIFY, kelvin, 0.3).calibration_id
+    follower = session.follower
+    assert follower is not None
+    learned.shift.now_ns += 1800 * NS
+    learned.warmth(15.0)
+    now_ns = learned.shift.now_ns
+    arm = session.reference.cell.arm
+    before = follower.state
+    with follower.looking_ahead(session.temperatures.until(now_ns)):
+        told, _ = follower.forecast(session.arm).drift_at(follower.time_s(now_ns))
+    assert follower.state is before
+    true = arm.parameters.read(warmed(learned.cold, 15.0).mdh - learned.cold.mdh)
+    held = arm.parameters.read(warmed(learned.cold, 9.0).mdh - learned.cold.mdh)
+    moved = [arm.parameter_jacobian(learned.q, [0.1, 0.05, 0.2])[:, :3] @ d for d in (told, held)]
+    true_moved = arm.parameter_jacobian(learned.q, [0.1, 0.05, 0.2])[:, :3] @ true
+    error, hold = (np.sqrt(np.mean((m - true_moved) ** 2)) for m in moved)
+    assert error < 0.5 * hold
+
+
+def test_a_restart_keeps_the_temperatures_course(learned):
+    state = learned.session.follower.state
+    session = learned.start("learned")
+    again = session.follower.state
+    assert np.array_equal(state.heat.array(), again.heat.array())
+    assert np.array_equal(state.tracker.mean, again.tracker.mean)
+    back = FollowerState.of_document(state.document())
+    assert np.array_equal(back.tracker.covariance, state.tracker.covariance)
+    assert np.array_equal(back.heat.array(), state.heat.array())
+
+
+def test_silent_temperatures_are_refused_with_what_to_do(learned):
+    learned.temperatures = False
+    try:
+        refused = learned.visit(events.IDENTIFY, 9.0, 1.0)
+    finally:
+        learned.temperatures = True
+    assert refused.status.name == "STALE"
+    assert "check their topic" in refused.message
+
+
+def test_readings_do_not_depend_on_their_order():
+    """All joints known; the last of each ten seconds."""
+    samples = [TemperatureSample(s * NS, name, s + 0.1) for s in range(1, 40) for name in "ab"]
+    straight, shuffled = MotorTemperatures(("a", "b")), MotorTemperatures(("a", "b"))
+    for sample in samples:
+        straight.add(sample)
+    for i in np.random.default_rng(0).permutation(len(samples)):
+        shuffled.add(samples[i])
+    for found in (straight, shuffled):
+        assert [stamp // NS for stamp, _ in found.until(35 * NS)] == [9, 19, 29]
+        assert [t.tolist() for _, t in found.until(25 * NS)] == [[9.1, 9.1], [19.1, 19.1]]
+    assert straight.until(0) == []
