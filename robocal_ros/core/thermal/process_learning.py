@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.heat import HeatGains
 from robocal_ros.core.thermal.learning import learn_drift
@@ -119,7 +119,8 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     sigma_m = visit_noise(shifts)
 
     def covariance(of: Sequence[EarlierShift]) -> Array:
-        histories = [(shift.spots, shift.cycles[::THINNED]) for shift in of]
+        every = max(1, min(THINNED, sum(len(s.cycles) for s in of) // FEWEST_CYCLES))
+        histories = [(shift.spots, shift.cycles[::every]) for shift in of]
         return learn_drift(histories, sigma_m=sigma_m).covariance
 
     pairs = [
@@ -154,6 +155,8 @@ def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     TooFewSamplesError
         With fewer than ten cycles.
     """
+    if any(shift.temperature is None for shift in shifts):
+        raise InputError("a shift without motor temperatures teaches no gains: leave it out")
     sigma_m, arm = visit_noise(shifts), shifts[0].spots.cell.arm
 
     def start(left: float, lag_s: float, length: float, angle: float) -> LearnedProcess:
