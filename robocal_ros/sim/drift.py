@@ -107,7 +107,7 @@ class DriftRecord:
     time_s : (t,) of each cycle.
     cold_q, cold : (r, s, n) readings and (r, s, 3) measured centres of the cold rounds.
     q, position : (t, s, n) and (t, s, 3) of the cycles.
-    temperature_s, temperature : (u,) and (u, n) of the motors above cold, K.
+    temperature : (t, n) of the motors above cold at each cycle, K.
     """
 
     time_s: Array
@@ -115,7 +115,6 @@ class DriftRecord:
     cold: Array
     q: Array
     position: Array
-    temperature_s: Array
     temperature: Array
 
 
@@ -207,7 +206,6 @@ def record(
         cold=np.array([p for _, p in before]),
         q=np.array([q for q, _ in after]),
         position=np.array([p for _, p in after]),
-        temperature_s=times,
         temperature=rise + TEMPERATURE_NOISE_K * rng.standard_normal(rise.shape),
     )
 
