@@ -12,7 +12,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bench import thermal_setup, thermal_tracking
+from bench import thermal_real, thermal_setup, thermal_tracking
 from bench.tables import Goal, Table
 from bench.thermal_shifts import PARTS, SEEDS, SIGMA_M, Measured, cell_of
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
@@ -276,5 +276,6 @@ def tables() -> Sequence[Table]:
         ),
         *thermal_setup.tables(),
         *thermal_tracking.tables(),
+        *thermal_real.tables(),
         speed_table(),
     ]

@@ -110,6 +110,7 @@ class DriftRecord:
     time_s : (t,) of each cycle.
     cold_q, cold : (r, s, n) readings and (r, s, 3) measured centres of the cold rounds.
     q, position : (t, s, n) and (t, s, 3) of the cycles.
+    temperature : (t, n) of the motors above cold at each cycle, K.
     """
 
     time_s: Array
@@ -117,6 +118,7 @@ class DriftRecord:
     cold: Array
     q: Array
     position: Array
+    temperature: Array
 
 
 def poses(kind: str) -> Array:
@@ -199,12 +201,14 @@ def record(
     before = [_visit(cell, sensor, cold, 0.0, rng) for _ in range(rounds)]
     states = list(plan.warmths())
     after = [_visit(cell, sensor, state, time_s, rng) for time_s, state in states]
+    rise = np.array([state.motor for _, state in states])
     return DriftRecord(
         time_s=np.array([time_s for time_s, _ in states]),
         cold_q=np.array([q for q, _ in before]),
         cold=np.array([p for _, p in before]),
         q=np.array([q for q, _ in after]),
         position=np.array([p for _, p in after]),
+        temperature=rise + TEMPERATURE_NOISE_K * rng.standard_normal(rise.shape),
     )
 
 

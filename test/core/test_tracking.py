@@ -1,6 +1,8 @@
 """The tracker: exact where it must be, honest where it cannot be, on simulated drift."""
 
+import pickle
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, StaleError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
+from robocal_ros.core.thermal.heat import Heat, HeatGains
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess
 from robocal_ros.core.thermal.spots import ColdSpots
@@ -177,3 +180,105 @@ def test_moving_the_sensor_changes_nothing(arm):
         tracker.take(moved[1], PERIOD_S)
         answers.append(tracker.drift(PERIOD_S)[0])
     assert answers[1] == pytest.approx(answers[0], abs=1e-9)
+
+
+def lagged(motor: np.ndarray, lag_s: float, parts: int = 500) -> np.ndarray:
+    """First-order lag (t, n) of temperatures read every five minutes, in many small steps."""
+    course = np.vstack([np.zeros(motor.shape[1]), motor])
+    value, found = np.zeros(motor.shape[1]), []
+    for before, after in pairwise(course):
+        for part in range(parts):
+            now = before + (after - before) * (part + 0.5) / parts
+            value = value + (now - value) * PERIOD_S / parts / lag_s
+        found.append(value)
+    return np.array(found)
+
+
+def test_lagged_temperatures_follow_the_straight_course_between_readings():
+    motor = 20.0 * np.random.default_rng(6).uniform(size=(5, 6))
+    heat = Heat.cold(6, 0.0, 1200.0)
+    for i, (row, expected) in enumerate(zip(motor, lagged(motor, 1200.0), strict=True)):
+        heat = heat.read(row, PERIOD_S * (i + 1))
+        # midpoint steps of 0.6 s: (0.6/1200)^2 / 24 of 20 K and less
+        assert heat.lagged == pytest.approx(expected, abs=1e-2)
+    assert heat.held(1e6).lagged == pytest.approx(motor[-1])
+    assert heat.held(0.0) is heat
+
+
+def test_with_temperatures_errors_are_what_the_filter_says(arm):
+    """Gains drawn from their prior, every parameter moved by its own joint's motors."""
+    cell, q, k = cell_of(arm), postures(6), len(arm.parameters)
+    process = DriftProcess(1e-4 * drift_prior(arm), setup_sigma_m=1e-9)
+    gains = HeatGains.expected(arm, 3600.0, 1.0, 0.5)
+    motor = 25.0 * (1.0 - np.exp(-np.arange(1, 9)[:, None] / np.linspace(4.0, 9.0, 6)))
+    behind = lagged(motor, 3600.0)
+    joint = np.array([index for index, _ in arm.parameters.index])
+    following = np.column_stack([behind[:, 1:], np.zeros(len(behind))])
+    runs, error2, innovation2, freedom, sums = 40, 0.0, 0.0, 0, np.zeros(2)
+    for seed in range(runs):
+        rng = np.random.default_rng(seed)
+        own = (np.sqrt(np.diag(gains.covariance)) * rng.standard_normal(3 * k)).reshape(k, 3)
+        spots = ColdSpots.of(cell, visit(cell, q, rng))
+        tracker = DriftTracker(spots, process, SIGMA, gains=gains)
+        plain = DriftTracker(spots, DriftProcess(drift_prior(arm)), SIGMA)
+        rest = sample_path(process, len(motor), rng)
+        for i in range(len(motor)):
+            at_s = PERIOD_S * (i + 1)
+            sources = np.column_stack([motor[i], behind[i], following[i]])[joint]
+            drift = np.sum(own * sources, axis=1) + rest[i]
+            warm = visit(drifted(cell, drift), q, rng)
+            tracker.read_temperatures(motor[i], at_s)
+            found = tracker.take(warm, at_s)
+            plain.take(warm, at_s)
+            innovation2, freedom = innovation2 + found.squared, freedom + found.freedom
+        mean, covariance = tracker.drift(at_s)
+        error2 += float((mean - drift) @ np.linalg.solve(covariance, mean - drift))
+        scale = np.diag(drift_prior(arm))
+        sums += [np.sum((x - drift) ** 2 / scale) for x in (mean, plain.drift(at_s)[0])]
+    assert error2 == pytest.approx(runs * k, abs=4.0 * np.sqrt(2.0 * runs * k))
+    assert innovation2 == pytest.approx(freedom, abs=4.0 * np.sqrt(2.0 * freedom))
+    assert sums[0] < sums[1]
+
+
+def test_temperatures_that_cannot_be_used_are_refused(arm):
+    cell, q = cell_of(arm), postures(6)
+    spots, process = ColdSpots.of(cell, visit(cell, q)), DriftProcess(drift_prior(arm))
+    with pytest.raises(InputError, match="no gains"):
+        DriftTracker(spots, process, SIGMA).read_temperatures(np.zeros(6), 60.0)
+    gains = HeatGains.expected(arm, 3600.0, 1.0, 1.0)
+    tracker = DriftTracker(spots, process, SIGMA, gains=gains)
+    for wrong in (np.zeros(5), np.full(6, np.nan)):
+        with pytest.raises(InputError, match="6 numbers, one per joint"):
+            tracker.read_temperatures(wrong, 60.0)
+    tracker.read_temperatures(np.ones(6), 60.0)
+    with pytest.raises(InputError, match="older than the last"):
+        tracker.read_temperatures(np.ones(6), 30.0)
+    with pytest.raises(StaleError, match="1140 s old"):
+        tracker.take(visit(cell, q), 1200.0)
+    near, far = (np.trace(tracker.drift(at_s)[1]) for at_s in (60.0, 7200.0))
+    assert near < far
+
+
+def test_a_process_that_forgets_too_soon_is_refused(arm):
+    with pytest.raises(InputError, match="shorter than"):
+        DriftProcess(drift_prior(arm), approach_s=3600.0, steady_s=3600.0)
+
+
+def test_a_week_of_cycles_takes_no_more_room_than_one(arm):
+    """Every three minutes for a week: the state keeps its size, and stays a covariance."""
+    cell, q, rng = cell_of(arm), postures(6), np.random.default_rng(7)
+    gains = HeatGains.expected(arm, 3600.0, 1.0, 1.0)
+    spots = ColdSpots.of(cell, visit(cell, q, rng))
+    tracker = DriftTracker(spots, DriftProcess(drift_prior(arm)), SIGMA, gains=gains)
+    rounds = [visit(cell, q, rng) for _ in range(20)]
+
+    def week(first: int, last: int) -> int:
+        for i in range(first, last):
+            tracker.read_temperatures(rng.normal(20.0, 1.0, 6), 180.0 * i)
+            assert tracker.take(rounds[i % 20], 180.0 * i).applied
+        return len(pickle.dumps(tracker))
+
+    after_one = week(1, 2)
+    assert week(2, 7 * 24 * 20 + 1) <= after_one + 64  # larger integers
+    assert after_one < 400_000
+    assert np.linalg.eigvalsh(tracker.state.covariance).min() > -1e-18

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.errors import InputError
+
 Array = NDArray[np.float64]
 
 SETUP_SIGMA_M = 1e-5
@@ -25,9 +27,14 @@ class DriftProcess:
     Attributes
     ----------
     covariance : (k, k) of the parameters' steady state, SI.
-    approach_s, steady_s : time constants; they must differ.
+    approach_s, steady_s : time constants; the first one is the shorter.
     setup_sigma_m, setup_approach_s : standard deviation of the steady state of each of the
         set-up's six coordinates, and how fast they approach it.
+
+    Raises
+    ------
+    InputError
+        When the steady state is forgotten before it is approached.
     """
 
     covariance: Array
@@ -35,6 +42,13 @@ class DriftProcess:
     steady_s: float = STEADY_TIME_S
     setup_sigma_m: float = SETUP_SIGMA_M
     setup_approach_s: float = SETUP_APPROACH_S
+
+    def __post_init__(self) -> None:
+        if not 0.0 < max(self.approach_s, self.setup_approach_s) < self.steady_s:
+            raise InputError(
+                f"approach within {self.approach_s:g} s (set-up: {self.setup_approach_s:g} s) must "
+                f"be shorter than the {self.steady_s:g} s after which the steady state is forgotten"
+            )
 
     def transition(self, step_s: float) -> tuple[Array, Array]:
         """Transition (2, 2) of a drift and its steady state, and its noise for variance 1."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.heat import HeatGains
 from robocal_ros.core.thermal.learning import learn_drift
@@ -22,10 +22,13 @@ from robocal_ros.core.thermal.tracking import DriftTracker
 Array = NDArray[np.float64]
 
 SCALES = tuple(2.0**-i for i in range(6))
+APPROACH_S = (1800.0, 2400.0, 3600.0)
 STEADY_S = (7200.0, 14400.0, 28800.0)
 LAGS_S = (1800.0, 3600.0, 7200.0)
 FEWEST_CYCLES = 10
-THINNED = 5  # widths are judged by every fifth cycle
+THINNED = 5  # cycles of one shift resemble each other: every fifth tells how large drifts are,
+SUCCESSIVE = 2  # and every second how they go on,
+JUDGING_POSES = 7  # by so many of its poses, or a few more
 LEFT_OVER = (1e-2, 1e-3, 1e-4, 1e-5)  # share of the default prior's variance that gains leave
 MEDIAN_SQUARE = 2.3659739  # of three standard normal numbers
 OUTLYING = 5.0  # standard deviations
@@ -115,29 +118,27 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     """
     sigma_m = visit_noise(shifts)
 
-    def covariance(of: Sequence[EarlierShift], every: int) -> Array:
-        step = min(every, max(1, sum(len(shift.cycles) for shift in of) // FEWEST_CYCLES))
-        histories = [(shift.spots, shift.cycles[::step]) for shift in of]
+    def covariance(of: Sequence[EarlierShift]) -> Array:
+        every = max(1, min(THINNED, sum(len(s.cycles) for s in of) // FEWEST_CYCLES))
+        histories = [(shift.spots, shift.cycles[::every]) for shift in of]
         return learn_drift(histories, sigma_m=sigma_m).covariance
 
     pairs = [
-        (covariance([s for s in shifts if s is not judged] or [judged], THINNED), judged)
+        (covariance([s for s in shifts if s is not judged] or [judged]), _fewer(judged))
         for judged in shifts
     ]
 
-    def likely(scale: float, steady_s: float) -> float:
-        return sum(
-            _follow(
-                LearnedProcess(DriftProcess(scale * learned, steady_s=steady_s), sigma_m),
-                judged,
-                THINNED,
-            )[1]
-            for learned, judged in pairs
-        )
+    def likely(scale: float, approach_s: float, steady_s: float) -> float:
+        total = 0.0
+        for learned, judged in pairs:
+            process = DriftProcess(scale * learned, approach_s, steady_s)
+            total += _follow(LearnedProcess(process, sigma_m), judged, SUCCESSIVE)[1]
+        return total
 
-    steady_s = max(STEADY_S, key=lambda x: likely(SCALES[2], x))
-    scale = _first_peak(lambda x: likely(x, steady_s), SCALES)
-    process = DriftProcess(scale * covariance(shifts, 1), steady_s=steady_s)
+    steady_s = max(STEADY_S, key=lambda x: likely(SCALES[2], APPROACH_S[1], x))
+    approach_s = max(APPROACH_S, key=lambda x: likely(SCALES[2], x, steady_s))
+    scale = _first_peak(lambda x: likely(x, approach_s, steady_s), SCALES)
+    process = DriftProcess(scale * covariance(shifts), approach_s, steady_s)
     return LearnedProcess(process, sigma_m)
 
 
@@ -154,6 +155,8 @@ def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     TooFewSamplesError
         With fewer than ten cycles.
     """
+    if any(shift.temperature is None for shift in shifts):
+        raise InputError("a shift without motor temperatures teaches no gains: leave it out")
     sigma_m, arm = visit_noise(shifts), shifts[0].spots.cell.arm
 
     def start(left: float, lag_s: float, length: float, angle: float) -> LearnedProcess:
@@ -170,6 +173,19 @@ def learn_gains(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     lag_s = max(LAGS_S, key=lambda x: likely(left, x, length, angle))
     left = _first_peak(lambda x: likely(x, lag_s, length, angle), LEFT_OVER)
     return _pass(start(left, lag_s, length, angle), shifts, 1)[0]
+
+
+def _fewer(shift: EarlierShift) -> EarlierShift:
+    """The shift by a part of its poses: quicker, and no less telling of time."""
+    spots = shift.spots
+    every = max(1, len(spots.visits) // JUDGING_POSES)
+    kept = np.arange(0, len(spots.visits), every)
+    few = replace(
+        spots, q=spots.q[kept], target=spots.target[kept], error=spots.error[kept],
+        visits=spots.visits[kept],
+    )  # fmt: skip
+    cycles = [cycle.take(np.isin(spots.match(cycle), kept)) for cycle in shift.cycles]
+    return replace(shift, spots=few, cycles=cycles)
 
 
 def _pass(
