@@ -235,7 +235,13 @@ sys.exit(frame.main(sys.argv[1:]))
 class TestSignals:
     def test_interrupt(self):
         command = [sys.executable, "-c", SLOW, "probe", "--wait"]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, env=environment()) as process:
+        with subprocess.Popen(
+            command,
+            stderr=subprocess.PIPE,
+            env=environment(),
+            # Where the tests run in the background, a shell has them ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        ) as process:
             try:
                 assert process.stderr.readline() == b"ready\n"
                 process.send_signal(signal.SIGINT)
