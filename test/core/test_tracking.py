@@ -255,8 +255,23 @@ def test_temperatures_that_cannot_be_used_are_refused(arm):
         tracker.read_temperatures(np.ones(6), 30.0)
     with pytest.raises(StaleError, match="1140 s old"):
         tracker.take(visit(cell, q), 1200.0)
-    near, far = (np.trace(tracker.drift(at_s)[1]) for at_s in (60.0, 7200.0))
-    assert near < far
+
+
+def test_temperatures_no_longer_read_are_held_with_a_growing_doubt(arm):
+    """Known gains, hardly any process: what is in doubt is the motors' 20 K, times the gain."""
+    cell, q, k = cell_of(arm), postures(6), len(arm.parameters)
+    known = np.zeros((k, 3))
+    known[:, 0] = np.sqrt(np.diag(drift_prior(arm))) / 20.0
+    gains = HeatGains(known.ravel(), 1e-30 * np.eye(3 * k), 3600.0)
+    process = DriftProcess(1e-12 * drift_prior(arm))
+    spots = ColdSpots.of(cell, visit(cell, q))
+    tracker = DriftTracker(spots, process, SIGMA, gains=gains)
+    tracker.read_temperatures(np.full(6, 10.0), 60.0)
+    for silent_s, doubt_k in ((0.0, 0.0), (3600.0, 20.0 * (1.0 - np.exp(-1.0))), (1e6, 20.0)):
+        mean, covariance = tracker.drift(60.0 + silent_s)
+        assert mean == pytest.approx(10.0 * known[:, 0])
+        sigma = np.sqrt(np.diag(covariance))
+        assert sigma == pytest.approx(doubt_k * known[:, 0], rel=1e-3, abs=1e-8)
 
 
 def test_a_process_that_forgets_too_soon_is_refused(arm):

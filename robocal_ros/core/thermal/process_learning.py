@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 SCALES = tuple(2.0**-i for i in range(6))
 APPROACH_S = (1800.0, 2400.0, 3600.0)
-STEADY_S = (7200.0, 14400.0, 28800.0)
+WORK_TIME_S = 7200.0  # within which work, and so the steady state, is taken to change
 LAGS_S = (1800.0, 3600.0, 7200.0)
 FEWEST_CYCLES = 10
 THINNED = 5  # cycles of one shift resemble each other: every fifth tells how large drifts are,
@@ -106,8 +106,8 @@ def visit_noise(shifts: Sequence[EarlierShift]) -> float:
 def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
     """Learn to track without temperatures.
 
-    The covariance is ``learn_drift``'s, its size the one with which each shift is most likely
-    under what the others teach (one shift alone judges itself).
+    The covariance is ``learn_drift``'s; its size, and the time of approach, are those with which
+    each shift is most likely under what the others teach (one shift alone judges itself).
 
     Raises
     ------
@@ -128,17 +128,16 @@ def learn_process(shifts: Sequence[EarlierShift]) -> LearnedProcess:
         for judged in shifts
     ]
 
-    def likely(scale: float, approach_s: float, steady_s: float) -> float:
+    def likely(scale: float, approach_s: float) -> float:
         total = 0.0
         for learned, judged in pairs:
-            process = DriftProcess(scale * learned, approach_s, steady_s)
+            process = DriftProcess(scale * learned, approach_s, WORK_TIME_S)
             total += _follow(LearnedProcess(process, sigma_m), judged, SUCCESSIVE)[1]
         return total
 
-    steady_s = max(STEADY_S, key=lambda x: likely(SCALES[2], APPROACH_S[1], x))
-    approach_s = max(APPROACH_S, key=lambda x: likely(SCALES[2], x, steady_s))
-    scale = _first_peak(lambda x: likely(x, approach_s, steady_s), SCALES)
-    process = DriftProcess(scale * covariance(shifts), approach_s, steady_s)
+    approach_s = max(APPROACH_S, key=lambda x: likely(SCALES[2], x))
+    scale = _first_peak(lambda x: likely(x, approach_s), SCALES)
+    process = DriftProcess(scale * covariance(shifts), approach_s, WORK_TIME_S)
     return LearnedProcess(process, sigma_m)
 
 
