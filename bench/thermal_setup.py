@@ -128,7 +128,7 @@ def poses_table() -> Table:
         ("candidates", "before", "random poses", "poses of the shifts", "planned",
          "planned / random", "goal"),
         "Default prior, candidates in the sensor's field, 34 working poses. Random: the median of "
-        "50 draws of the candidates. 500 candidates is the default of the command.",
+        "50 draws of the candidates. 1000 candidates is the default of the command.",
     )  # fmt: skip
     for count in (500, CANDIDATES, 2000):
         plan, (design, _) = planned(count), _design(count)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 NAME = "plan-poses"
 HELP = "choose the poses of a measuring cycle that say most about the tool, and how much better"
 
-POSES, CANDIDATES = 6, 500
+POSES, CANDIDATES = 6, 1000
 FIELD_MM = "570,430,700,550,850"
 
 

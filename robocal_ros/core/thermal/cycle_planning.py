@@ -20,7 +20,7 @@ from robocal_ros.core.thermal.pose_planning import (
 Array = NDArray[np.float64]
 
 POSES = 6
-CANDIDATES = 500
+CANDIDATES = 1000
 COLD_VISITS = 3
 
 
