@@ -1,0 +1,287 @@
+"""A tool frame from circles and plunges through two crossed beams."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import RankDeficientError, ResidualError
+from robocal_ros.core.estimation import Estimate, solve
+from robocal_ros.core.tool.beam_edges import BEAMS, BeamEdge, BeamError, edges_of
+from robocal_ros.core.tool.crossed_beams import CircleMotion, fit_circle
+from robocal_ros.core.tool.crossed_model import (
+    BeamStep,
+    Held,
+    RobotNoise,
+    RunProblem,
+    ToolState,
+    across,
+    touch_of,
+)
+from robocal_ros.core.tool.flange_path import FlangePath
+from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.core.tool.tool_axis import (
+    axis_from_centres,
+    require_height,
+    require_upright,
+    retaught,
+)
+
+Array = NDArray[np.float64]
+
+FEWEST_EDGES = {"circle": 4, "plunge": 2}  # of each beam
+START_RADIUS_M = 2e-3
+DEFAULT_NOISE = RobotNoise()
+FREE = Held()
+LARGEST_MISFIT_M = 2e-4  # rms of the edges: more is no robot's repeatability
+
+
+@dataclass(frozen=True, eq=False)
+class ToolEstimate:
+    """A measured tool.
+
+    Attributes
+    ----------
+    T_flange_tool : (4, 4) z along the axis from flange to tip, turned about it as it was taught.
+    covariance : (5, 5) of the tip (flange axes, m^2) and of the axis' direction along the tool's
+        own x and y (rad^2); None for the classic method.
+    latency_s, latency_sigma_s : of the edges behind the robot's readings.
+    radius : (circles, 2) of the tool as each circle and beam sees it, m.
+    misfit_m : rms of the edges' residuals, m.
+    rejected : edges that do not fit the others, as (step, beam, time_s).
+    """
+
+    T_flange_tool: Array
+    covariance: Array | None
+    latency_s: float | None
+    latency_sigma_s: float | None
+    radius: Array | None
+    misfit_m: float
+    rejected: tuple[tuple[str, str, float], ...]
+    estimate: Estimate[ToolState] | None
+
+    @property
+    def tip(self) -> Array:
+        """(3,) in the flange frame, m."""
+        return np.asarray(self.T_flange_tool[:3, 3])
+
+    @property
+    def axis(self) -> Array:
+        """(3,) unit vector from flange to tip, flange frame."""
+        return np.asarray(self.T_flange_tool[:3, 2])
+
+
+def estimate_tool(
+    laser: LaserFrame,
+    path: FlangePath,
+    steps: Sequence[BeamStep],
+    T_flange_tool: Array,
+    *,
+    noise: RobotNoise = DEFAULT_NOISE,
+    taper: float = 0.0,
+    held: Held = FREE,
+) -> ToolEstimate:
+    """Find tip and axis from the edges of all steps together, by maximum likelihood.
+
+    The flange pose is that of the path at each edge, so that the speed need not be constant and
+    the laser's axes need not be the base's.
+
+    Parameters
+    ----------
+    T_flange_tool : (4, 4) the taught tool: where the search begins, and the turn about the axis.
+    taper : growth of the radius per length above the tip; only matters while the tool is tilted.
+    held : what the steps need not determine, with its sigma about the taught tool.
+
+    Raises
+    ------
+    BeamError
+        When edges are missing, doubled or out of order.
+    RankDeficientError
+        When a motion is missing; the message names it.
+    ResidualError
+        When no tool explains the edges.
+    """
+    _require_steps(steps, held)
+    problem, start = run_problem(laser, path, steps, T_flange_tool, noise, taper, held)
+    _require_motion(problem, start)
+    found = solve(problem, start, prior_information=problem.prior)
+    _require_fit(problem, found)
+    state = found.state
+    R = retaught(T_flange_tool[:3, :3], state.axis)
+    return ToolEstimate(
+        T_flange_tool=frames.transform(R, state.tip),
+        covariance=_tool_covariance(found, R),
+        latency_s=state.latency_s,
+        latency_sigma_s=float(np.sqrt(found.covariance[5, 5])),
+        radius=state.radius,
+        misfit_m=_misfit(problem, found),
+        rejected=tuple(
+            (steps[problem.step[i]].name, BEAMS[problem.beam[i]], float(problem.time_s[i]))
+            for i in np.flatnonzero(found.rejected)
+        ),
+        estimate=found,
+    )
+
+
+def run_problem(
+    laser: LaserFrame,
+    path: FlangePath,
+    steps: Sequence[BeamStep],
+    T_flange_tool: Array,
+    noise: RobotNoise,
+    taper: float = 0.0,
+    held: Held = FREE,
+) -> tuple[RunProblem, ToolState]:
+    """The problem of a run and the state at which to begin; raises BeamError as `estimate_tool`."""
+    rows: list[tuple[int, int, int, BeamEdge]] = []
+    circles = 0
+    for i, step in enumerate(steps):
+        own = circles if step.kind == "circle" else -1
+        circles += step.kind == "circle"
+        for b, beam in enumerate(BEAMS):
+            found = edges_of(step.edges, beam, FEWEST_EDGES[step.kind])
+            rows += [(b, i, own, edge) for edge in found]
+    beam, step_index, circle = (np.array([r[k] for r in rows]) for k in range(3))
+    time = np.array([r[3].time_s for r in rows])
+    breaks = np.array([r[3].blocked for r in rows])
+    start = ToolState(
+        tip=T_flange_tool[:3, 3],
+        axis=T_flange_tool[:3, 2],
+        latency_s=0.0,
+        radius=np.full((circles, 2), START_RADIUS_M),
+        shift=np.zeros((len(steps), 3)),
+        bend=np.zeros((4, 2)),
+    )
+    T, velocity = path.at(time)
+    R = T[:, :3, :3]
+    touch = touch_of(
+        R @ start.tip + T[:, :3, 3], R @ start.axis,
+        laser.points[2 * beam], laser.points[2 * beam + 1], circle >= 0, beam,
+    )  # fmt: skip
+    rate = np.sum(touch.normal * velocity, axis=1)
+    _require_order(steps, rows, rate)
+    sigma_s = np.array([r[3].sigma_s for r in rows])
+    problem = RunProblem(
+        laser=laser,
+        path=path,
+        beam=beam,
+        step=step_index,
+        circle=circle,
+        side=np.where(breaks, -np.sign(rate), np.sign(rate)),
+        time_s=time,
+        sigma_m=np.hypot(rate * sigma_s, noise.edge_m),
+        circles=circles,
+        steps=len(steps),
+        taper=taper,
+        height=np.array([touch.height[circle == c].mean() for c in range(circles)]),
+        taught=start,
+        noise=noise,
+        held=held,
+    )
+    return problem, start
+
+
+def _require_order(
+    steps: Sequence[BeamStep], rows: Sequence[tuple[int, int, int, BeamEdge]], rate: Array
+) -> None:
+    """Refuse arcs that do not alternate, and a plunge that breaks on its way up."""
+    for (b, i, circle, edge), speed in zip(rows, rate, strict=True):
+        if circle < 0 and edge.blocked != (speed > 0.0):
+            way = "up" if edge.blocked else "down"
+            raise BeamError(
+                f"{steps[i].name}: beam {BEAMS[b]} was {'broken' if edge.blocked else 'restored'} "
+                f"at {edge.time_s:.4f} s while the tool moved {way}: begin above the beams, with "
+                "both of them clear"
+            )
+    for i, step in enumerate(steps):
+        for b, beam in enumerate(BEAMS):
+            own = [k for k, row in enumerate(rows) if row[:2] == (b, i)]
+            turned = np.sign(rate[own])
+            passes = np.cumsum([rows[k][3].blocked for k in own])
+            wanted = turned[0] * (-1.0) ** (passes - passes[0])
+            if step.kind == "circle" and np.any(turned != wanted):
+                raise BeamError(
+                    f"{step.name}: the shadows on beam {beam} do not alternate between the two "
+                    "ways across it: edges were lost, or the robot was moved by hand; repeat it"
+                )
+
+
+def _require_steps(steps: Sequence[BeamStep], held: Held) -> None:
+    kinds = {step.kind for step in steps}
+    if "circle" not in kinds:
+        raise RankDeficientError(
+            "there is no circle: the place of the tool across the beams is not determined",
+            ("place across the beams",),
+        )
+    if "plunge" not in kinds and held.along_m is None:
+        raise RankDeficientError(
+            "there is no plunge: how far the tip reaches is not determined; move the axis onto the "
+            "crossing and drive it down and up",
+            ("place along the axis",),
+        )
+
+
+def _require_motion(problem: RunProblem, start: ToolState) -> None:
+    """Refuse circles at one height, and an axis nearly in the beam plane."""
+    laser = problem.laser
+    T, _ = problem.path.at(problem.time_s)
+    v = T[:, :3, :3] @ start.axis
+    require_upright(float(np.min(np.abs(v @ laser.T_base_laser[:3, 2]))))
+    if problem.held.tilt_rad is None:
+        require_height(float(np.ptp(problem.height)))
+
+
+def _misfit(problem: RunProblem, found: Estimate[ToolState]) -> float:
+    used = ~found.rejected
+    return float(np.sqrt(np.mean((found.residual[used, 0] * problem.sigma_m[used]) ** 2)))
+
+
+def _require_fit(problem: RunProblem, found: Estimate[ToolState]) -> None:
+    misfit = _misfit(problem, found)
+    if misfit > LARGEST_MISFIT_M or not found.converged:
+        raise ResidualError(
+            f"the edges miss any one tool by {misfit * 1e3:.3f} mm rms (allowed "
+            f"{LARGEST_MISFIT_M * 1e3:.1f} mm): check robot and laser frame, and whether the robot "
+            "was moved by hand in between"
+        )
+
+
+def _tool_covariance(found: Estimate[ToolState], R_flange_tool: Array) -> Array:
+    turn = np.eye(5)
+    turn[3:, 3:] = R_flange_tool[:, :2].T @ across(found.state.axis)
+    return np.asarray(turn @ found.covariance[:5, :5] @ turn.T)
+
+
+@dataclass(frozen=True, eq=False)
+class CommandedCircle:
+    """A circle as commanded: its motion, the flange's pose at its centre, and the edges."""
+
+    motion: CircleMotion
+    T_base_centre: Array
+    edges: Sequence[BeamEdge]
+
+
+def classic_tool(
+    laser: LaserFrame,
+    circles: tuple[CommandedCircle, CommandedCircle],
+    upright: CommandedCircle,
+    plunge: Array,
+    T_flange_tool: Array,
+) -> ToolEstimate:
+    """Tip and axis as in the source, with its errors corrected: mid-times, commanded motion.
+
+    ``circles``: with the tool as it is, at two heights; ``upright``: with its axis set along z.
+    ``plunge`` (n, 3): flange positions, base, m, at the edges of the plunges, made at the
+    orientation of ``upright`` with its centre moved onto the crossing. The tip is
+    ``R_base_flange^T (M - mean of the plunge)`` (thesis eq. 4-14, corrected).
+    """
+    centres = [fit_circle(c.motion, c.edges, "classic").centre for c in circles]
+    v = axis_from_centres(
+        laser, (circles[0].T_base_centre, circles[1].T_base_centre), (centres[0], centres[1])
+    )
+    R_base_flange = upright.T_base_centre[:3, :3]
+    tip = R_base_flange.T @ (laser.T_base_laser[:3, 3] - plunge.mean(axis=0))
+    R = retaught(T_flange_tool[:3, :3], v)
+    return ToolEstimate(frames.transform(R, tip), None, None, None, None, 0.0, (), None)

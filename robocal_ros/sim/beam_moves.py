@@ -1,0 +1,109 @@
+"""Motions of the flange at a beam station: circles with a rippling speed, plunges, sweeps.
+
+Each gives T_base_flange (m, 4, 4) at times (m,); the orientation is held.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def _moved(T_base_flange: Array, shift: Array) -> Array:
+    T = np.tile(T_base_flange, (len(shift), 1, 1))
+    T[:, :3, 3] += shift
+    return T
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """One turn, from ``start_s``, with a run-up and a run-out of ``ramp_s`` along the circle.
+
+    Attributes
+    ----------
+    T_base_centre : (4, 4) the flange at the centre.
+    R_base_laser : (3, 3) the circle lies in its x-y plane; ``start_rad`` counts from x.
+    ripple : relative amplitude of the speed, ``ripples`` times a turn.
+    """
+
+    T_base_centre: Array
+    R_base_laser: Array
+    radius: float
+    period_s: float
+    start_s: float = 0.0
+    start_rad: float = float(np.pi / 4.0)
+    direction: int = 1
+    ripple: float = 0.0
+    ripples: int = 7
+    phase_rad: float = 0.0
+    ramp_s: float = 0.2
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """The turn at full speed."""
+        return self.start_s, self.start_s + self.period_s
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """From rest to rest."""
+        return self.start_s - self.ramp_s, self.start_s + self.period_s + self.ramp_s
+
+    def __call__(self, time_s: Array) -> Array:
+        """T_base_flange (m, 4, 4)."""
+        t = time_s - self.start_s
+        before = np.clip(t, -self.ramp_s, 0.0)
+        after = np.clip(t - self.period_s, 0.0, self.ramp_s)
+        run = np.clip(t, 0.0, self.period_s) + before + after
+        run += (before**2 - after**2) / (2.0 * self.ramp_s)
+        turn = 2.0 * np.pi * run / self.period_s
+        turn = turn + self.ripple / self.ripples * np.sin(self.ripples * turn + self.phase_rad)
+        angle = self.start_rad + self.direction * turn
+        flat = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+        return _moved(self.T_base_centre, self.radius * flat @ self.R_base_laser.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Plunge:
+    """Down and up again along ``down`` (3,), base, as a cosine of the time."""
+
+    T_base_top: Array
+    down: Array
+    depth: float
+    duration_s: float
+    start_s: float = 0.0
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """From rest to rest."""
+        return self.start_s, self.start_s + self.duration_s
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """The same."""
+        return self.window
+
+    def __call__(self, time_s: Array) -> Array:
+        """T_base_flange (m, 4, 4)."""
+        share = np.clip((time_s - self.start_s) / self.duration_s, 0.0, 1.0)
+        depth = 0.5 * self.depth * (1.0 - np.cos(2.0 * np.pi * share))
+        return _moved(self.T_base_top, depth[:, None] * self.down)
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """At constant speed along ``along`` (3,), base, m, within ``duration_s``."""
+
+    T_base_start: Array
+    along: Array
+    duration_s: float
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """From begin to end."""
+        return 0.0, self.duration_s
+
+    def __call__(self, time_s: Array) -> Array:
+        """T_base_flange (m, 4, 4)."""
+        return _moved(self.T_base_start, (time_s / self.duration_s)[:, None] * self.along)
