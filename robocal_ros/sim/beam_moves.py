@@ -3,7 +3,7 @@
 Each gives T_base_flange (m, 4, 4) at times (m,); the orientation is held.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,10 @@ class Circle:
         """From rest to rest."""
         return self.start_s - self.ramp_s, self.start_s + self.period_s + self.ramp_s
 
+    def starting(self, start_s: float) -> "Circle":
+        """The same turn, begun at another time."""
+        return replace(self, start_s=start_s)
+
     def __call__(self, time_s: Array) -> Array:
         """T_base_flange (m, 4, 4)."""
         t = time_s - self.start_s
@@ -93,7 +97,7 @@ class Plunge:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """At constant speed along ``along`` (3,), base, m, within ``duration_s``."""
+    """At constant speed along ``along`` (3,), base, m; backwards where ``duration_s`` < 0."""
 
     T_base_start: Array
     along: Array
@@ -102,7 +106,7 @@ class Sweep:
     @property
     def window(self) -> tuple[float, float]:
         """From begin to end."""
-        return 0.0, self.duration_s
+        return min(self.duration_s, 0.0), max(self.duration_s, 0.0)
 
     def __call__(self, time_s: Array) -> Array:
         """T_base_flange (m, 4, 4)."""

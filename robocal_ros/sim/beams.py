@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.tool.beam_edges import BEAMS, BeamEdge
+from robocal_ros.core.tool.beam_edges import BEAMS, Beam, BeamEdge
 
 Array = NDArray[np.float64]
 Poses = Callable[[Array], Array]
@@ -222,15 +222,14 @@ def reported(time: ArrayLike, source: TrueInput, rng: np.random.Generator) -> Ar
 
 
 def _bounced(
-    beam: str, blocked: bool, stamp: float, source: TrueInput, rng: np.random.Generator
+    beam: Beam, blocked: bool, stamp: float, source: TrueInput, rng: np.random.Generator
 ) -> Sequence[BeamEdge]:
     sigma = float(np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0)))
-    name = BEAMS[BEAMS.index(beam)]  # type: ignore[arg-type]
     times = [stamp]
     if source.bounce_s > 0.0:
         times += sorted((stamp + source.bounce_s * rng.random(2)).tolist())
     return [
-        BeamEdge(name, blocked if i % 2 == 0 else not blocked, t, sigma)
+        BeamEdge(beam, blocked if i % 2 == 0 else not blocked, t, sigma)
         for i, t in enumerate(times)
     ]
 

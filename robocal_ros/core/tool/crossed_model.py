@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 StepKind = Literal["circle", "plunge"]
 
 TOOL_NAMES = ("tip_x", "tip_y", "tip_z", "tilt_x", "tilt_y")
+START_RADIUS_M = 2e-3
 EXACT_M = 1e-9  # prior of what is taken as exact, against edges of micrometres
 
 
@@ -71,6 +72,18 @@ class ToolState:
     radius: Array
     shift: Array
     bend: Array
+
+    @classmethod
+    def taught(cls, T_flange_tool: Array, circles: int, steps: int) -> "ToolState":
+        """Where the search begins."""
+        return cls(
+            tip=T_flange_tool[:3, 3],
+            axis=T_flange_tool[:3, 2],
+            latency_s=0.0,
+            radius=np.full((circles, 2), START_RADIUS_M),
+            shift=np.zeros((steps, 3)),
+            bend=np.zeros((4, 2)),
+        )
 
 
 def across(axis: Array) -> Array:

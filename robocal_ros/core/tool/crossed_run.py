@@ -10,7 +10,8 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import RankDeficientError, ResidualError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.tool.beam_edges import BEAMS, BeamEdge, BeamError, edges_of
-from robocal_ros.core.tool.crossed_beams import CircleMotion, fit_circle
+from robocal_ros.core.tool.circle_edges import CircleMotion
+from robocal_ros.core.tool.crossed_beams import fit_circle
 from robocal_ros.core.tool.crossed_model import (
     BeamStep,
     Held,
@@ -30,9 +31,9 @@ from robocal_ros.core.tool.tool_axis import (
 )
 
 Array = NDArray[np.float64]
+Row = tuple[int, int, int, BeamEdge]
 
 FEWEST_EDGES = {"circle": 4, "plunge": 2}  # of each beam
-START_RADIUS_M = 2e-3
 DEFAULT_NOISE = RobotNoise()
 FREE = Held()
 LARGEST_MISFIT_M = 2e-4  # rms of the edges: more is no robot's repeatability
@@ -135,39 +136,25 @@ def run_problem(
     held: Held = FREE,
 ) -> tuple[RunProblem, ToolState]:
     """The problem of a run and the state at which to begin; raises BeamError as `estimate_tool`."""
-    rows: list[tuple[int, int, int, BeamEdge]] = []
-    circles = 0
-    for i, step in enumerate(steps):
-        own = circles if step.kind == "circle" else -1
-        circles += step.kind == "circle"
-        for b, beam in enumerate(BEAMS):
-            found = edges_of(step.edges, beam, FEWEST_EDGES[step.kind])
-            rows += [(b, i, own, edge) for edge in found]
-    beam, step_index, circle = (np.array([r[k] for r in rows]) for k in range(3))
-    time = np.array([r[3].time_s for r in rows])
-    breaks = np.array([r[3].blocked for r in rows])
-    start = ToolState(
-        tip=T_flange_tool[:3, 3],
-        axis=T_flange_tool[:3, 2],
-        latency_s=0.0,
-        radius=np.full((circles, 2), START_RADIUS_M),
-        shift=np.zeros((len(steps), 3)),
-        bend=np.zeros((4, 2)),
-    )
+    rows = _rows(steps)
+    beam, step, circle = (np.array([row[k] for row in rows]) for k in range(3))
+    edges = [row[3] for row in rows]
+    time = np.array([edge.time_s for edge in edges])
+    breaks = np.array([edge.blocked for edge in edges])
+    circles = int(circle.max(initial=-1)) + 1
+    start = ToolState.taught(T_flange_tool, circles, len(steps))
     T, velocity = path.at(time)
-    R = T[:, :3, :3]
-    touch = touch_of(
-        R @ start.tip + T[:, :3, 3], R @ start.axis,
-        laser.points[2 * beam], laser.points[2 * beam + 1], circle >= 0, beam,
-    )  # fmt: skip
+    tip, axis = T[:, :3, :3] @ start.tip + T[:, :3, 3], T[:, :3, :3] @ start.axis
+    ends = laser.points[2 * beam], laser.points[2 * beam + 1]
+    touch = touch_of(tip, axis, *ends, circle >= 0, beam)
     rate = np.sum(touch.normal * velocity, axis=1)
     _require_order(steps, rows, rate)
-    sigma_s = np.array([r[3].sigma_s for r in rows])
+    sigma_s = np.array([edge.sigma_s for edge in edges])
     problem = RunProblem(
         laser=laser,
         path=path,
         beam=beam,
-        step=step_index,
+        step=step,
         circle=circle,
         side=np.where(breaks, -np.sign(rate), np.sign(rate)),
         time_s=time,
@@ -183,9 +170,23 @@ def run_problem(
     return problem, start
 
 
-def _require_order(
-    steps: Sequence[BeamStep], rows: Sequence[tuple[int, int, int, BeamEdge]], rate: Array
-) -> None:
+def _rows(steps: Sequence[BeamStep]) -> list[Row]:
+    """Beam, step, circle (-1 in a plunge) and edge, one by one."""
+    rows: list[Row] = []
+    circles = 0
+    for i, step in enumerate(steps):
+        own = circles if step.kind == "circle" else -1
+        circles += step.kind == "circle"
+        for b, beam in enumerate(BEAMS):
+            try:
+                found = edges_of(step.edges, beam, FEWEST_EDGES[step.kind])
+            except BeamError as error:
+                raise BeamError(f"{step.name}: {error}") from error
+            rows += [(b, i, own, edge) for edge in found]
+    return rows
+
+
+def _require_order(steps: Sequence[BeamStep], rows: Sequence[Row], rate: Array) -> None:
     """Refuse arcs that do not alternate, and a plunge that breaks on its way up."""
     for (b, i, circle, edge), speed in zip(rows, rate, strict=True):
         if circle < 0 and edge.blocked != (speed > 0.0):
@@ -266,22 +267,21 @@ class CommandedCircle:
 def classic_tool(
     laser: LaserFrame,
     circles: tuple[CommandedCircle, CommandedCircle],
-    upright: CommandedCircle,
+    R_base_flange: Array,
     plunge: Array,
     T_flange_tool: Array,
 ) -> ToolEstimate:
     """Tip and axis as in the source, with its errors corrected: mid-times, commanded motion.
 
-    ``circles``: with the tool as it is, at two heights; ``upright``: with its axis set along z.
-    ``plunge`` (n, 3): flange positions, base, m, at the edges of the plunges, made at the
-    orientation of ``upright`` with its centre moved onto the crossing. The tip is
+    ``circles``: with the tool as it is, at two heights. ``plunge`` (n, 3): flange positions, base,
+    m, at the edges of the plunges, made at the orientation ``R_base_flange`` (3, 3) with the
+    axis upright and on the crossing. The tip is
     ``R_base_flange^T (M - mean of the plunge)`` (thesis eq. 4-14, corrected).
     """
     centres = [fit_circle(c.motion, c.edges, "classic").centre for c in circles]
     v = axis_from_centres(
         laser, (circles[0].T_base_centre, circles[1].T_base_centre), (centres[0], centres[1])
     )
-    R_base_flange = upright.T_base_centre[:3, :3]
     tip = R_base_flange.T @ (laser.T_base_laser[:3, 3] - plunge.mean(axis=0))
     R = retaught(T_flange_tool[:3, :3], v)
     return ToolEstimate(frames.transform(R, tip), None, None, None, None, 0.0, (), None)
