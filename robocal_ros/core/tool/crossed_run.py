@@ -18,6 +18,7 @@ from robocal_ros.core.tool.crossed_model import (
     RobotNoise,
     RunProblem,
     ToolState,
+    Touch,
     across,
     touch_of,
 )
@@ -143,11 +144,7 @@ def run_problem(
     breaks = np.array([edge.blocked for edge in edges])
     circles = int(circle.max(initial=-1)) + 1
     start = ToolState.taught(T_flange_tool, circles, len(steps))
-    T, velocity = path.at(time)
-    tip, axis = T[:, :3, :3] @ start.tip + T[:, :3, 3], T[:, :3, :3] @ start.axis
-    ends = laser.points[2 * beam], laser.points[2 * beam + 1]
-    touch = touch_of(tip, axis, *ends, circle >= 0, beam)
-    rate = np.sum(touch.normal * velocity, axis=1)
+    touch, rate = _approach(laser, path, start, time, beam, circle)
     _require_order(steps, rows, rate)
     sigma_s = np.array([edge.sigma_s for edge in edges])
     problem = RunProblem(
@@ -168,6 +165,22 @@ def run_problem(
         held=held,
     )
     return problem, start
+
+
+def _approach(
+    laser: LaserFrame,
+    path: FlangePath,
+    start: ToolState,
+    time: Array,
+    beam: NDArray[np.int64],
+    circle: NDArray[np.int64],
+) -> tuple[Touch, Array]:
+    """How the taught tool lies to each edge's beam, and its speed (m,) towards it, m/s."""
+    T, velocity = path.at(time)
+    tip, axis = T[:, :3, :3] @ start.tip + T[:, :3, 3], T[:, :3, :3] @ start.axis
+    ends = laser.points[2 * beam], laser.points[2 * beam + 1]
+    touch = touch_of(tip, axis, *ends, circle >= 0, beam)
+    return touch, np.sum(touch.normal * velocity, axis=1)
 
 
 def _rows(steps: Sequence[BeamStep]) -> list[Row]:

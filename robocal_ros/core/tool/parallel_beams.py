@@ -21,7 +21,7 @@ LARGEST_LEAN_M = 3e-4  # between both beams after straightening
 
 @dataclass(frozen=True)
 class ParallelBeams:
-    """Heights of the beams in base, and the place x of the lower one, m."""
+    """Heights of the upper and the lower beam in base, m."""
 
     up_m: float
     down_m: float

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
+from robocal_ros.core.descent import Problem
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.observability import observability
@@ -111,7 +112,7 @@ def fit_four(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
     count = len(T_base_flange)
     if count < FEWEST_TOUCHES:
         raise TooFewSamplesError(f"{count} touches: at least {FEWEST_TOUCHES} are needed")
-    problem = _TouchProblem(T_base_flange, sigma_m or 1.0)
+    problem: Problem[Array] = _TouchProblem(T_base_flange, sigma_m or 1.0)
     rows = problem.linearise(np.zeros(6))[1].reshape(-1, 6)
     seen = observability(rows)
     if seen.rank < 6 or 1.0 / seen.condition < LEAST_SPREAD:
@@ -120,7 +121,8 @@ def fit_four(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
             f"{seen.condition:.3g}): turn the flange about a second axis, by 30 deg or more",
             ("tip along the axis of rotation",),
         )
-    start = np.linalg.lstsq(rows, -problem.linearise(np.zeros(6))[0].ravel(), rcond=None)[0]
+    right = -problem.linearise(np.zeros(6))[0].ravel()
+    start: Array = np.asarray(np.linalg.lstsq(rows, right, rcond=None)[0], dtype=np.float64)
     found = solve(
         problem, start, noise_known=sigma_m is not None, robust=count > FEWEST_TOUCHES + 2
     )
@@ -148,8 +150,8 @@ def fit_seven(T_base_flange: Array, sigma_m: float | None = None) -> TouchFit:
     turned = np.linalg.norm(frames.log_rotation(last[1:, :3, :3] @ last[0, :3, :3].T), axis=1)
     if turned.max() > 1e-3:
         raise InputError(
-            f"the flange turned by {np.degrees(turned.max()):.3f} deg between the last three poses: "
-            "move in a straight line without turning"
+            f"the flange turned by {np.degrees(turned.max()):.3f} deg between the last three "
+            "poses: move in a straight line without turning"
         )
     x, z = np.diff(last[:, :3, 3], axis=0)
     shortest = float(min(np.linalg.norm(x), np.linalg.norm(z)))
