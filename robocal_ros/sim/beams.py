@@ -19,6 +19,7 @@ Poses = Callable[[Array], Array]
 
 GRID_S = 2e-3  # no shadow is shorter
 HALVINGS = 45
+FINEST_S = 1e-9  # what a perfect input claims
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +225,8 @@ def reported(time: ArrayLike, source: TrueInput, rng: np.random.Generator) -> Ar
 def _bounced(
     beam: Beam, blocked: bool, stamp: float, source: TrueInput, rng: np.random.Generator
 ) -> Sequence[BeamEdge]:
-    sigma = float(np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0)))
+    spread = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
+    sigma = max(float(spread), FINEST_S)
     times = [stamp]
     if source.bounce_s > 0.0:
         times += sorted((stamp + source.bounce_s * rng.random(2)).tolist())

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.circle_edges import CircleMotion
+from robocal_ros.core.tool.classic_run import CommandedCircle
 from robocal_ros.core.tool.crossed_beams import CircleMethod, fit_circle
 from robocal_ros.core.tool.crossed_model import BeamStep, Held, RobotNoise
-from robocal_ros.core.tool.crossed_run import CommandedCircle, ToolEstimate, estimate_tool
+from robocal_ros.core.tool.crossed_run import ToolEstimate, estimate_tool
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.tool_axis import axis_from_centres, upright_pose

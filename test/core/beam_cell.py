@@ -12,9 +12,7 @@ from robocal_ros.storage.robots import load_robot
 Q_NEAR = np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618])
 BETA = np.radians(92.2)
 GAP = 5.8e-5
-T_BASE_LASER = frames.transform(
-    frames.exp_rotation([0.02, -0.04, 0.01]), [0.7994, -0.1263, 0.1945]
-)
+T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.04, 0.01]), [0.7994, -0.1263, 0.1945])
 TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.15])
 SILENT = RobotNoise(1e-7, 1e-7)
 

@@ -23,6 +23,12 @@ def edges(*times: float, beam: str = "x", first: bool = True) -> list[BeamEdge]:
     return [BeamEdge(beam, (i % 2 == 0) == first, t, SIGMA) for i, t in enumerate(times)]
 
 
+@pytest.mark.parametrize(("time", "sigma"), [(np.nan, SIGMA), (0.1, 0.0), (0.1, np.nan)])
+def test_an_edge_without_a_time_or_a_sigma_is_refused(time, sigma):
+    with pytest.raises(InputError, match="both must be finite"):
+        BeamEdge("x", True, time, sigma)
+
+
 def test_sigma_of_a_sampled_input_is_uniform():
     assert InputRule(3e-5, 0.002).sigma_s == pytest.approx(np.hypot(3e-5, 0.002 / np.sqrt(12.0)))
     assert InputRule(3e-5).sigma_s == pytest.approx(3e-5)

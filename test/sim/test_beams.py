@@ -113,12 +113,15 @@ def test_a_plunge_goes_down_and_returns():
 
 
 def test_a_sampled_input_is_late_by_a_uniform_part_of_a_period():
-    late = np.array(
-        [
-            reported(0.123456, TrueInput(0.004, 0.0, 0.002), np.random.default_rng(i))
-            for i in range(4000)
-        ]
-    ) - 0.123456
+    late = (
+        np.array(
+            [
+                reported(0.123456, TrueInput(0.004, 0.0, 0.002), np.random.default_rng(i))
+                for i in range(4000)
+            ]
+        )
+        - 0.123456
+    )
     assert late.min() >= 0.004
     assert late.max() <= 0.006
     assert late.mean() == pytest.approx(0.005, abs=4.0 * 0.002 / np.sqrt(12.0 * 4000))

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core.errors import RankDeficientError, RobocalError
+from robocal_ros.core.errors import InputError, RankDeficientError, RobocalError
 
 Array = NDArray[np.float64]
 Beam = Literal["x", "y"]
@@ -30,12 +30,24 @@ class BeamEdge:
     """A beam was broken (``blocked``) or restored at ``time_s``, known to ``sigma_s``.
 
     ``time_s`` counts from any origin that all edges and the robot's readings share.
+
+    Raises
+    ------
+    InputError
+        When the time is not finite, or sigma not positive.
     """
 
     beam: Beam
     blocked: bool
     time_s: float
     sigma_s: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.time_s) and 0.0 < self.sigma_s < np.inf):
+            raise InputError(
+                f"edge of beam {self.beam} at {self.time_s} s with a sigma of {self.sigma_s} s: "
+                "both must be finite, and no stamp is exact"
+            )
 
 
 @dataclass(frozen=True)

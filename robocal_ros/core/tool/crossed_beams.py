@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 CircleMethod = Literal["best", "classic"]
 
 LARGEST_MISFIT_M = 2e-4  # rms along the circle: speed not constant, or an edge that belongs not
+THICKEST = 0.7  # tool's radius on the circle's
 DEEPEST = 0.999  # of R: an edge where the circle hardly crosses the beam
 
 
@@ -142,10 +143,11 @@ def fit_circle(
         return CircleFit(
             "classic", motion.centre(d), None, d, None, latency, None, motion.period_s, 0.0, None
         )
-    if np.any(rho <= 0.0):
+    if np.any(rho > THICKEST * motion.radius_m):
         raise BeamError(
-            f"the edges give a tool radius of {rho.min() * 1e3:.2f} mm: breaks and "
-            "restores are exchanged; check the input's polarity and the direction"
+            f"the shadows last for most of the turn (radius {rho.max() * 1e3:.2f} mm on a circle "
+            f"of {motion.radius_m * 1e3:.2f} mm): check the input's polarity; for a tool so thick "
+            "enlarge the circle"
         )
     problem = CircleProblem(motion, labelled, latency_s is None, period_free)
     start = CircleState(d, rho, latency if latency_s is None else latency_s, motion.period_s)

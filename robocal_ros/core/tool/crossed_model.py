@@ -136,6 +136,12 @@ class RunProblem:
         return (*TOOL_NAMES, "latency", *radii, *shifts, *bends)
 
     @property
+    def undetermined(self) -> int:
+        """How many unknowns have no prior."""
+        held = 2 * (self.held.tilt_rad is not None) + (self.held.along_m is not None)
+        return 6 + 2 * self.circles - held
+
+    @property
     def _starts(self) -> tuple[int, int, int]:
         """First columns of radii, shifts and bends."""
         shifts = 6 + 2 * self.circles

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.core.errors import RankDeficientError, ResidualError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.tool.beam_edges import BEAMS, BeamEdge, BeamError, edges_of
-from robocal_ros.core.tool.circle_edges import CircleMotion
-from robocal_ros.core.tool.crossed_beams import fit_circle
 from robocal_ros.core.tool.crossed_model import (
     BeamStep,
     Held,
@@ -25,7 +24,6 @@ from robocal_ros.core.tool.crossed_model import (
 from robocal_ros.core.tool.flange_path import FlangePath
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.tool_axis import (
-    axis_from_centres,
     require_height,
     require_upright,
     retaught,
@@ -35,6 +33,7 @@ Array = NDArray[np.float64]
 Row = tuple[int, int, int, BeamEdge]
 
 FEWEST_EDGES = {"circle": 4, "plunge": 2}  # of each beam
+MOST_SIGMAS = 6.0  # of a step's shift
 DEFAULT_NOISE = RobotNoise()
 FREE = Held()
 LARGEST_MISFIT_M = 2e-4  # rms of the edges: more is no robot's repeatability
@@ -48,21 +47,21 @@ class ToolEstimate:
     ----------
     T_flange_tool : (4, 4) z along the axis from flange to tip, turned about it as it was taught.
     covariance : (5, 5) of the tip (flange axes, m^2) and of the axis' direction along the tool's
-        own x and y (rad^2); None for the classic method.
+        own x and y (rad^2).
     latency_s, latency_sigma_s : of the edges behind the robot's readings.
     radius : (circles, 2) of the tool as each circle and beam sees it, m.
     misfit_m : rms of the edges' residuals, m.
-    rejected : edges that do not fit the others, as (step, beam, time_s).
+    shift_m : largest shift of a step against the others, m.
     """
 
     T_flange_tool: Array
-    covariance: Array | None
-    latency_s: float | None
-    latency_sigma_s: float | None
-    radius: Array | None
+    covariance: Array
+    latency_s: float
+    latency_sigma_s: float
+    radius: Array
     misfit_m: float
-    rejected: tuple[tuple[str, str, float], ...]
-    estimate: Estimate[ToolState] | None
+    shift_m: float
+    estimate: Estimate[ToolState]
 
     @property
     def tip(self) -> Array:
@@ -108,21 +107,18 @@ def estimate_tool(
     _require_steps(steps, held)
     problem, start = run_problem(laser, path, steps, T_flange_tool, noise, taper, held)
     _require_motion(problem, start)
-    found = solve(problem, start, prior_information=problem.prior)
-    _require_fit(problem, found)
+    found = solve(problem, start, prior_information=problem.prior, robust=False)
+    _require_fit(problem, steps, found)
     state = found.state
     R = retaught(T_flange_tool[:3, :3], state.axis)
     return ToolEstimate(
         T_flange_tool=frames.transform(R, state.tip),
-        covariance=_tool_covariance(found, R),
+        covariance=_tool_covariance(problem, found, R),
         latency_s=state.latency_s,
         latency_sigma_s=float(np.sqrt(found.covariance[5, 5])),
         radius=state.radius,
         misfit_m=_misfit(problem, found),
-        rejected=tuple(
-            (steps[problem.step[i]].name, BEAMS[problem.beam[i]], float(problem.time_s[i]))
-            for i in np.flatnonzero(found.rejected)
-        ),
+        shift_m=float(np.linalg.norm(state.shift, axis=1).max()),
         estimate=found,
     )
 
@@ -248,53 +244,38 @@ def _require_motion(problem: RunProblem, start: ToolState) -> None:
 
 
 def _misfit(problem: RunProblem, found: Estimate[ToolState]) -> float:
-    used = ~found.rejected
-    return float(np.sqrt(np.mean((found.residual[used, 0] * problem.sigma_m[used]) ** 2)))
+    return float(np.sqrt(np.mean((found.residual[:, 0] * problem.sigma_m) ** 2)))
 
 
-def _require_fit(problem: RunProblem, found: Estimate[ToolState]) -> None:
+def _require_fit(
+    problem: RunProblem, steps: Sequence[BeamStep], found: Estimate[ToolState]
+) -> None:
+    """Refuse edges that miss any tool, and a step that lies apart from the others."""
     misfit = _misfit(problem, found)
     if misfit > LARGEST_MISFIT_M or not found.converged:
         raise ResidualError(
             f"the edges miss any one tool by {misfit * 1e3:.3f} mm rms (allowed "
-            f"{LARGEST_MISFIT_M * 1e3:.1f} mm): check robot and laser frame, and whether the robot "
-            "was moved by hand in between"
+            f"{LARGEST_MISFIT_M * 1e3:.1f} mm): check robot, laser frame and joint readings"
+        )
+    shift = np.linalg.norm(found.state.shift, axis=1)
+    worst = int(np.argmax(shift))
+    limit = max(LARGEST_MISFIT_M, MOST_SIGMAS * problem.noise.step_m)
+    if shift[worst] > limit:
+        raise ResidualError(
+            f"{steps[worst].name}: {shift[worst] * 1e3:.3f} mm apart from the other steps (allowed "
+            f"{limit * 1e3:.3f} mm): was the robot moved by hand in between, the tool touched, or "
+            "the laser frame made at another station?"
         )
 
 
-def _tool_covariance(found: Estimate[ToolState], R_flange_tool: Array) -> Array:
+def _tool_covariance(
+    problem: RunProblem, found: Estimate[ToolState], R_flange_tool: Array
+) -> Array:
+    """(5, 5), widened where edges and shifts together are larger than their sigmas explain."""
     turn = np.eye(5)
     turn[3:, 3:] = R_flange_tool[:, :2].T @ across(found.state.axis)
-    return np.asarray(turn @ found.covariance[:5, :5] @ turn.T)
-
-
-@dataclass(frozen=True, eq=False)
-class CommandedCircle:
-    """A circle as commanded: its motion, the flange's pose at its centre, and the edges."""
-
-    motion: CircleMotion
-    T_base_centre: Array
-    edges: Sequence[BeamEdge]
-
-
-def classic_tool(
-    laser: LaserFrame,
-    circles: tuple[CommandedCircle, CommandedCircle],
-    R_base_flange: Array,
-    plunge: Array,
-    T_flange_tool: Array,
-) -> ToolEstimate:
-    """Tip and axis as in the source, with its errors corrected: mid-times, commanded motion.
-
-    ``circles``: with the tool as it is, at two heights. ``plunge`` (n, 3): flange positions, base,
-    m, at the edges of the plunges, made at the orientation ``R_base_flange`` (3, 3) with the
-    axis upright and on the crossing. The tip is
-    ``R_base_flange^T (M - mean of the plunge)`` (thesis eq. 4-14, corrected).
-    """
-    centres = [fit_circle(c.motion, c.edges, "classic").centre for c in circles]
-    v = axis_from_centres(
-        laser, (circles[0].T_base_centre, circles[1].T_base_centre), (centres[0], centres[1])
-    )
-    tip = R_base_flange.T @ (laser.T_base_laser[:3, 3] - plunge.mean(axis=0))
-    R = retaught(T_flange_tool[:3, :3], v)
-    return ToolEstimate(frames.transform(R, tip), None, None, None, None, 0.0, (), None)
+    away = problem.deviation(found.state)
+    misfit = float(np.sum(found.residual**2) + away @ problem.prior @ away)
+    free = len(found.residual) - problem.undetermined
+    wide = misfit / free if free > 0 and misfit > chi2_quantile(SOUND_FIT, free) else 1.0
+    return np.asarray(wide * turn @ found.covariance[:5, :5] @ turn.T)

@@ -82,9 +82,9 @@ def quick_check(
     )
     R = T_flange_tool[:3, :3]
     deviation = R.T @ (found.tip - T_flange_tool[:3, 3])
-    spread = np.zeros((3, 3)) if stored_covariance is None else stored_covariance
-    if found.covariance is not None:
-        spread = spread + found.covariance[:3, :3]
+    spread = found.covariance[:3, :3]
+    if stored_covariance is not None:
+        spread = spread + stored_covariance
     covariance = R.T @ spread @ R
     size = float(np.linalg.norm(deviation))
     along = deviation / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
