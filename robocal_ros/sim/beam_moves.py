@@ -70,28 +70,40 @@ class Circle:
 
 @dataclass(frozen=True, eq=False)
 class Plunge:
-    """Down and up again along ``down`` (3,), base, as a cosine of the time."""
+    """Down and up again along ``down`` (3,), base, at ``speed`` but for the ramps at each end."""
 
     T_base_top: Array
     down: Array
     depth: float
-    duration_s: float
+    speed: float
     start_s: float = 0.0
+    ramp_s: float = 0.1
 
     @property
     def window(self) -> tuple[float, float]:
         """From rest to rest."""
-        return self.start_s, self.start_s + self.duration_s
+        return self.start_s, self.start_s + 2.0 * self._one_way_s
 
     @property
     def span(self) -> tuple[float, float]:
         """The same."""
         return self.window
 
+    @property
+    def _one_way_s(self) -> float:
+        return self.depth / self.speed + self.ramp_s
+
     def __call__(self, time_s: Array) -> Array:
         """T_base_flange (m, 4, 4)."""
-        share = np.clip((time_s - self.start_s) / self.duration_s, 0.0, 1.0)
-        depth = 0.5 * self.depth * (1.0 - np.cos(2.0 * np.pi * share))
+        whole, ramp = self._one_way_s, self.ramp_s
+        t = whole - np.abs(np.clip(time_s - self.start_s, 0.0, 2.0 * whole) - whole)
+        t = np.clip(t, 0.0, whole)
+        to_go = whole - t
+        depth = np.where(
+            to_go < ramp,
+            self.depth - self.speed * to_go**2 / (2.0 * ramp),
+            np.where(t < ramp, self.speed * t**2 / (2.0 * ramp), self.speed * (t - 0.5 * ramp)),
+        )
         return _moved(self.T_base_top, depth[:, None] * self.down)
 
 

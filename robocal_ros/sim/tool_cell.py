@@ -36,8 +36,8 @@ class RunPlan:
     radius: float = 0.012
     speed: float = 0.05
     height: float = 0.05  # between the circles
-    plunge_depth: float = 0.006
-    plunge_speed: float = 0.01  # at most
+    plunge_depth: float = 0.007
+    plunge_speed: float = 0.01
     transfer_s: float = 0.3
     ripple: float = 0.0
     rate_hz: float = 125.0
@@ -156,9 +156,8 @@ class MeasuredRun:
     def plunge(self, name: str, T_base_top: Array) -> None:
         """Run a plunge."""
         plan = self.cell.plan
-        duration = np.pi * plan.plunge_depth / plan.plunge_speed
-        down = -self.cell.up
-        self._run(name, Plunge(T_base_top, down, plan.plunge_depth, duration, self._next_s))
+        depth, speed, down = plan.plunge_depth, plan.plunge_speed, -self.cell.up
+        self._run(name, Plunge(T_base_top, down, depth, speed, self._next_s))
 
     def upright(self, method: CircleMethod) -> Array:
         """Centre of the next circle, with the tool set upright as the circles so far show it."""

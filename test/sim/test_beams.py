@@ -106,10 +106,16 @@ def test_circle_runs_at_constant_speed_in_its_window_and_rests_at_its_ends():
     assert np.linalg.norm(np.diff(move(ends)[:, :3, 3], axis=0)[[0, 2]], axis=1).max() < 1e-7
 
 
-def test_a_plunge_goes_down_and_returns():
-    move = Plunge(UPRIGHT, np.array([0.0, 0.0, -1.0]), 0.006, 2.0)
-    height = move(np.array([0.0, 1.0, 2.0]))[:, 2, 3] - UPRIGHT[2, 3]
-    assert height == pytest.approx([0.0, -0.006, 0.0], abs=1e-15)
+def test_a_plunge_goes_down_at_its_speed_and_returns():
+    move = Plunge(UPRIGHT, np.array([0.0, 0.0, -1.0]), 0.006, 0.01)
+    first, last = move.window
+    assert last - first == pytest.approx(1.4)
+    time = np.linspace(first, last, 1401)
+    height = move(time)[:, 2, 3] - UPRIGHT[2, 3]
+    assert height[[0, 700, 1400]] == pytest.approx([0.0, -0.006, 0.0], abs=1e-12)
+    speed = np.diff(height) / np.diff(time)
+    assert np.abs(speed).max() == pytest.approx(0.01, rel=1e-9)
+    assert np.abs(np.diff(speed)).max() < 1.1 * 0.01 * 1e-3 / 0.1  # no jump
 
 
 def test_a_sampled_input_is_late_by_a_uniform_part_of_a_period():
