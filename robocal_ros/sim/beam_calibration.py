@@ -13,13 +13,14 @@ Array = NDArray[np.float64]
 DOWN = np.array([0.0, 0.0, -1.0])
 SWEEP_M = 1e-2
 SWEEP_S = 1.0
+CYLINDER_M = 2.5e-3  # radius
 
 
-def calibration_tool(radius: float = 2.5e-3, reach: float = 0.15) -> RoundTool:
+def calibration_tool(reach: float = 0.15) -> RoundTool:
     """A cylinder along the flange's z."""
     T = np.eye(4)
     T[2, 3] = reach
-    return RoundTool.cylinder(T, radius)
+    return RoundTool.cylinder(T, CYLINDER_M)
 
 
 def laser_points(

@@ -16,8 +16,16 @@ from robocal_ros.core.tool.tool_axis import (
     retaught,
     upright_pose,
 )
-from robocal_ros.sim.beam_calibration import laser_points, point_sigma
-from robocal_ros.sim.beams import NO_NOISE, PERFECT, BeamStation, TrueInput, TrueNoise, beams_of
+from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
+from robocal_ros.sim.beams import (
+    NO_NOISE,
+    PERFECT,
+    BeamStation,
+    TrueBeam,
+    TrueInput,
+    TrueNoise,
+    beams_of,
+)
 
 PUBLISHED_MM = {  # thesis table 5-3
     "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),
@@ -70,6 +78,19 @@ def test_a_constant_latency_cancels_in_sweeps_back_and_forth():
     source = TrueInput(latency_s=0.02, jitter_s=0.0)
     station = BeamStation(beams_of(T_BASE_LASER, BETA, GAP), source, NO_NOISE)
     found = calibrate_laser(laser_points(station, T_BASE_LASER, np.random.default_rng(0)))
+    assert found.T_base_laser == pytest.approx(T_BASE_LASER, abs=1e-9)
+
+
+@pytest.mark.parametrize("light", [0.3, 0.5, 0.8])
+def test_a_cylinder_of_known_radius_gives_the_beams_reach(light):
+    """Beams that lean by 2 deg in base: exact to the square of that."""
+    beams = tuple(
+        TrueBeam(b.start, b.end, 8e-4, light, light) for b in beams_of(T_BASE_LASER, BETA, GAP)
+    )
+    station = BeamStation(beams, PERFECT, NO_NOISE)
+    points = laser_points(station, T_BASE_LASER, np.random.default_rng(0))
+    found = calibrate_laser(points, radius_m=CYLINDER_M)
+    assert found.reach == pytest.approx([beams[0].threshold(light)] * 2, abs=1e-9)
     assert found.T_base_laser == pytest.approx(T_BASE_LASER, abs=1e-9)
 
 

@@ -91,6 +91,30 @@ def test_a_rippling_speed_does_no_harm():
         fit_circle(run.commanded(0).motion, run.steps[0].edges)
 
 
+def test_a_receiver_with_hysteresis_does_no_harm_beside_a_latency():
+    """Off at 30 %, on at 70 % of the light: late by a depth, which a circle's speed hides."""
+    cell = make_cell(source=TrueInput(latency_s=0.011, jitter_s=0.0))
+    beams = tuple(replace(b, dark_at=0.3, light_at=0.7) for b in cell.station.beams)
+    cell.station = replace(cell.station, beams=beams)
+    run = cell.full_run(RoundTool.cylinder(TRUTH, 0.0025), TAUGHT, rng())
+    found = solved(run)
+    assert found.tip == pytest.approx(TRUTH[:3, 3], abs=1e-7)
+    assert found.latency_s == pytest.approx(0.011, abs=1e-6)
+    assert found.estimate.state.depth == pytest.approx(beams[0].threshold(0.7), abs=1e-7)
+
+
+def test_a_beam_that_switches_off_its_middle_moves_the_height_unless_its_reach_is_known():
+    cell = make_cell()
+    beams = tuple(replace(b, dark_at=0.3, light_at=0.3) for b in cell.station.beams)
+    cell.station = replace(cell.station, beams=beams)
+    reach = beams[0].threshold(0.3)
+    run = cell.full_run(RoundTool.cylinder(TRUTH, 0.0025), TAUGHT, rng())
+    off = solved(run).tip - TRUTH[:3, 3]
+    assert off @ TRUTH[:3, 2] == pytest.approx(reach, abs=1e-7)
+    known = replace(cell.laser, reach=np.full(2, reach))
+    assert solved(run, laser=known).tip == pytest.approx(TRUTH[:3, 3], abs=1e-7)
+
+
 def test_a_torch_of_two_radii_is_no_harder():
     cell = make_cell()
     run = cell.full_run(RoundTool.torch(TRUTH, 0.0006, 0.004), TAUGHT, rng())

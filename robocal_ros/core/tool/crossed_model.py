@@ -3,10 +3,12 @@
 A circle's edge: the line of the tool's axis passes the line of the beam at a signed distance
 ``s = n . (tip - A)`` (n the common normal of both), which is +r or -r of the tool there. A plunge's
 edge: the tip's plane reaches the beam, ``w . (tip - A) = 0`` (w the part of the axis across the
-beam). Both hold for any flange pose and any tilt; for a cylinder exactly.
+beam; less the beam's reach). Both hold for any flange pose and any tilt; for a cylinder exactly.
 
-The robot's repeatability is an unknown shift of each step with its own prior, and so is each
-point of the laser frame, so that the covariance of the tool is that of all of them together.
+A receiver switches back at more light than it switched off at: both edges come late by a depth,
+which differs from a latency by the speed. The robot's repeatability is an unknown shift of each
+step with its own prior, and so is each point of the laser frame, so that the covariance of the
+tool is that of all of them together.
 """
 
 from collections.abc import Sequence
@@ -27,6 +29,7 @@ StepKind = Literal["circle", "plunge"]
 
 TOOL_NAMES = ("tip_x", "tip_y", "tip_z", "tilt_x", "tilt_y")
 START_RADIUS_M = 2e-3
+HYSTERESIS_M = 2e-4  # sigma of a receiver's: light of a beam of half a millimetre
 EXACT_M = 1e-9  # prior of what is taken as exact, against edges of micrometres
 
 
@@ -61,6 +64,7 @@ class ToolState:
     ----------
     tip : (3,) in the flange frame, m; ``axis`` (3,) unit vector from flange to tip there.
     latency_s : of the edges behind the robot's readings.
+    depth : of an edge behind the mean of break and restore, m: the receiver's hysteresis.
     radius : (circles, 2) of the tool as each circle and beam sees it, m.
     shift : (steps, 3) of the flange in each step, base, m.
     bend : (4, 2) of the laser's points A ... D, horizontally across the beam and upwards, m.
@@ -69,6 +73,7 @@ class ToolState:
     tip: Array
     axis: Array
     latency_s: float
+    depth: float
     radius: Array
     shift: Array
     bend: Array
@@ -80,6 +85,7 @@ class ToolState:
             tip=T_flange_tool[:3, 3],
             axis=T_flange_tool[:3, 2],
             latency_s=0.0,
+            depth=0.0,
             radius=np.full((circles, 2), START_RADIUS_M),
             shift=np.zeros((steps, 3)),
             bend=np.zeros((4, 2)),
@@ -116,6 +122,7 @@ class RunProblem:
     step: NDArray[np.int64]
     circle: NDArray[np.int64]  # -1 in a plunge
     side: Array
+    way: Array  # +1 where the gap grows, -1 where it shrinks
     time_s: Array
     sigma_m: Array
     circles: int
@@ -133,7 +140,7 @@ class RunProblem:
         radii = [f"radius_{b}_{c}" for c in range(self.circles) for b in BEAMS]
         shifts = [f"shift_{a}_{s}" for s in range(self.steps) for a in "xyz"]
         bends = [f"laser_{p}_{a}" for p in "ABCD" for a in ("across", "up")]
-        return (*TOOL_NAMES, "latency", *radii, *shifts, *bends)
+        return (*TOOL_NAMES, "latency", "depth", *radii, *shifts, *bends)
 
     @property
     def undetermined(self) -> int:
@@ -144,14 +151,15 @@ class RunProblem:
     @property
     def _starts(self) -> tuple[int, int, int]:
         """First columns of radii, shifts and bends."""
-        shifts = 6 + 2 * self.circles
-        return 6, shifts, shifts + 3 * self.steps
+        shifts = 7 + 2 * self.circles
+        return 7, shifts, shifts + 3 * self.steps
 
     @property
     def prior(self) -> Array:
         """Information matrix of shifts, bends and what is held; none for the rest."""
         _, shifts, bends = self._starts
         diagonal = np.zeros(len(self.names))
+        diagonal[6] = 1.0 / HYSTERESIS_M**2
         diagonal[shifts:bends] = 1.0 / max(self.noise.step_m, EXACT_M) ** 2
         diagonal[bends:] = 1.0 / max(self.laser.sigma_m, EXACT_M) ** 2
         if self.held.tilt_rad is not None:
@@ -168,6 +176,7 @@ class RunProblem:
         away = np.zeros(len(self.names))
         away[:3] = state.tip - self.taught.tip
         away[3:5] = across(state.axis).T @ (state.axis - self.taught.axis)
+        away[6] = state.depth
         away[shifts:bends], away[bends:] = state.shift.ravel(), state.bend.ravel()
         return away
 
@@ -180,6 +189,7 @@ class RunProblem:
             tip=state.tip + step[:3],
             axis=turn @ state.axis,
             latency_s=state.latency_s + float(step[5]),
+            depth=state.depth + float(step[6]),
             radius=state.radius + step[radii:shifts].reshape(-1, 2),
             shift=state.shift + step[shifts:bends].reshape(-1, 3),
             bend=state.bend + step[bends:].reshape(4, 2),
@@ -194,7 +204,8 @@ class RunProblem:
         circle = self.circle >= 0
         own = np.maximum(self.circle, 0)
         radius = state.radius[own, self.beam] + self.taper * (touch.height - self.height[own])
-        residual = touch.gap - np.where(circle, self.side * radius, 0.0)
+        wanted = np.where(circle, self.side * radius, -self.laser.reach[self.beam])
+        residual = touch.gap - wanted - self.way * state.depth
         taper = np.where(circle, self.side * self.taper, 0.0)[:, None]
         by_tip = touch.normal - taper * touch.height_by_tip
         by_axis = touch.by_axis - taper * touch.height_by_axis
@@ -204,6 +215,7 @@ class RunProblem:
         J[:, :3] = np.einsum("mi,mij->mj", by_tip, R)
         J[:, 3:5] = np.einsum("mi,mij->mj", by_axis, R) @ across(state.axis)
         J[:, 5] = -np.sum(by_tip * velocity, axis=1)
+        J[:, 6] = -self.way
         J[rows, radii + 2 * own + self.beam] = np.where(circle, -self.side, 0.0)
         for i in range(3):
             J[rows, shifts + 3 * self.step + i] = by_tip[:, i]

@@ -150,6 +150,7 @@ def run_problem(
         step=step,
         circle=circle,
         side=np.where(breaks, -np.sign(rate), np.sign(rate)),
+        way=np.sign(rate),
         time_s=time,
         sigma_m=np.hypot(rate * sigma_s, noise.edge_m),
         circles=circles,

@@ -6,7 +6,7 @@ z = x times the y-beam, y = z times x (thesis, eq. 4-15 to 4-27).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,8 @@ class LaserFrame:
         to B and from C to D, from emitter to receiver.
     sigma_m : standard deviation of each coordinate of a point across its beam; 0 where the same
         frame serves both measurements of a change, so that its error cancels.
+    reach : (2,) how far from its middle each beam is broken, m: negative where a tool must cover
+        more than half of the light. It moves the height of a tip, and nothing else.
 
     Raises
     ------
@@ -44,6 +46,7 @@ class LaserFrame:
 
     points: Array
     sigma_m: float = 0.0
+    reach: Array = field(default_factory=lambda: np.zeros(2))
 
     def __post_init__(self) -> None:
         if np.shape(self.points) != (4, 3) or not np.all(np.isfinite(self.points)):
@@ -115,12 +118,16 @@ class LaserFrame:
         return np.asarray(in_laser @ self.T_base_laser[:3, :3].T)
 
 
-def calibrate_laser(flange: Mapping[str, Array], sigma_m: float = 0.0) -> LaserFrame:
+def calibrate_laser(
+    flange: Mapping[str, Array], sigma_m: float = 0.0, radius_m: float | None = None
+) -> LaserFrame:
     """Beams from flange positions (3,), base, m, at the edges A1 ... D4 of a cylinder along z_e.
 
     Indices 1 and 2 are break and restore with the cylinder upright, moved across the beam: their
     mean gives x and y. Indices 3 and 4 are those with the cylinder level, across the beam at the
-    same place along it, moved in z: their mean gives z (eq. 4-15, 4-16).
+    same place along it, moved in z: their mean gives z (eq. 4-15, 4-16). With the cylinder's
+    ``radius_m`` the widths of the shadows give the beams' reach. A constant latency moves a
+    point by speed times latency: give the means of sweeps back and forth.
 
     Raises
     ------
@@ -134,4 +141,18 @@ def calibrate_laser(flange: Mapping[str, Array], sigma_m: float = 0.0) -> LaserF
     for row, name in zip(points, POINTS, strict=True):
         row[:2] = 0.5 * (flange[f"{name}1"] + flange[f"{name}2"])[:2]
         row[2] = 0.5 * (flange[f"{name}3"] + flange[f"{name}4"])[2]
-    return LaserFrame(points, sigma_m)
+    laser = LaserFrame(points, sigma_m)
+    return laser if radius_m is None else replace(laser, reach=_reach(laser, flange, radius_m))
+
+
+def _reach(laser: LaserFrame, flange: Mapping[str, Array], radius_m: float) -> Array:
+    """Half the way across a beam in its shadow, less the cylinder's radius; (2,) means, m."""
+    shares = []
+    for name, u in zip(POINTS, np.repeat(laser.direction, 2, axis=0), strict=True):
+        across = flange[f"{name}2"] - flange[f"{name}1"]
+        down = flange[f"{name}4"] - flange[f"{name}3"]
+        # Upright the cylinder lies along the second way, level along the first.
+        for way, axis in ((across, down), (down, across)):
+            normal = np.cross(u, axis)
+            shares.append(0.5 * abs(way @ normal) / np.linalg.norm(normal))
+    return np.asarray(np.mean(np.reshape(shares, (2, 4)), axis=1) - radius_m)
