@@ -270,7 +270,7 @@ def remount_table() -> Table:
     return table
 
 
-def effects_table(runs: int = 60) -> Table:
+def effects_table(runs: int = 30) -> Table:
     """What each effect does to both methods."""
     table = Table(
         "tool_effects",
@@ -300,7 +300,7 @@ def effects_table(runs: int = 60) -> Table:
     return table
 
 
-def check_table(runs: int = 200) -> Table:
+def check_table(runs: int = 120) -> Table:
     """How often a quick check says what."""
     limit = 2e-4
     table = Table(
