@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Poses = Callable[[Array], Array]
 
 GRID_S = 2e-3  # no shadow is shorter
-HALVINGS = 34
+HALVINGS = 40
 FINEST_S = 1e-9  # what a perfect input claims
 
 
