@@ -1,0 +1,1 @@
+"""Where a tool's tip and axis are, from light barriers or from touches."""

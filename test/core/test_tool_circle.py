@@ -1,0 +1,239 @@
+"""One circle by time alone: exact, unbiased for thick tools, as good as the bound; refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import ResidualError
+from robocal_ros.core.tool.beam_edges import BeamEdge, BeamError
+from robocal_ros.core.tool.circle_edges import CircleMotion, label_edges
+from robocal_ros.core.tool.crossed_beams import (
+    CircleProblem,
+    CircleState,
+    classic_distances,
+    closed_form,
+    fit_circle,
+)
+from robocal_ros.sim.beam_moves import Circle
+from robocal_ros.sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+
+RADIUS, PERIOD, START = 0.012, 2.0, np.radians(45.0)
+BETA = np.radians(92.2)
+JITTER = 2e-5
+UPRIGHT = np.diag([1.0, -1.0, -1.0])
+TOOL = frames.transform(np.eye(3), [0.0, 0.0, 0.15])
+
+
+def motion(direction: int = 1, beta: float = np.pi / 2.0) -> CircleMotion:
+    return CircleMotion(RADIUS, PERIOD, START, direction, beta)
+
+
+def passed(
+    centre: tuple[float, float],
+    rho: float,
+    direction: int = 1,
+    beta: float = np.pi / 2.0,
+    window: tuple[float, float] = (0.0, PERIOD),
+    latency: float = 0.0,
+    **changes,
+) -> list[BeamEdge]:
+    """Edges of a cylinder whose axis circles about ``centre``; sigma is that of the jitter."""
+    station = BeamStation(beams_of(np.eye(4), beta), PERFECT, NO_NOISE)
+    T = frames.transform(UPRIGHT, [*centre, 0.13])
+    turns = int(np.ceil((window[1] + 1.0) / PERIOD))
+    move = Circle(T, np.eye(3), RADIUS, PERIOD, start_rad=START, direction=direction, **changes)
+    found = []
+    for i in range(turns):  # turn by turn, so that every one is at full speed
+        part = max(window[0] - i * PERIOD, 0.0), min(window[1] - i * PERIOD, PERIOD)
+        if part[1] > part[0]:
+            tool = RoundTool.cylinder(TOOL, rho)
+            edges = station.edges(tool, move, part, np.random.default_rng(0))
+            found += [replace(e, time_s=e.time_s + i * PERIOD) for e in edges]
+    return [replace(e, time_s=e.time_s + latency, sigma_s=JITTER) for e in found]
+
+
+def jittered(edges: list[BeamEdge], rng: np.random.Generator) -> list[BeamEdge]:
+    return [replace(e, time_s=e.time_s + JITTER * rng.standard_normal()) for e in edges]
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize("beta", [np.pi / 2.0, BETA])
+@pytest.mark.parametrize(
+    ("centre", "rho"),
+    [((0.003, -0.004), 0.0025), ((0.006, 0.005), 0.004), ((-0.006, -0.005), 0.004)],
+)
+def test_without_noise_centre_radius_and_latency_are_exact(centre, rho, direction, beta):
+    edges = passed(centre, rho, direction, beta, latency=0.007)
+    found = fit_circle(motion(direction, beta), edges)
+    assert found.centre == pytest.approx(centre, abs=1e-10)
+    assert found.rho == pytest.approx([rho, rho], abs=1e-10)
+    assert found.latency_s == pytest.approx(0.007, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("centre", "rho", "bias_mm"),
+    [((0.003, -0.004), 0.0025, (0.07, -0.10)), ((0.006, 0.005), 0.004, (0.54, 0.39))],
+)
+def test_the_classic_method_is_biased_as_published(centre, rho, bias_mm):
+    found = fit_circle(motion(), passed(centre, rho), "classic")
+    assert 1e3 * (found.centre - centre) == pytest.approx(bias_mm, abs=0.005)
+    assert found.covariance is None
+
+
+def test_the_classic_method_is_exact_for_a_thin_tool():
+    found = fit_circle(motion(beta=BETA), passed((0.006, 0.005), 2e-4, beta=BETA), "classic")
+    # The bias is of second order in the radius: 0.56 mm at 4 mm.
+    assert found.centre == pytest.approx((0.006, 0.005), abs=2.0 * 5.6e-4 * (0.2 / 4.0) ** 2)
+
+
+def test_ignoring_the_beams_angle_costs_what_is_said():
+    """0.19 mm at 2.2 deg for 5 mm."""
+    edges = passed((0.0, 0.005), 2e-4, beta=BETA)
+    square = fit_circle(motion(), edges, "classic")
+    assert 1e3 * abs(square.centre[0]) == pytest.approx(0.19, abs=0.005)
+    with pytest.raises(ResidualError):  # eight edges see that the beams are not at a right angle
+        fit_circle(motion(), edges)
+
+
+@pytest.mark.parametrize(
+    "window", [(0.0, PERIOD), (0.31, 0.31 + PERIOD), (0.1, 0.1 + 2.6 * PERIOD)]
+)
+def test_any_whole_turn_serves_and_several_too(window):
+    edges = passed((0.004, -0.005), 0.003, window=window)
+    found = fit_circle(motion(), edges, period_free=window[1] > 2.0 * PERIOD)
+    assert found.centre == pytest.approx((0.004, -0.005), abs=1e-10)
+
+
+def test_a_first_edge_may_be_a_restore():
+    """The circle begins within the x-beam's shadow."""
+    edges = passed((-0.006, -0.005), 0.004)
+    assert not next(e for e in edges if e.beam == "x").blocked
+    assert fit_circle(motion(), edges).centre == pytest.approx((-0.006, -0.005), abs=1e-10)
+
+
+def test_shadows_of_both_beams_may_overlap():
+    edges = passed((0.006, 0.005), 0.004)
+    order = "".join(e.beam for e in edges)
+    assert "xyx" in order or "yxy" in order  # one beam's edge within the other's shadow
+    assert fit_circle(motion(), edges).centre == pytest.approx((0.006, 0.005), abs=1e-10)
+
+
+def test_the_period_is_found_where_it_is_free():
+    slow = replace(motion(), period_s=PERIOD * 1.002)
+    edges = passed((0.004, -0.005), 0.003, window=(0.0, 1.5 * PERIOD))
+    found = fit_circle(slow, edges, period_free=True)
+    assert found.period_s == pytest.approx(PERIOD, abs=1e-9)
+    assert found.centre == pytest.approx((0.004, -0.005), abs=1e-10)
+
+
+def test_closed_form_alone_is_exact_and_has_no_bias():
+    """500 runs with 20 us jitter: mean within 4 standard errors, spread about 0.4 um."""
+    edges, m, rng = passed((0.006, 0.005), 0.004), motion(), np.random.default_rng(2)
+    found = [m.centre(closed_form(m, label_edges(m, jittered(edges, rng)))[0]) for _ in range(500)]
+    error = np.array(found) - (0.006, 0.005)
+    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * error.std(axis=0) / np.sqrt(500.0))
+    assert np.all(error.std(axis=0) < 0.5e-6)
+
+
+@pytest.mark.parametrize("latency", [None, 0.0])
+def test_best_attains_the_bound_and_says_it(latency):
+    edges, m, rng = passed((0.006, 0.005), 0.004, beta=BETA), motion(beta=BETA), None
+    rng = np.random.default_rng(7)
+    found = [fit_circle(m, jittered(edges, rng), latency_s=latency) for _ in range(500)]
+    error = np.array([f.centre for f in found]) - (0.006, 0.005)
+    bound = fit_circle(m, edges, latency_s=latency).covariance
+    assert np.all(np.abs(error.mean(axis=0)) < 4.0 * error.std(axis=0) / np.sqrt(500.0))
+    assert np.all(error.std(axis=0) < 1.1 * np.sqrt(np.diag(bound)))
+    squared = [e @ np.linalg.solve(f.covariance, e) for e, f in zip(error, found, strict=True)]
+    assert np.sum(squared) == pytest.approx(1000.0, abs=4.0 * np.sqrt(2000.0))
+    assert (found[0].latency_sigma_s is None) == (latency is not None)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_jacobian_is_that_of_the_residual(direction):
+    m = motion(direction, BETA)
+    edges = label_edges(m, passed((0.005, -0.004), 0.003, direction, BETA))
+    problem = CircleProblem(m, edges, True, True)
+    state = CircleState(np.array([-0.0041, 0.0052]), np.array([0.0031, 0.0029]), 1e-3, 2.001)
+    _, J = problem.linearise(state)
+    for i, h in enumerate([1e-8] * 4 + [1e-7] * 2):
+        step = h * np.eye(6)[i]
+        up = problem.linearise(problem.retract(state, step))[0]
+        down = problem.linearise(problem.retract(state, -step))[0]
+        assert J[:, 0, i] == pytest.approx((up - down)[:, 0] / (2.0 * h), rel=1e-5, abs=1e-2)
+
+
+def test_radius_of_the_circle_only_scales():
+    """R is not seen by times: the same edges with a circle twice as large give all twice."""
+    edges = passed((0.004, -0.005), 0.003)
+    one, two = (fit_circle(replace(motion(), radius_m=R), edges) for R in (RADIUS, 2.0 * RADIUS))
+    assert two.centre == pytest.approx(2.0 * one.centre, abs=1e-10)
+    assert two.misfit_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_turning_the_station_changes_nothing():
+    """The same circle, beams exchanged by a quarter turn: the centre turns with them."""
+    here = fit_circle(motion(), passed((0.004, -0.005), 0.003))
+    turned = passed((0.005, 0.004), 0.003)
+    there = fit_circle(motion(), turned)
+    assert there.centre == pytest.approx([-here.centre[1], here.centre[0]], abs=1e-10)
+
+
+def edge_list() -> list[BeamEdge]:
+    return passed((0.002, -0.003), 0.002)
+
+
+def without(i: int) -> list[BeamEdge]:
+    return [e for k, e in enumerate(edge_list()) if k != i]
+
+
+def test_seven_edges_are_refused():
+    for i in range(8):
+        with pytest.raises(BeamError, match=r"edges, 4 are needed|is (broken|restored) twice"):
+            fit_circle(motion(), without(i))
+
+
+def test_nine_edges_are_refused_where_the_ninth_fits_no_turn():
+    edges = edge_list()
+    last = edges[-1]
+    extra = BeamEdge(last.beam, not last.blocked, last.time_s + 0.05, JITTER)
+    with pytest.raises(ResidualError, match="miss a circle at constant speed"):
+        fit_circle(motion(), [*edges, extra])
+    with pytest.raises(BeamError, match="twice"):
+        fit_circle(motion(), [*edges, replace(last, time_s=last.time_s + 0.05)])
+
+
+def test_a_dead_beam_and_a_missed_one_are_refused():
+    with pytest.raises(BeamError, match="beam y was never broken"):
+        fit_circle(motion(), [e for e in edge_list() if e.beam == "x"])
+    with pytest.raises(BeamError, match=r"beam x has 2 edges|beam x was never"):
+        fit_circle(motion(), passed((0.0, 0.0105), 0.002))
+
+
+def test_a_speed_that_is_not_constant_is_refused():
+    edges = passed((0.002, -0.003), 0.002, ripple=0.2, ripples=1)
+    with pytest.raises(ResidualError, match="record joint_states so that the speed need not"):
+        fit_circle(motion(), edges)
+
+
+def test_an_inverted_input_is_refused():
+    inverted = [replace(e, blocked=not e.blocked) for e in edge_list()]
+    with pytest.raises(BeamError, match="polarity"):
+        fit_circle(motion(), inverted)
+
+
+def test_the_classic_distances_are_the_arcs_of_the_source():
+    """Eq. 4-8, 4-9 by hand: four mid-times, arcs as shares of the turn."""
+    m, edges = motion(), edge_list()
+    middle = {b: [] for b in "xy"}
+    for beam in "xy":
+        own = [e.time_s for e in edges if e.beam == beam]
+        middle[beam] = [0.5 * (own[0] + own[1]), 0.5 * (own[2] + own[3])]
+    # From 45 deg: y (90), x (180), y (270), x (360): arcs 2, 3 between, then 4.
+    y1, x1, y2, x2 = middle["y"][0], middle["x"][0], middle["y"][1], middle["x"][1]
+    arcs = 2.0 * np.pi / PERIOD * np.array([x1 - y1, y2 - x1, x2 - y2])
+    d_x = RADIUS * np.cos(0.5 * (arcs[1] + arcs[2]))
+    d_y = RADIUS * np.cos(0.5 * (arcs[0] + arcs[1]))
+    assert classic_distances(m, label_edges(m, edges)) == pytest.approx([d_x, d_y], abs=1e-12)

@@ -1,0 +1,207 @@
+"""The laser frame: the source's data, simulated calibrations, refusals; axes and tool rotations."""
+
+import numpy as np
+import pytest
+from beam_cell import BETA, GAP, T_BASE_LASER, laser_of
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError, RankDeficientError
+from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.core.tool.tool_axis import (
+    axis_from_centres,
+    first_rotation,
+    minimal_rotation,
+    retaught,
+    upright_pose,
+)
+from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
+from robocal_ros.sim.beams import (
+    NO_NOISE,
+    PERFECT,
+    BeamStation,
+    TrueBeam,
+    TrueInput,
+    TrueNoise,
+    beams_of,
+)
+
+PUBLISHED_MM = {  # thesis table 5-3
+    "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),
+    "A3": (793.66, -139.26, 196.72), "A4": (793.68, -139.23, 191.76),
+    "B1": (805.58, -128.96, 207.46), "B2": (805.56, -124.01, 207.47),
+    "B3": (805.57, -139.27, 197.19), "B4": (805.55, -139.25, 192.24),
+    "C1": (796.99, -132.40, 207.44), "C2": (801.95, -132.43, 207.45),
+    "C3": (786.35, -132.42, 196.86), "C4": (786.31, -132.44, 191.92),
+    "D1": (796.87, -120.35, 207.47), "D2": (801.84, -120.34, 207.47),
+    "D3": (786.32, -120.36, 197.13), "D4": (786.35, -120.37, 192.19),
+}  # fmt: skip
+
+
+def published() -> dict[str, np.ndarray]:
+    return {name: 1e-3 * np.array(place) for name, place in PUBLISHED_MM.items()}
+
+
+def test_the_sources_station_to_the_printed_digits():
+    laser = calibrate_laser(published())
+    T = laser.T_base_laser
+    assert np.round(1e3 * T[:3, 3], 3).tolist() == [799.413, -126.302, 194.498]
+    assert round(1e3 * abs(laser.gap_m), 3) == 0.058
+    assert np.round(T[:3, 0], 5).tolist() == [0.99876, -0.02981, 0.03988]
+    assert np.round(T[:3, 2], 5).tolist() == [-0.04057, -0.02273, 0.99892]
+    assert round(np.degrees(laser.beam_angle_rad), 2) == 92.20
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+def test_moving_the_base_moves_the_frame_and_nothing_else():
+    """Points that are lines in space, not their raw sweeps, which run along the base's axes."""
+    laser = calibrate_laser(published())
+    move = frames.transform(frames.exp_rotation([0.4, -1.1, 0.7]), [0.3, -0.2, 0.9])
+    moved = LaserFrame(laser.points @ move[:3, :3].T + move[:3, 3])
+    assert moved.T_base_laser == pytest.approx(move @ laser.T_base_laser, abs=1e-12)
+    assert moved.gap_m == pytest.approx(laser.gap_m, abs=1e-14)
+    assert moved.beam_angle_rad == pytest.approx(laser.beam_angle_rad, abs=1e-12)
+
+
+def test_simulated_sweeps_give_the_true_frame():
+    """A gap and beams that cross at 92.2 deg, level in base."""
+    level = frames.transform(frames.exp_rotation([0.0, 0.0, 0.03]), T_BASE_LASER[:3, 3])
+    station = BeamStation(beams_of(level, BETA, GAP), PERFECT, NO_NOISE)
+    found = calibrate_laser(laser_points(station, level, np.random.default_rng(0)))
+    assert found.T_base_laser == pytest.approx(level, abs=1e-9)
+    assert found.gap_m == pytest.approx(GAP, abs=1e-12)
+    assert found.beam_angle_rad == pytest.approx(BETA, abs=1e-9)
+
+
+def test_a_constant_latency_cancels_in_sweeps_back_and_forth():
+    source = TrueInput(latency_s=0.02, jitter_s=0.0)
+    station = BeamStation(beams_of(T_BASE_LASER, BETA, GAP), source, NO_NOISE)
+    found = calibrate_laser(laser_points(station, T_BASE_LASER, np.random.default_rng(0)))
+    assert found.T_base_laser == pytest.approx(T_BASE_LASER, abs=1e-9)
+
+
+@pytest.mark.parametrize("light", [0.3, 0.5, 0.8])
+def test_a_cylinder_of_known_radius_gives_the_beams_reach(light):
+    """Beams that lean by 2 deg in base: exact to the square of that."""
+    beams = tuple(
+        TrueBeam(b.start, b.end, 8e-4, light, light) for b in beams_of(T_BASE_LASER, BETA, GAP)
+    )
+    station = BeamStation(beams, PERFECT, NO_NOISE)
+    points = laser_points(station, T_BASE_LASER, np.random.default_rng(0))
+    found = calibrate_laser(points, radius_m=CYLINDER_M)
+    assert found.reach == pytest.approx([beams[0].threshold(light)] * 2, abs=1e-9)
+    assert found.T_base_laser == pytest.approx(T_BASE_LASER, abs=1e-9)
+
+
+def test_scatter_of_the_points_is_what_is_said():
+    source, noise = TrueInput(sample_period_s=0.002), TrueNoise(3e-5, 1e-5)
+    station = BeamStation(beams_of(T_BASE_LASER, BETA, GAP), source, noise)
+    exact = BeamStation(station.beams, PERFECT, NO_NOISE)
+    true = calibrate_laser(laser_points(exact, T_BASE_LASER, np.random.default_rng(0)))
+    errors = []
+    for seed in range(40):
+        found = calibrate_laser(laser_points(station, T_BASE_LASER, np.random.default_rng(seed)))
+        away = found.points - true.points
+        errors += [away[:2, 1], away[2:, 0], away[:, 2]]  # across the beams
+    squares = np.concatenate(errors) ** 2
+    assert len(squares) == 320
+    sigma = point_sigma(station)
+    assert squares.mean() == pytest.approx(sigma**2, rel=4.0 * np.sqrt(2.0 / 320.0))
+
+
+def test_what_gives_no_frame_is_refused():
+    points = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA))).points
+    with pytest.raises(InputError, match="points B3, C1 are missing"):
+        calibrate_laser({k: v for k, v in published().items() if k not in ("B3", "C1")})
+    with pytest.raises(RankDeficientError, match=r"two points on the y-beam are 0\.00 mm apart"):
+        LaserFrame(points[[0, 1, 2, 2]])
+    with pytest.raises(RankDeficientError, match="the beams cross at"):
+        LaserFrame(np.vstack([points[:2], points[:2] + 1e-4]))
+    with pytest.raises(InputError, match=r"pass each other at 5\.00 mm"):
+        LaserFrame(points + np.array([0, 0, 1, 1])[:, None] * 5e-3 * T_BASE_LASER[:3, 2])
+
+
+unit = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+@given(unit, unit)
+def test_the_minimal_rotation_turns_one_into_the_other_by_their_angle(a, b):
+    a, b = (np.array(v) / np.linalg.norm(v) for v in (a, b))
+    R = minimal_rotation(a, b)
+    assert R @ a == pytest.approx(b, abs=1e-7)
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
+    assert np.linalg.norm(frames.log_rotation(R)) == pytest.approx(angle, abs=1e-6)
+
+
+@given(unit)
+def test_a_first_rotation_is_the_minimal_one_from_z(v):
+    v = np.array(v) / np.linalg.norm(v)
+    if v[2] > -0.999:
+        assert first_rotation(v) == pytest.approx(minimal_rotation([0, 0, 1], v), abs=1e-7)
+
+
+@pytest.mark.parametrize("z", [1.0, -1.0])
+def test_a_first_rotation_along_z_divides_by_nothing(z):
+    R = first_rotation([0.0, 0.0, z], spin_rad=0.3)
+    assert R[:, 2] == pytest.approx([0.0, 0.0, z], abs=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    if z > 0.0:
+        assert pytest.approx(np.eye(3)) == R
+
+
+def test_the_sources_bent_tool_points_along_its_tip():
+    """The third row of the published rotation (5-6) is the axis, its third column is not."""
+    tip = np.array([-13.2159, 18.2912, 152.3880])
+    axis = np.array([-0.0857, 0.1187, 0.9892])
+    R = first_rotation(axis / np.linalg.norm(axis))
+    assert R[:, 2] @ tip / np.linalg.norm(tip) == pytest.approx(1.0, abs=2e-6)
+    published = [[0.9963, 0.0051, 0.0857], [0.0051, 0.9929, -0.1187], [-0.0857, 0.1187, 0.9892]]
+    assert pytest.approx(np.array(published), abs=1e-4) == R.T
+
+
+def test_the_taught_turn_about_the_axis_stays():
+    taught = frames.exp_rotation([0.1, -0.2, 0.8])
+    axis = frames.exp_rotation([0.05, 0.07, 0.0]) @ taught[:, 2]
+    new = retaught(taught, axis)
+    assert new[:, 2] == pytest.approx(axis)
+    between = frames.log_rotation(new @ taught.T)
+    assert between @ taught[:, 2] == pytest.approx(0.0, abs=1e-12)  # no turn about the axis
+
+
+def two_centres(v_flange, order):
+    """Where a straight tool passes the beam plane at two heights of the flange."""
+    laser = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA)))
+    R = laser.T_base_laser[:3, :3] @ np.diag([1.0, -1.0, -1.0]) @ frames.exp_rotation([0, 0, 0.4])
+    poses, centres = [], []
+    for height in order:
+        place = laser.T_base_laser @ np.array([0.001, -0.002, height, 1.0])
+        T_laser_flange = frames.invert(laser.T_base_laser) @ frames.transform(R, place[:3])
+        v, t = T_laser_flange[:3, :3] @ v_flange, T_laser_flange[:3, 3]
+        poses.append(frames.transform(R, place[:3]))
+        centres.append((t - t[2] / v[2] * v)[:2])
+    return laser, tuple(poses), tuple(centres)
+
+
+@pytest.mark.parametrize("order", [(0.15, 0.10), (0.10, 0.15)])
+def test_two_heights_give_the_axis(order):
+    v = np.array([0.08, -0.05, 1.0]) / np.linalg.norm([0.08, -0.05, 1.0])
+    laser, poses, centres = two_centres(v, order)
+    assert axis_from_centres(laser, poses, centres) == pytest.approx(v, abs=1e-12)
+
+
+def test_one_height_gives_none():
+    laser, poses, centres = two_centres(np.array([0.0, 0.0, 1.0]), (0.15, 0.149))
+    with pytest.raises(RankDeficientError, match=r"heights differ by 1\.00 mm"):
+        axis_from_centres(laser, poses, centres)
+    with pytest.raises(RankDeficientError, match="turn the flange until the tool stands upright"):
+        axis_from_centres(laser, two_centres(np.array([0.0, 0.0, 1.0]), (0.15, 0.14))[1],
+                          (np.array([0.02, 0.0]), np.zeros(2)))  # fmt: skip
+
+
+def test_the_upright_pose_sets_the_axis_down_and_the_point_on_the_crossing():
+    laser = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA)))
+    v = np.array([0.1, 0.05, 1.0]) / np.linalg.norm([0.1, 0.05, 1.0])
+    T = upright_pose(laser, np.eye(4), v, [0.01, 0.02, 0.15])
+    assert T[:3, :3] @ v == pytest.approx(-laser.T_base_laser[:3, 2])
+    assert (T @ [0.01, 0.02, 0.15, 1.0])[:3] == pytest.approx(laser.T_base_laser[:3, 3])

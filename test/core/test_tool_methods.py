@@ -1,0 +1,178 @@
+"""The other ways to a tool: four and seven touches, two parallel beams."""
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import (
+    InputError,
+    RankDeficientError,
+    ResidualError,
+    TooFewSamplesError,
+)
+from robocal_ros.core.tool.parallel_beams import (
+    ParallelBeams,
+    parallel_tip,
+    straighten,
+    sweep_axis,
+)
+from robocal_ros.core.tool.touch_points import fit_four, fit_seven, pose_from_euler
+from robocal_ros.sim.beam_moves import Sweep
+from robocal_ros.sim.beams import RoundTool, TrueBeam, bent, crossings
+
+TIP = np.array([0.012, -0.034, 0.21])
+POINT = np.array([0.9, 0.2, 0.5])
+SIGMA = 1e-4
+
+
+def touches(count: int = 6, seed: int = 0, noise: float = 0.0) -> np.ndarray:
+    """Flange poses that bring the tip to one point, turned by up to 40 deg each way."""
+    random = np.random.default_rng(seed)
+    R = frames.exp_rotation(random.uniform(-0.7, 0.7, (count, 3)) + np.array([np.pi, 0.0, 0.0]))
+    t = POINT - R @ TIP + noise * random.standard_normal((count, 3))
+    return frames.transform(R, t)
+
+
+def test_four_touches_give_the_tip():
+    found = fit_four(touches(4))
+    assert found.tip == pytest.approx(TIP, abs=1e-10)
+    assert found.point == pytest.approx(POINT, abs=1e-10)
+    assert found.verdict.accept
+
+
+def test_touches_scatter_as_the_covariance_says():
+    """Same poses, 400 draws: chi-square of 1200 degrees."""
+    exact = touches(5)
+    random, squared = np.random.default_rng(1), 0.0
+    for _ in range(400):
+        T = exact.copy()
+        T[:, :3, 3] += SIGMA * random.standard_normal((5, 3))
+        found = fit_four(T, SIGMA)
+        error = found.tip - TIP
+        # The fit widens a covariance that its own residuals contradict; here they are the truth.
+        squared += error @ np.linalg.solve(found.covariance / found.estimate.scale**2, error)
+    assert squared == pytest.approx(1200.0, abs=4.0 * np.sqrt(2400.0))
+
+
+def test_moving_the_base_does_not_move_the_tip():
+    T = touches(5, noise=SIGMA)
+    move = frames.transform(frames.exp_rotation([0.4, 0.9, -0.3]), [1.0, -2.0, 0.3])
+    assert fit_four(move @ T).tip == pytest.approx(fit_four(T).tip, abs=1e-10)
+
+
+def test_poor_touches_fail_the_verdict():
+    T = touches(6)
+    T[2, :3, 3] += [0.004, -0.003, 0.002]
+    T[4, :3, 3] -= [0.005, 0.001, 0.0]
+    verdict = fit_four(T[:6]).verdict
+    assert verdict.code is Code.RESIDUAL_TOO_LARGE
+    assert "Euler convention" in verdict.reason
+
+
+def test_too_few_touches_or_one_axis_are_refused():
+    with pytest.raises(TooFewSamplesError, match="3 touches: at least 4"):
+        fit_four(touches(3))
+    R = frames.exp_rotation(np.outer([0.0, 0.5, 1.0, 1.5, 2.0], [0.0, 0.6, 0.8]))
+    one_axis = frames.transform(R, POINT - R @ TIP)
+    with pytest.raises(RankDeficientError, match=r"determine 5 of 6 .* about a second axis"):
+        fit_four(one_axis)
+    small = frames.exp_rotation(0.01 * np.random.default_rng(0).standard_normal((6, 3)))
+    with pytest.raises(RankDeficientError, match="about a second axis"):
+        fit_four(frames.transform(small, POINT - small @ TIP))
+
+
+def seven(R_flange_tool: np.ndarray, x=(0.1, 0.0, 0.0), z=(0.0, 0.0, 0.1)) -> np.ndarray:
+    """Four touches, then the aligned tool moved along x and z of the base."""
+    last = np.tile(frames.transform(R_flange_tool.T, [0.8, 0.1, 0.6]), (3, 1, 1))
+    last[1:, :3, 3] += x
+    last[2:, :3, 3] += z
+    return np.concatenate([touches(4), last])
+
+
+def test_seven_points_give_the_orientation_too():
+    R = frames.exp_rotation([0.3, 2.9, -0.4])
+    found = fit_seven(seven(R))
+    assert found.tip == pytest.approx(TIP, abs=1e-10)
+    assert found.rotation == pytest.approx(R, abs=1e-10)
+
+
+def test_seven_points_with_slanted_moves_stay_a_rotation():
+    found = fit_seven(seven(np.eye(3), z=(0.002, 0.0, 0.1)))
+    assert found.rotation.T @ found.rotation == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.norm(frames.log_rotation(found.rotation)) == pytest.approx(0.01, rel=0.01)
+
+
+def test_moves_that_give_no_axes_are_refused():
+    with pytest.raises(RankDeficientError, match=r"a move of 5\.0 mm gives no direction"):
+        fit_seven(seven(np.eye(3), x=(0.005, 0.0, 0.0)))
+    with pytest.raises(RankDeficientError, match="nearly parallel"):
+        fit_seven(seven(np.eye(3), z=(0.1, 0.0, 0.01)))
+    turned = seven(np.eye(3))
+    turned[-1, :3, :3] = frames.exp_rotation([0.0, 0.01, 0.0])
+    with pytest.raises(InputError, match=r"turned by 0\.573 deg"):
+        fit_seven(turned)
+
+
+def test_controllers_angles():
+    """Thesis eq. 4-3 written out; KUKA's A, B, C turn about z, y, x."""
+    A, B, C = 0.3, -0.7, 1.1
+    ca, sa, cb, sb, cc, sc = np.cos(A), np.sin(A), np.cos(B), np.sin(B), np.cos(C), np.sin(C)
+    printed = [
+        [ca * cc - sa * cb * sc, -ca * sc - sa * cb * cc, sa * sb],
+        [sa * cc + ca * cb * sc, -sa * sc + ca * cb * cc, -ca * sb],
+        [sb * sc, sb * cc, cb],
+    ]
+    T = pose_from_euler([1.0, 2.0, 3.0], [A, B, C], "zxz")
+    assert pytest.approx(np.array(printed)) == T[:3, :3]
+    assert T[:3, 3].tolist() == [1.0, 2.0, 3.0]
+    one = [np.array([0, 0, A]), np.array([0, B, 0]), np.array([C, 0, 0])]
+    turns = [frames.exp_rotation(v) for v in one]
+    R = pose_from_euler(np.zeros((2, 3)), [[A, B, C]] * 2, "zyx")[1, :3, :3]
+    assert pytest.approx(turns[0] @ turns[1] @ turns[2]) == R
+
+
+BEAMS = ParallelBeams(0.40, 0.36)
+X_BEAM = 0.8
+R_FIRST = np.column_stack([[-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])  # y_e along y_b, z_e down
+R_TURNED = np.column_stack([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -1.0]])  # x_e along y_b
+
+
+def sweep(tool: RoundTool, R: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Flange x_b at the edges of the upper and the lower beam."""
+    start = frames.transform(R, [X_BEAM - 0.03, 0.0, height])
+    move = Sweep(start, np.array([0.06, 0.0, 0.0]), 1.0)
+    found = []
+    for h in (BEAMS.up_m, BEAMS.down_m):
+        beam = TrueBeam(np.array([X_BEAM, -0.1, h]), np.array([X_BEAM, 0.1, h]))
+        time, _ = crossings(beam, tool, move, move.window, 0.0, np.random.default_rng(0))
+        found.append(move(time)[:, 0, 3])
+    return found[0], found[1]
+
+
+def test_parallel_beams_find_axis_and_tip():
+    truth = bent(frames.transform(np.eye(3), [0.0, 0.0, 0.2]), [4e-3, -3e-3, 1e-3], [0.06, 0.04, 0])
+    tool = RoundTool.cylinder(truth, 0.003)
+    up, down = sweep(tool, R_FIRST, 0.53)
+    turned_up, turned_down = sweep(tool, R_TURNED, 0.53)
+    v = sweep_axis(BEAMS, up, down, turned_up, turned_down)
+    assert v == pytest.approx(truth[:3, 2], abs=1e-9)
+    straight = straighten(R_FIRST, v)
+    quarter = frames.exp_rotation([0.0, 0.0, np.pi / 2.0])
+    pair = (straight, quarter @ straight)
+    middles = tuple(sweep(tool, R, 0.53) for R in pair)
+    z = BEAMS.up_m - (straight @ truth[:3, 3])[2]  # where the tip reaches the upper beam
+    tip = parallel_tip(BEAMS, X_BEAM, pair, middles, z)
+    assert tip == pytest.approx(truth[:3, 3], abs=1e-8)
+
+
+def test_parallel_beams_refuse_what_they_cannot_tell():
+    edges = np.array([0.79, 0.81])
+    with pytest.raises(RankDeficientError, match=r"beams are 1\.00 mm apart in height"):
+        ParallelBeams(0.401, 0.4)
+    with pytest.raises(InputError, match="lower beam needs the places of its break"):
+        sweep_axis(BEAMS, edges, edges[:1], edges, edges)
+    with pytest.raises(ResidualError, match=r"leans by 1\.000 mm"):
+        parallel_tip(BEAMS, X_BEAM, (R_FIRST, R_TURNED), ((edges, edges + 1e-3),) * 2, 0.6)
+    with pytest.raises(RankDeficientError, match="turn the flange by 90 deg"):
+        parallel_tip(BEAMS, X_BEAM, (R_FIRST, R_FIRST), ((edges, edges),) * 2, 0.6)
