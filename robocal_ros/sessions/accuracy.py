@@ -39,17 +39,17 @@ def accuracy_of(
     stamp_ns: int,
 ) -> Accuracy:
     """Judge the model in force at a stamp, by the motors' temperatures (n,) up to then."""
-    try:
-        follower = following.follower
-    except RobocalError as error:
-        return Accuracy(AccuracyLevel.FAULT, str(error))
     if current.fault:
         return Accuracy(AccuracyLevel.FAULT, current.fault)
-    if follower is None:
-        words = "no cold reference: how far the robot has drifted is not known; capture one"
-        return Accuracy(AccuracyLevel.EXPIRED, words)
-    with follower.looking_ahead(temperatures):
-        return _judged(follower, current, config, stamp_ns)
+    try:
+        follower = following.follower
+        if follower is None:
+            words = "no cold reference: how far the robot has drifted is not known; capture one"
+            return Accuracy(AccuracyLevel.EXPIRED, words)
+        with follower.looking_ahead(temperatures):
+            return _judged(follower, current, config, stamp_ns)
+    except RobocalError as error:
+        return Accuracy(AccuracyLevel.FAULT, str(error))
 
 
 def _judged(

@@ -61,10 +61,6 @@ class MotorTemperatures:
         end = bisect_right(self._readings, stamp_ns, key=lambda reading: reading[0])
         return self._readings[:end]
 
-    def clear(self) -> None:
-        """Forget all: the clock jumped."""
-        self.__init__(tuple(self._place))  # type: ignore[misc]
-
     def _put_together(self) -> None:
         self._readings, self._latest = [], np.full(len(self._place), np.nan)
         for sample in self._samples:

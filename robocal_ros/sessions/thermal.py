@@ -121,7 +121,7 @@ class ThermalSession:
             jumps = self.desk.jumps
             self.desk.add_joints(sample)
             if self.desk.jumps > jumps:
-                self.temperatures.clear()
+                self.temperatures = MotorTemperatures(self.nominal.joint_names)
         elif isinstance(sample, TemperatureSample):
             self.temperatures.add(sample)
             self.desk.newest_ns[TEMPERATURES] = self.temperatures.newest_ns or 0
