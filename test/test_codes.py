@@ -26,5 +26,6 @@ def test_numbers_are_never_reused():
         "NONE": 0, "ACCEPT": 1, "WORSE_THAN_CURRENT": 2, "NO_SIGNIFICANT_GAIN": 3,
         "RANK_DEFICIENT": 4, "TOO_FEW_SAMPLES": 5, "RESIDUAL_TOO_LARGE": 6,
         "POSES_NOT_INFORMATIVE": 7, "STALE": 8, "WRONG_ROBOT": 9, "LIMIT_EXCEEDED": 10,
-        "BAD_INPUT": 11, "CONFLICT": 12, "STORAGE_FAILED": 13,
+        "BAD_INPUT": 11, "CONFLICT": 12, "STORAGE_FAILED": 13, "SENSOR_OR_ROBOT_MOVED": 14,
+        "BEAM_EDGES_WRONG": 15,
     }.items() <= CODES.items()  # fmt: skip

@@ -46,6 +46,7 @@ COMMANDS = {
     "replay": "replay",
     "history": "history",
     "thermal": "thermal",
+    "tool": "tool",
     "import-ur": "import_ur",
 }
 """Name of each command and its module, in the order of the help."""

@@ -25,3 +25,4 @@ class Code(IntEnum):
     CONFLICT = 12
     STORAGE_FAILED = 13
     SENSOR_OR_ROBOT_MOVED = 14
+    BEAM_EDGES_WRONG = 15

@@ -3,7 +3,7 @@
 The contract is written in docs/csv.md.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
 
@@ -73,11 +73,29 @@ def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> Layout:
     """
     names = [name.strip() for name in header]
     _check_separator(names, file)
-    _check_names(names, arm, file)
+    _check_known(names, known_columns(arm), file, arm)
     place = {name: i for i, name in enumerate(names)}
     joints, factors = _joint_columns(place, arm, file)
     position, factor = _position_columns(place, file)
-    return Layout(place, joints, factors, position, factor, _orientation_columns(place, file))
+    return Layout(place, joints, factors, position, factor, orientation_columns(place, file))
+
+
+def check_plain(
+    header: Sequence[str], file: str, required: Sequence[str], optional: Sequence[str] = ()
+) -> None:
+    """Refuse a header of plain columns.
+
+    Raises
+    ------
+    InputError
+        For an unknown, missing, doubled or nameless column.
+    """
+    names = [name.strip() for name in header]
+    _check_separator(names, file)
+    _check_known(names, (*required, *optional), file)
+    missing = [name for name in required if name not in names]
+    if missing:
+        _fail(f"column {', '.join(missing)} is missing", file)
 
 
 def _fail(message: str, file: str, column: str | None = None) -> NoReturn:
@@ -98,15 +116,17 @@ def _check_separator(names: list[str], file: str) -> None:
             )
 
 
-def _check_names(names: list[str], arm: SerialArm, file: str) -> None:
-    known = known_columns(arm)
+def _check_known(
+    names: list[str], known: Sequence[str], file: str, arm: SerialArm | None = None
+) -> None:
     for number, name in enumerate(names, start=1):
         if not name:
             _fail(f"column {number} has no name", file)
         if names.index(name) != number - 1:
             _fail("this column appears twice", file, name)
         if name not in known:
-            _fail(f"unknown column{_why_unknown(name, arm) or nearest(name, known)}", file, name)
+            why = "" if arm is None else _why_unknown(name, arm)
+            _fail(f"unknown column{why or nearest(name, known)}", file, name)
 
 
 def _why_unknown(name: str, arm: SerialArm) -> str:
@@ -156,7 +176,14 @@ def _position_columns(place: Mapping[str, int], file: str) -> tuple[tuple[str, .
     return POSITION[unit], LENGTH_UNITS[unit]
 
 
-def _orientation_columns(place: Mapping[str, int], file: str) -> tuple[str, ...] | None:
+def orientation_columns(place: Collection[str], file: str) -> tuple[str, ...] | None:
+    """The columns of one of ``ORIENTATIONS`` that a header has; None without any.
+
+    Raises
+    ------
+    InputError
+        When it has several, or one in part.
+    """
     begun = [names for names in ORIENTATIONS if any(name in place for name in names)]
     if not begun:
         return None

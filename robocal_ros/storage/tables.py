@@ -2,10 +2,8 @@
 
 import csv
 import io
-from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +14,8 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import DEFAULT_TARGET, Measurements
 from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits
-from robocal_ros.storage.files import quoted, read_text, write_text
+from robocal_ros.storage.cells import Cells, read_cells
+from robocal_ros.storage.files import quoted, write_text
 from robocal_ros.storage.table_columns import (
     EULER,
     QUATERNION,
@@ -29,24 +28,8 @@ Array = NDArray[np.float64]
 
 QUATERNION_TOLERANCE = 1e-3
 LARGEST_STAMP_S = 9_000_000_000
-LARGEST = 1e9  # in any unit: beyond it squares lose what is left of a measurement
 SMALLEST_SIGMA_MM = 1e-9
 DIGITS = ".12g"  # 1e-9 mm in a metre, and no trailing noise of binary fractions
-
-
-class _Table(NamedTuple):
-    """Cells of a file: its rows' numbers (the header is row 1) and its columns of text."""
-
-    file: str
-    layout: Layout
-    rows: list[int]
-    columns: list[tuple[str, ...]]
-
-    def column(self, name: str) -> tuple[str, ...]:
-        return self.columns[self.layout.place[name]]
-
-    def fail(self, message: str, index: int, column: str) -> NoReturn:
-        raise InputError(message, file=self.file, row=self.rows[index], column=column)
 
 
 def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
@@ -65,7 +48,7 @@ def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
     InputError
         With file, row and column, when anything in the file is not as docs/csv.md says.
     """
-    return _measurements(_read_cells(Path(path), arm), arm)
+    return _measurements(*_read(Path(path), arm), arm)
 
 
 def read_visits(path: str | Path, arm: SerialArm) -> Visits:
@@ -76,29 +59,28 @@ def read_visits(path: str | Path, arm: SerialArm) -> Visits:
     InputError
         As ``read_measurements``, and when the column ``pose`` is missing.
     """
-    table = _read_cells(Path(path), arm)
-    if "pose" not in table.layout.place:
+    table, layout = _read(Path(path), arm)
+    if "pose" not in layout.place:
         raise InputError(
             "column pose is missing: it names each measuring pose, the same name cold and warm",
             file=table.file,
             row=1,
         )
-    data = _measurements(table, arm)
-    cycle = _words(table, "cycle") or (ONLY_CYCLE,) * len(data)
-    return Visits(data, _words(table, "pose"), cycle)
+    data = _measurements(table, layout, arm)
+    cycle = table.words("cycle") or (ONLY_CYCLE,) * len(data)
+    return Visits(data, table.words("pose"), cycle)
 
 
-def _measurements(table: _Table, arm: SerialArm) -> Measurements:
-    layout = table.layout
-    numbers = _numbers(table)
+def _measurements(table: Cells, layout: Layout, arm: SerialArm) -> Measurements:
+    numbers = np.column_stack([table.numbers(name) for name in layout.numeric])
     n = arm.n
     rest = numbers[:, n + 3 :]
     return Measurements(
         q=numbers[:, :n] * layout.joint_factors,
         position=numbers[:, n : n + 3] * layout.position_factor,
-        target=_words(table, "target") or (DEFAULT_TARGET,) * len(numbers),
+        target=table.words("target") or (DEFAULT_TARGET,) * len(numbers),
         sample=_samples(table),
-        rotation=_rotations(table, rest),
+        rotation=None if layout.orientation is None else read_rotations(table, layout.orientation),
         sigma=_sigma(table, rest[:, -1]) if "sigma_mm" in layout.place else None,
         stamp_ns=_stamps(table) if "stamp_s" in layout.place else None,
     )
@@ -152,86 +134,19 @@ def _texts(values: Array) -> list[str]:
     return [format(value, DIGITS) for value in values.tolist()]
 
 
-def _read_cells(path: Path, arm: SerialArm) -> _Table:
-    file = str(path)
-    reader = csv.reader(io.StringIO(read_text(path, "table"), newline=""), strict=True)
-    rows, numbers = [], []
-    try:
-        header = next(reader)
-        layout = read_layout(header, arm, file)
-        for number, row in enumerate(reader, start=2):
-            if row:
-                rows.append(row)
-                numbers.append(number)
-    except csv.Error as error:
-        raise InputError(f"not a CSV table: {error}", file=file, row=reader.line_num) from error
-    if not rows:
-        raise InputError("the table has a header but no measurements", file=file)
-    width = len(header)
-    for number, row in zip(numbers, rows, strict=True):
-        if len(row) != width:
-            raise InputError(_ragged(row, width), file=file, row=number)
-    return _Table(file, layout, numbers, list(zip(*rows, strict=True)))
+def _read(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
+    found: list[Layout] = []
+    table = read_cells(path, lambda header, file: found.append(read_layout(header, arm, file)))
+    return table, found[0]
 
 
-def _ragged(row: list[str], width: int) -> str:
-    message = f"{len(row)} cells, but the header has {width} columns"
-    if len(row) > width:
-        message += "; is the decimal mark a comma? It must be a point"
-    return message
-
-
-def _numbers(table: _Table) -> Array:
-    """Numeric columns (m, k), all finite, in the order of ``layout.numeric``."""
-    columns = [_column(table, name) for name in table.layout.numeric]
-    numbers = np.array(columns).T
-    bad = np.argwhere(~np.isfinite(numbers))
-    if len(bad):
-        name = table.layout.numeric[bad[0, 1]]
-        text = table.column(name)[bad[0, 0]]
-        table.fail(f"{quoted(text)} is not a finite number", int(bad[0, 0]), name)
-    bad = np.argwhere(np.abs(numbers) > LARGEST)
-    if len(bad):
-        name = table.layout.numeric[bad[0, 1]]
-        text = table.column(name)[bad[0, 0]]
-        table.fail(f"{quoted(text)} is no measurement", int(bad[0, 0]), name)
-    return numbers
-
-
-def _column(table: _Table, name: str) -> list[float]:
-    cells = table.column(name)
-    try:
-        values = list(map(float, cells))
-    except ValueError:
-        _fail_at_text(table, name, float)
-    if "_" in "".join(cells):  # Python reads 1_000 as a thousand; a table must not mean that
-        index = next(i for i, cell in enumerate(cells) if "_" in cell)
-        table.fail(f"{quoted(cells[index])} is not a number", index, name)
-    return values
-
-
-def _fail_at_text(table: _Table, name: str, convert: Callable[[str], object]) -> NoReturn:
-    """Report the first cell that ``convert`` refuses."""
-    for index, cell in enumerate(table.column(name)):
-        try:
-            convert(cell.strip())
-        except (ValueError, InvalidOperation):
-            text = cell.strip()
-            if not text:
-                table.fail("the cell is empty", index, name)
-            comma = text.count(",") == 1 and text.replace(",", "").lstrip("+-").isdigit()
-            hint = "; the decimal mark must be a point" if comma else ""
-            table.fail(f"{quoted(text)} is not a number{hint}", index, name)
-    raise AssertionError(f"every cell of {name} is a number")
-
-
-def _stamps(table: _Table) -> NDArray[np.int64]:
+def _stamps(table: Cells) -> NDArray[np.int64]:
     """Nanoseconds, without the rounding that seconds since 1970 suffer in binary."""
     stamps = []
     try:
-        seconds = [Decimal(cell.strip()) for cell in table.column("stamp_s")]
+        seconds = [Decimal(cell.strip()) for cell in table.columns["stamp_s"]]
     except InvalidOperation:
-        _fail_at_text(table, "stamp_s", Decimal)
+        table.fail_at_text("stamp_s", Decimal)
     for index, value in enumerate(seconds):
         if not value.is_finite():
             table.fail(f"{quoted(value)} is not a finite number", index, "stamp_s")
@@ -243,17 +158,8 @@ def _stamps(table: _Table) -> NDArray[np.int64]:
     return np.array(stamps, dtype=np.int64)
 
 
-def _words(table: _Table, name: str) -> tuple[str, ...]:
-    if name not in table.layout.place:
-        return ()
-    words = tuple(cell.strip() for cell in table.column(name))
-    if "" in words:
-        table.fail("the cell is empty", words.index(""), name)
-    return words
-
-
-def _samples(table: _Table) -> tuple[str, ...]:
-    samples = _words(table, "sample") or tuple(map(str, table.rows))
+def _samples(table: Cells) -> tuple[str, ...]:
+    samples = table.words("sample") or tuple(map(str, table.rows))
     if len(set(samples)) != len(samples):
         first: dict[str, int] = {}
         for index, name in enumerate(samples):
@@ -263,7 +169,7 @@ def _samples(table: _Table) -> tuple[str, ...]:
     return samples
 
 
-def _sigma(table: _Table, sigma_mm: Array) -> Array:
+def _sigma(table: Cells, sigma_mm: Array) -> Array:
     bad = np.flatnonzero(sigma_mm < SMALLEST_SIGMA_MM)
     if len(bad):
         index = int(bad[0])
@@ -271,20 +177,25 @@ def _sigma(table: _Table, sigma_mm: Array) -> Array:
     return sigma_mm * 1e-3
 
 
-def _rotations(table: _Table, values: Array) -> Array | None:
-    kind = table.layout.orientation
-    if kind is None:
-        return None
+def read_rotations(table: Cells, kind: tuple[str, ...]) -> Array:
+    """Orientations (m, 3, 3) from columns of one of ``ORIENTATIONS``.
+
+    Raises
+    ------
+    InputError
+        When a quaternion is not of unit length.
+    """
+    values = np.column_stack([table.numbers(name) for name in kind])
     if kind == EULER:
         # intrinsic XYZ: turn about x, then about the new y, then about the new z
-        rotations = Rotation.from_euler("XYZ", values[:, :3], degrees=True)
+        rotations = Rotation.from_euler("XYZ", values, degrees=True)
     elif kind == ROTATION_VECTOR:
-        rotations = Rotation.from_rotvec(values[:, :3])
+        rotations = Rotation.from_rotvec(values)
     else:
-        length = np.linalg.norm(values[:, :4], axis=1)
+        length = np.linalg.norm(values, axis=1)
         bad = np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)
         if len(bad):
             index = int(bad[0])
             table.fail(f"the quaternion has length {length[index]:.6g}, not 1", index, "qw")
-        rotations = Rotation.from_quat(values[:, :4])
+        rotations = Rotation.from_quat(values)
     return np.asarray(rotations.as_matrix())

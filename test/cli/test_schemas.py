@@ -7,6 +7,7 @@ from campaign import ROBOT, measured, table
 from command import SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
 from recordings import plain_bag, recorded_bag, shift
+from tool_tables import tool_tables
 
 from robocal_ros.cli.main import COMMANDS
 
@@ -28,6 +29,7 @@ DRIFT = ["thermal", "identify", "--robot", ROBOT, "--sensor", "s.yaml", "--cold"
 SCREEN = ["thermal", "screen", *DRIFT[2:]]
 PLAN = ["thermal", "plan-poses", "--robot", ROBOT, "--sensor", "s.yaml"]
 PRIOR = ["thermal", "learn-prior", *DRIFT[2:]]
+CROSSED = ["tool", "crossed", "--radius-mm", "12", "--period-s", "2", "--start-deg", "45"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -108,6 +110,24 @@ CASES = {
         [*PLAN, "--field-mm", "500,400,20000,19900,20100"],
         (3, "LIMIT_EXCEEDED"),
     ),
+    "tool beams": (
+        "tool.beams.json",
+        ["tool", "beams", "--data", "beams.csv"],
+        ["tool", "beams", "--data", "some_beams.csv"],
+        (2, "BAD_INPUT"),
+    ),
+    "tool crossed": (
+        "tool.crossed.json",
+        [*CROSSED, "--events", "edges.csv"],
+        [*CROSSED, "--events", "lost_edge.csv"],
+        (3, "BEAM_EDGES_WRONG"),
+    ),
+    "tool points": (
+        "tool.points.json",
+        ["tool", "points", "--data", "touches.csv"],
+        ["tool", "points", "--data", "few_touches.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -126,6 +146,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plain_bag(folder / "plain.mcap", visits)
     recorded_bag(folder / "live.mcap", folder / "state", visits)
     fixed_tables(folder)
+    tool_tables(folder)
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)

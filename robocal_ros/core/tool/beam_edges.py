@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RankDeficientError, RobocalError
 
 Array = NDArray[np.float64]
@@ -23,6 +24,8 @@ MOST_BOUNCES = 5  # edges of one burst; more is no contact that settles
 
 class BeamError(RobocalError):
     """Edges that no single passage of a tool explains: what is missing or too many."""
+
+    code = Code.BEAM_EDGES_WRONG
 
 
 @dataclass(frozen=True, slots=True)
