@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError
+from robocal_ros.core.errors import ConflictError, LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.thermal.cycle_planning import POSES, plan_cycle
@@ -23,6 +23,7 @@ from robocal_ros.sessions.setting_up import SENSOR
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 Array = NDArray[np.float64]
+MOST_POSES = 20  # a plan holds the node up for two seconds then
 AddService = Callable[[type, str, Callable[[Any, Any], Any]], None]
 Ask = Callable[[Command], Awaitable[Outcome]]
 
@@ -78,6 +79,8 @@ class SetUpServices:
         if sensor is None:
             raise ConflictError("the sensor is not placed: call calibrate_sensor first")
         T_sensor_base, sphere = placed_of(sensor)
+        if request.count > MOST_POSES:
+            raise LimitError(f"{request.count} poses: at most {MOST_POSES} are planned at a time")
         found = plan_cycle(
             self._nominal,
             T_sensor_base,

@@ -158,7 +158,7 @@ class ThermalNode(HouseNode):
     def _prior(self) -> Array:
         if self._session is None:
             raise NotActiveError("no session: activate the node")
-        return self._session.expected.process.covariance
+        return self._session.expected_drift()
 
     def _force(self) -> None:
         self._step(force=True)

@@ -1,15 +1,12 @@
 """How accurate the robot is believed to be now, for the line."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.drift_following import DriftFollower, Following
 from robocal_ros.sessions.in_force import InForce
+from robocal_ros.sessions.temperatures import MotorTemperatures
 from robocal_ros.sessions.thermal_config import ThermalConfig
 
 DUE_AHEAD_S = 300.0  # a measurement is due so long before the bound reaches the tolerance
@@ -35,10 +32,10 @@ def accuracy_of(
     following: Following,
     current: InForce,
     config: ThermalConfig,
-    temperatures: Sequence[tuple[int, NDArray[np.float64]]],
+    temperatures: MotorTemperatures,
     stamp_ns: int,
 ) -> Accuracy:
-    """Judge the model in force at a stamp, by the motors' temperatures (n,) up to then."""
+    """Judge the model in force at a stamp, with the motors' temperatures."""
     if current.fault:
         return Accuracy(AccuracyLevel.FAULT, current.fault)
     try:
@@ -46,7 +43,7 @@ def accuracy_of(
         if follower is None:
             words = "no cold reference: how far the robot has drifted is not known; capture one"
             return Accuracy(AccuracyLevel.EXPIRED, words)
-        with follower.looking_ahead(temperatures):
+        with follower.looking_ahead(temperatures.between(follower.read_ns, stamp_ns)):
             return _judged(follower, current, config, stamp_ns)
     except RobocalError as error:
         return Accuracy(AccuracyLevel.FAULT, str(error))

@@ -18,10 +18,12 @@ class CycleBook:
     ----------
     id : its name; empty while none is open.
     begun_ns : stamp at which it began.
+    postponed_ns : stamp at which it could not be kept; its time-out begins anew there.
     """
 
     id: str = ""
     begun_ns: int = 0
+    postponed_ns: int = 0
 
     def begin(self, cycle_id: str, stamp_ns: int, history: History) -> str:
         """Open a cycle and say so; one that is open already goes on, another one is broken off.

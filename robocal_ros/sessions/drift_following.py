@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL
+from robocal_ros.core.proposals import THERMAL, Entry
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.accuracy import AccuracyForecast
 from robocal_ros.core.thermal.heat import Heat
@@ -25,14 +25,14 @@ from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.core.thermal.steps import FixedSphere
 from robocal_ros.core.thermal.tracked_cycle import TrackedCycle, track_cycle
-from robocal_ros.sessions.follower_state import HEAT, STATE, FollowerState
+from robocal_ros.sessions.follower_state import HEAT, STATE, TIMES, FollowerState
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce
 
 Array = NDArray[np.float64]
 
 CHECKPOINT_EVERY = 32  # cycles between two kept states: a restart takes at most so many again
-LOOK_BACK = 500
+LOOK_BACK = 100
 EXPECTED = "expected"  # of a reference's model: the learned process, None for the default
 
 
@@ -50,8 +50,10 @@ class DriftFollower:
         self._tracker = expected.tracker(reference.spots)
         self._reference = reference
         self._forecast: tuple[SerialArm, AccuracyForecast] | None = None
+        cold_ns = reference.data.middle_ns
+        self.read_ns = cold_ns
         self.state = FollowerState(
-            self._tracker.state, self._tracker.heat, reference.data.middle_ns, 0
+            self._tracker.state, self._tracker.heat, cold_ns, 0, anchor_ns=cold_ns
         )
 
     def take(
@@ -64,18 +66,41 @@ class DriftFollower:
         RobocalError
             When it cannot answer; then nothing has changed.
         """
-        stamp_ns = cycle.middle_ns
-        time_s = self._time_s(stamp_ns)
-        found = track_cycle(self._tracker, cycle, time_s, in_force=in_force, fixed=fixed)
+        stamp_ns, state = cycle.middle_ns, self.state
+        found = track_cycle(
+            self._tracker,
+            cycle,
+            self.time_s(stamp_ns),
+            in_force=in_force,
+            fixed=fixed,
+            doubt_s=state.moved_s,
+        )
         refused = found.judged.verdict.code is Code.SENSOR_OR_ROBOT_MOVED
+        self._count(stamp_ns, found.judged.verdict.reason if refused else "")
+        return found
+
+    def _count(self, stamp_ns: int, moved: str) -> None:
+        """Go on after a cycle that was taken, or refused because something moved."""
+        state, time_s = self.state, self.time_s(stamp_ns)
         self.state = FollowerState(
             tracker=self._tracker.state,
             heat=self._tracker.heat,
-            stamp_ns=self.state.stamp_ns if refused else stamp_ns,
-            cycles=self.state.cycles + 1,
-            moved=found.judged.verdict.reason if refused else "",
+            stamp_ns=state.stamp_ns if moved else stamp_ns,
+            cycles=state.cycles + 1,
+            anchor_ns=state.anchor_ns if moved else stamp_ns,
+            moved=moved,
+            moved_s=(time_s if state.moved_s is None else state.moved_s) if moved else None,
         )
-        return found
+
+    def clock_jumped(self, stamp_ns: int) -> None:
+        """Go on at a stamp of another clock; how long it was since the last cycle is not known."""
+        unknown_ns = round(self._tracker.process.steady_s * 1e9)
+        self.state = replace(self.state, anchor_ns=stamp_ns - unknown_ns)
+        self.read_ns = stamp_ns - unknown_ns
+
+    def expected_drift(self) -> Array:
+        """Covariance (k, k), SI, of the drift that a shift may bring."""
+        return self._tracker.expected_drift()
 
     def read(self, temperatures: Sequence[tuple[int, Array]]) -> None:
         """Take motor temperatures (n,), degrees Celsius, that are newer than the last ones."""
@@ -83,28 +108,30 @@ class DriftFollower:
         if tracker.heat is None or cold is None:
             return
         for stamp_ns, temperature in temperatures:
-            time_s = self.state.tracker.time_s + 1e-9 * (stamp_ns - self.state.stamp_ns)
+            time_s = self._anchored_s(stamp_ns)
             if time_s > tracker.heat.time_s:
                 tracker.read_temperatures(temperature - cold, time_s)
+                self.read_ns = stamp_ns
 
     @contextmanager
     def looking_ahead(self, temperatures: Sequence[tuple[int, Array]]) -> Iterator[None]:
         """Within, the follower knows these temperatures too; then it forgets them again."""
-        heat = self._tracker.heat
+        heat, read_ns = self._tracker.heat, self.read_ns
         try:
             self.read(temperatures)
             yield
         finally:
-            self._tracker.heat = heat
+            self._tracker.heat, self.read_ns = heat, read_ns
 
     @contextmanager
     def attempt(self) -> Iterator[None]:
         """Undo what is taken within when it cannot be kept."""
-        before = self.state
+        before, read_ns = self.state, self.read_ns
         try:
             yield
         except BaseException:
             self.go_on_from(before)
+            self.read_ns = read_ns
             raise
 
     def go_on_from(self, state: FollowerState) -> None:
@@ -116,34 +143,46 @@ class DriftFollower:
 
         ``temperature`` (n,) of the motors, degrees Celsius, for those who learn from it.
         """
-        state, kept = self.state, {}
+        state = self.state
+        moved_s = np.nan if state.moved_s is None else state.moved_s
+        kept = {TIMES: np.array([state.tracker.time_s, moved_s])}
         if temperature is not None:
             kept["motor_temperature"] = temperature
         if state.heat is not None:
             kept[HEAT] = state.heat.array()
         if state.cycles % CHECKPOINT_EVERY == 0:
-            kept |= {**state.arrays(), "tracker_time_s": np.array(state.tracker.time_s)}
+            kept |= state.arrays()
         return kept
 
-    def catch_up(self, history: History) -> None:
+    def catch_up(self, history: History, reference_id: int) -> None:
         """Take the kept cycles of this reference again, from the last kept state on."""
         waiting = []
-        for entry in history.list(LOOK_BACK):
-            if entry.kind != THERMAL:
-                continue
-            if history.model(entry.id).get("reference_stamp_ns") != self._reference.data.middle_ns:
-                continue
+        for entry in self._kept(history, reference_id):
             arrays = history.inputs(entry.id)
-            if "q" not in arrays:  # brought into force by a replay, not measured here
+            if TIMES not in arrays:  # brought into force by a replay, not measured here
                 continue
             moved = entry.reason if entry.code is Code.SENSOR_OR_ROBOT_MOVED else ""
             if STATE[0] in arrays:
-                time_s = float(arrays["tracker_time_s"])
-                self.go_on_from(FollowerState.of_arrays(arrays, time_s, moved))
+                time_s, moved_s = arrays[TIMES].tolist()
+                times = time_s, None if np.isnan(moved_s) else moved_s
+                self.go_on_from(FollowerState.of_arrays(arrays, times, moved))
                 break
             waiting.append((arrays, moved))
         for arrays, moved in reversed(waiting):
             self._take_again(arrays, moved)
+
+    def _kept(self, history: History, reference_id: int) -> Iterator[Entry]:
+        """Cycles of this reference, newest first; all of them came after it."""
+        cold_ns, limit, seen = self._reference.data.middle_ns, LOOK_BACK, 0
+        while len(entries := history.list(limit)) > seen:
+            for entry in entries[seen:]:
+                if entry.id < reference_id:
+                    return
+                if entry.kind == THERMAL:
+                    model = history.model(entry.id)
+                    if model.get("reference_stamp_ns") == cold_ns:
+                        yield entry
+            seen, limit = len(entries), 4 * limit
 
     def forecast(self, in_force: SerialArm) -> AccuracyForecast:
         """What to expect of a model in force."""
@@ -152,31 +191,28 @@ class DriftFollower:
         return self._forecast[1]
 
     def time_s(self, stamp_ns: int) -> float:
-        """Time of the tracker's at a stamp; not before its last cycle."""
-        ahead_ns = max(stamp_ns - self.state.stamp_ns, 0)
-        return self.state.tracker.time_s + ahead_ns * 1e-9
+        """Time of the tracker's at a stamp; one before its last cycle is of another clock."""
+        time_s, last_s = self._anchored_s(stamp_ns), self.state.tracker.time_s
+        return time_s if time_s >= last_s else last_s + self._tracker.process.steady_s
 
-    def _time_s(self, stamp_ns: int) -> float:
-        """The same for a cycle; how long ago the last one was is not known after a jump back."""
-        step_ns = stamp_ns - self.state.stamp_ns
-        step_s = step_ns * 1e-9 if step_ns >= 0 else self._tracker.process.steady_s
-        return self.state.tracker.time_s + step_s
+    def _anchored_s(self, stamp_ns: int) -> float:
+        return self.state.tracker.time_s + 1e-9 * (stamp_ns - self.state.anchor_ns)
 
     def _take_again(self, arrays: Mapping[str, NDArray[Any]], moved: str) -> None:
-        state, tracker, cycle = self.state, self._tracker, Measurements.of_arrays(arrays)
-        stamp_ns = cycle.middle_ns
+        tracker, cycle = self._tracker, Measurements.of_arrays(arrays)
         if HEAT in arrays:
             tracker.heat = Heat.of_array(arrays[HEAT])
+        time_s, moved_s = arrays[TIMES].tolist()
         if not moved:
-            averaged = tracker.spots.average(cycle, tracker.sigma_m)
-            tracker.take(averaged, self._time_s(stamp_ns))
-        self.state = FollowerState(
-            tracker=tracker.state,
-            heat=tracker.heat,
-            stamp_ns=state.stamp_ns if moved else stamp_ns,
-            cycles=state.cycles + 1,
-            moved=moved,
-        )
+            tracker.take(tracker.spots.average(cycle, tracker.sigma_m), time_s)
+        self._count(cycle.middle_ns, moved)
+        if moved:
+            self.state = replace(self.state, moved_s=moved_s)
+
+
+def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
+    """What to expect of a robot of which nothing is known; ``sigma_m`` of one visit."""
+    return LearnedProcess(DriftProcess(drift_prior(nominal)), sigma_m)
 
 
 class Following:
@@ -195,7 +231,7 @@ class Following:
         kept = (self._current.reference_model or {}).get(EXPECTED)
         if kept is not None:
             return process_of(kept)
-        return LearnedProcess(DriftProcess(drift_prior(self._current.nominal)), self._sigma_m)
+        return default_process(self._current.nominal, self._sigma_m)
 
     @property
     def follower(self) -> DriftFollower | None:
@@ -211,6 +247,6 @@ class Following:
             return None
         if self._followed is None or self._followed[0] != current.reference_id:
             follower = DriftFollower(current.reference, self.expected)
-            follower.catch_up(self._history)
+            follower.catch_up(self._history, current.reference_id or 0)
             self._followed = (current.reference_id, follower)
         return self._followed[1]

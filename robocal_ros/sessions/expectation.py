@@ -1,6 +1,7 @@
 """How a robot is expected to drift, as the shifts in its own history teach."""
 
 from collections import defaultdict
+from contextlib import suppress
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
 
 LEARN_FROM = 2000
+MOST_SHIFTS = 5  # the newest; learning takes half a second each
 FEWEST_WITH_TEMPERATURES = 2  # shifts, so that what one motor does is not what all of them do
 WRONG = (State.REJECTED, State.ROLLED_BACK)  # somebody did not believe it
 
@@ -31,11 +33,12 @@ def expected_drift(nominal: SerialArm, history: History) -> tuple[LearnedProcess
     """
     shifts = earlier_shifts(nominal, history)
     warm = [shift for shift in shifts if shift.temperature is not None]
-    try:
-        if len(warm) >= FEWEST_WITH_TEMPERATURES:
+    if len(warm) >= FEWEST_WITH_TEMPERATURES:
+        with suppress(RobocalError, np.linalg.LinAlgError):  # then without temperatures
             return learn_gains(warm), f"learned with temperatures from {len(warm)} shifts"
+    try:
         return learn_process(shifts), f"learned from {len(shifts)} shifts"
-    except RobocalError as error:
+    except (RobocalError, np.linalg.LinAlgError) as error:
         return None, f"default, because {error}"
 
 
@@ -47,9 +50,9 @@ def earlier_shifts(nominal: SerialArm, history: History) -> list[EarlierShift]:
         sound = entry.state not in WRONG and entry.code is not Code.SENSOR_OR_ROBOT_MOVED
         if entry.kind == THERMAL and sound:
             cycles[int(history.model(entry.id).get("reference_stamp_ns", 0))].append(entry)
-    shifts = []
+    shifts: list[EarlierShift] = []
     for entry in entries:
-        if entry.kind != REFERENCE:
+        if entry.kind != REFERENCE or len(shifts) == MOST_SHIFTS:
             continue
         reference = reference_of(history.model(entry.id), nominal)
         cold_ns = reference.data.middle_ns

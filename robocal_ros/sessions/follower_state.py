@@ -15,6 +15,7 @@ from robocal_ros.core.thermal.tracking import TrackerState
 Array = NDArray[np.float64]
 
 HEAT = "tracker_heat"
+TIMES = "tracker_times"  # of a kept cycle: the tracker's, and that of the first refused one
 STATE = ("tracker_mean", "tracker_covariance", "tracker_clock")
 
 
@@ -26,16 +27,20 @@ class FollowerState:
     ----------
     tracker : state of the tracker; its time counts from the cold visit.
     heat : motor temperatures as last read, where they are in use.
+    anchor_ns : stamp that the tracker's time is at; that of the last cycle until the clock jumps.
     stamp_ns : of the last cycle that was taken, of the cold visit before the first.
     cycles : kept since the cold visit, refused ones among them.
-    moved : why the last cycle was refused; empty where it was not.
+    moved, moved_s : why the last cycle was refused, empty where it was not; and the tracker's
+        time of the first of those that were refused in a row.
     """
 
     tracker: TrackerState
     heat: Heat | None
     stamp_ns: int
     cycles: int
+    anchor_ns: int
     moved: str = ""
+    moved_s: float | None = None
 
     def document(self) -> dict[str, Any]:
         """In plain values, bit for bit."""
@@ -46,6 +51,7 @@ class FollowerState:
             "time_s": self.tracker.time_s,
             "clock": clock.tolist(),
             "moved": self.moved,
+            "moved_s": self.moved_s,
             "heat": None if self.heat is None else _text(self.heat.array()),
         }
 
@@ -66,7 +72,8 @@ class FollowerState:
             }
             if document["heat"] is not None:
                 arrays[HEAT] = _array(document["heat"])
-            return cls.of_arrays(arrays, float(document["time_s"]), str(document["moved"]))
+            times = float(document["time_s"]), document["moved_s"]
+            return cls.of_arrays(arrays, times, str(document["moved"]))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"the recorded state of the tracker cannot be read: {error}"
@@ -75,20 +82,22 @@ class FollowerState:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """In arrays; the covariance is symmetric to the last bit, one half of it is kept."""
         P = self.tracker.covariance
-        clock = np.array([self.stamp_ns, self.cycles], dtype=np.int64)
+        clock = np.array([self.stamp_ns, self.cycles, self.anchor_ns], dtype=np.int64)
         return dict(zip(STATE, (self.tracker.mean, P[np.triu_indices(len(P))], clock), strict=True))
 
     @classmethod
     def of_arrays(
-        cls, arrays: Mapping[str, NDArray[Any]], time_s: float, moved: str
+        cls, arrays: Mapping[str, NDArray[Any]], times: tuple[float, float | None], moved: str
     ) -> "FollowerState":
-        """Read it back."""
+        """Read it back; ``times`` are the tracker's and `moved_s`."""
         mean, half, clock = (arrays[name] for name in STATE)
         P = np.zeros((len(mean),) * 2)
         rows, columns = np.triu_indices(len(mean))
         P[rows, columns] = P[columns, rows] = half
         heat = Heat.of_array(arrays[HEAT]) if HEAT in arrays else None
-        return cls(TrackerState(time_s, mean, P), heat, int(clock[0]), int(clock[1]), moved)
+        tracker = TrackerState(times[0], mean, P)
+        stamp_ns, cycles, anchor_ns = (int(value) for value in clock)
+        return cls(tracker, heat, stamp_ns, cycles, anchor_ns, moved, times[1])
 
 
 def _text(array: NDArray[Any]) -> str:

@@ -266,8 +266,8 @@ class ObservationDesk:
         return max((o.stamp_ns for o in self.unused(self.from_ns)), default=0)
 
     def unused(self, from_ns: int) -> list[Observation]:
-        """Observations from a stamp on that no command has used."""
-        return [o for o in self._observed if o.stamp_ns >= from_ns]
+        """Observations of targets on the flange, from a stamp on, that no command has used."""
+        return [o for o in self._observed if o.stamp_ns >= from_ns and o.topic != FIXED]
 
     def last_run_ns(self, pause_ns: int) -> int:
         """Stamp from which the unused observations follow each other without so long a pause."""

@@ -17,7 +17,7 @@ from robocal_ros.core.thermal.sensor_calibration import (
     calibrate_sensor,
     sensor_verdict,
 )
-from robocal_ros.sessions.drift_following import EXPECTED
+from robocal_ros.sessions.drift_following import EXPECTED, default_process
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.expectation import expected_drift
 from robocal_ros.sessions.history import History
@@ -79,13 +79,14 @@ class SetUp:
         self._keeper.accept(chosen, command, "captured", wall_ns)
         return Outcome(command, Code.ACCEPT, message, calibration_id=chosen, samples=len(data))
 
-    def _expected(self, command: Command) -> tuple[Command, dict[str, Any] | None, str]:
+    def _expected(self, command: Command) -> tuple[Command, dict[str, Any], str]:
         """The drift to expect from now on; the command carries it for replay."""
+        default = default_process(self._nominal, self._config.sigma_m)
         if self._config.prior == "default":
-            return command, None, ""
+            return command, process_document(default), ""
         if EXPECTED not in command.arguments:
             found, words = expected_drift(self._nominal, self._history)
-            kept = None if found is None else process_document(found)
+            kept = process_document(found or default)
             arguments = {**command.arguments, EXPECTED: kept, "expected_from": words}
             command = replace(command, arguments=arguments)
         told = f"; expected drift: {command.arguments['expected_from']}"

@@ -1,8 +1,5 @@
 """Motor temperatures as they come, one joint at a time, put together."""
 
-from bisect import bisect_right, insort
-from operator import attrgetter
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,12 +9,13 @@ from robocal_ros.core.samples import TemperatureSample
 Array = NDArray[np.float64]
 
 TEMPERATURES = "motor_temperatures"
-EVERY_NS = 10_000_000_000  # of readings closer together the last one counts
-MOST_KEPT = 20_000  # readings: more than two days
+EVERY_NS = 10_000_000_000  # of a joint's samples within ten seconds the first one counts
+SILENT_NS = 900_000_000_000  # a temperature says nothing any more after a quarter of an hour
+MOST_KEPT = 20_000  # of those ten seconds: more than two days
 
 
 class MotorTemperatures:
-    """All joints' temperatures at one stamp after the other, whatever order they arrive in.
+    """All joints' temperatures, whatever order they arrive in.
 
     Attributes
     ----------
@@ -26,9 +24,7 @@ class MotorTemperatures:
 
     def __init__(self, names: tuple[str, ...]) -> None:
         self._place = {name: i for i, name in enumerate(names)}
-        self._samples: list[TemperatureSample] = []
-        self._readings: list[tuple[int, Array]] = []
-        self._latest = np.full(len(names), np.nan)
+        self._kept: dict[int, dict[int, TemperatureSample]] = {}
         self.newest_ns: int | None = None
 
     def add(self, sample: TemperatureSample) -> None:
@@ -44,34 +40,34 @@ class MotorTemperatures:
                 f"temperature of '{sample.joint}': frame_id must be a joint's name, one of "
                 f"{', '.join(self._place)}"
             )
-        late = self.newest_ns is not None and sample.stamp_ns < self.newest_ns
-        insort(self._samples, sample, key=attrgetter("stamp_ns"))
+        joint, ten = self._place[sample.joint], sample.stamp_ns // EVERY_NS
+        first = self._kept.setdefault(ten, {}).setdefault(joint, sample)
+        if sample.stamp_ns < first.stamp_ns:
+            self._kept[ten][joint] = sample
         self.newest_ns = max(sample.stamp_ns, self.newest_ns or sample.stamp_ns)
-        if late:
-            self._put_together()
-        else:
-            self._follow(sample)
-        if len(self._readings) > MOST_KEPT:
-            del self._readings[: MOST_KEPT // 2]
-            first = self._readings[0][0]
-            del self._samples[: bisect_right(self._samples, first, key=attrgetter("stamp_ns"))]
+        if len(self._kept) > MOST_KEPT:
+            for old in sorted(self._kept)[: MOST_KEPT // 2]:
+                del self._kept[old]
 
-    def until(self, stamp_ns: int) -> list[tuple[int, Array]]:
-        """Stamps and temperatures (n,), degrees Celsius, of all joints up to a stamp."""
-        end = bisect_right(self._readings, stamp_ns, key=lambda reading: reading[0])
-        return self._readings[:end]
+    def between(self, after_ns: int, until_ns: int) -> list[tuple[int, Array]]:
+        """Stamps and temperatures (n,), degrees Celsius, after one stamp and up to another.
 
-    def _put_together(self) -> None:
-        self._readings, self._latest = [], np.full(len(self._place), np.nan)
-        for sample in self._samples:
-            self._follow(sample)
+        None where a joint has been silent for a quarter of an hour.
+        """
+        stamp = np.full(len(self._place), -SILENT_NS, dtype=np.int64)
+        celsius = np.full(len(self._place), np.nan)
+        first, last = (after_ns - SILENT_NS) // EVERY_NS, until_ns // EVERY_NS
+        found = []
+        for ten in sorted(t for t in self._kept if first <= t <= last):
+            known = {j: s for j, s in self._kept[ten].items() if s.stamp_ns <= until_ns}
+            for joint, sample in known.items():
+                stamp[joint], celsius[joint] = sample.stamp_ns, sample.celsius
+            now_ns = max((s.stamp_ns for s in known.values()), default=after_ns)
+            if now_ns > after_ns and now_ns - int(stamp.min()) < SILENT_NS:
+                found.append((now_ns, celsius.copy()))
+        return found
 
-    def _follow(self, sample: TemperatureSample) -> None:
-        self._latest[self._place[sample.joint]] = sample.celsius
-        if np.any(np.isnan(self._latest)):
-            return
-        reading = sample.stamp_ns, self._latest.copy()
-        if self._readings and self._readings[-1][0] // EVERY_NS == sample.stamp_ns // EVERY_NS:
-            self._readings[-1] = reading
-        else:
-            self._readings.append(reading)
+    def at(self, stamp_ns: int) -> Array | None:
+        """Temperatures (n,) at a stamp; None where they are not known."""
+        found = self.between(stamp_ns - SILENT_NS, stamp_ns)
+        return found[-1][1] if found else None

@@ -1,6 +1,7 @@
 """The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StorageError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
 from robocal_ros.core.samples import (
@@ -18,10 +19,10 @@ from robocal_ros.core.samples import (
     PoseSample,
     TemperatureSample,
 )
-from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.sessions import events
 from robocal_ros.sessions.accuracy import Accuracy, accuracy_of
+from robocal_ros.sessions.bounds import Bounds
 from robocal_ros.sessions.cycles import TIME_OUT, CycleBook, ended
 from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.drift_following import DriftFollower, Following
@@ -29,7 +30,7 @@ from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import InForce, outside_decision
 from robocal_ros.sessions.keeping import Keeper
-from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk
+from robocal_ros.sessions.observations import JOINTS, ObservationDesk
 from robocal_ros.sessions.proposing import Proposer
 from robocal_ros.sessions.setting_up import SetUp
 from robocal_ros.sessions.temperatures import TEMPERATURES, MotorTemperatures
@@ -40,7 +41,6 @@ __all__ = ["ThermalConfig", "ThermalSession"]
 
 Array = NDArray[np.float64]
 
-SAME_CLOCK_NS = 1_000_000_000
 _NO_REFERENCE = "no cold reference: capture it before the first cycle"
 
 
@@ -75,6 +75,7 @@ class ThermalSession:
         self.temperatures = MotorTemperatures(nominal.joint_names)
         self.cycle = CycleBook()
         self.windows = Windows(self.desk, self.cycle, self._current, config)
+        self._bounds = Bounds(self.desk, self.cycle, self.windows, config)
         self._following = Following(history, self._current, config.sigma_m)
         keeper = Keeper(nominal, history, software, self._current)
         self._set_up = SetUp(nominal, history, config, self._current, keeper)
@@ -110,10 +111,11 @@ class ThermalSession:
         """The cold reference as it is kept, or None."""
         return self._current.reference_model
 
-    @property
-    def expected(self) -> LearnedProcess:
-        """How the robot is expected to drift: as known when the reference was captured."""
-        return self._following.expected
+    def expected_drift(self) -> Array:
+        """Covariance (k, k), SI, of the drift that a shift may bring."""
+        if self.follower is not None:
+            return self.follower.expected_drift()
+        return self._following.expected.process.covariance
 
     def add(self, sample: JointSample | PointSample | PoseSample | TemperatureSample) -> None:
         """Take a sample."""
@@ -121,12 +123,20 @@ class ThermalSession:
             jumps = self.desk.jumps
             self.desk.add_joints(sample)
             if self.desk.jumps > jumps:
-                self.temperatures = MotorTemperatures(self.nominal.joint_names)
+                self._clock_jumped(sample.stamp_ns)
         elif isinstance(sample, TemperatureSample):
             self.temperatures.add(sample)
             self.desk.newest_ns[TEMPERATURES] = self.temperatures.newest_ns or 0
         else:
             self.desk.add_measurement(sample)
+
+    def _clock_jumped(self, stamp_ns: int) -> None:
+        """Nothing that an earlier clock stamped can be compared any more."""
+        self.temperatures = MotorTemperatures(self.nominal.joint_names)
+        self.cycle.begun_ns = stamp_ns
+        with suppress(RobocalError):  # said by `accuracy`
+            if self.follower is not None:
+                self.follower.clock_jumped(stamp_ns)
 
     def submit(self, command: Command, clock_ns: int | None = None) -> None:
         """Queue a command; ``advance`` carries it out when its samples are complete.
@@ -134,11 +144,7 @@ class ThermalSession:
         A command without a stamp gets ``clock_ns`` where that is on the samples' clock (within
         a second after the newest of them), else the newest stamp known.
         """
-        if command.stamp_ns is None:
-            newest = self.desk.clock_ns
-            near = clock_ns is not None and newest <= clock_ns <= newest + SAME_CLOCK_NS
-            command = replace(command, stamp_ns=clock_ns if near else newest)
-        self._queue.append(command)
+        self._queue.append(self._bounds.stamped(command, clock_ns))
 
     @property
     def waiting(self) -> int:
@@ -158,45 +164,17 @@ class ThermalSession:
 
     def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
         """Carry out one command, as ``advance``: what was decided outside before it, and it."""
-        if not self._queue or not (force or self._ready(self._queue[0])):
+        if not self._queue or not (force or self._bounds.ready(self._queue[0])):
             return []
-        command = self._named(self._queue.pop(0))
+        command = self._bounds.named(self._queue.pop(0))
         outside = self.poll()
         if command.marks is None:
-            command = self._marked(command)
+            command = self._bounds.marked(command)
         outcome = self._carry_out(command, wall_ns)
         outside += [
             outside_decision(decision, self.desk.marks) for decision in self._current.look(wall_ns)
         ]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
-
-    def _named(self, command: Command) -> Command:
-        """Name a cycle: as the open one, else by its time."""
-        begins = command.name == events.BEGIN_CYCLE
-        if command.arguments.get("cycle_id") or not (begins or command.name in events.CYCLE):
-            return command
-        by_time = str(np.datetime64((command.stamp_ns or 0) // 1_000_000, "ms"))
-        name = by_time if begins else self.cycle.id or by_time
-        return replace(command, arguments={**command.arguments, "cycle_id": name})
-
-    def _marked(self, command: Command) -> Command:
-        """Return the command with the bounds of its samples, for the record."""
-        marks, arguments = self.desk.marks, dict(command.arguments)
-        if command.name in events.MEASURED:
-            arguments.setdefault("from_ns", self.windows.from_ns(command))
-        return replace(command, marks=marks, arguments=arguments)
-
-    def _ready(self, command: Command) -> bool:
-        newest = self.desk.newest_ns
-        if command.marks is not None:
-            marks = dict(command.marks)
-            jumps = marks.pop(JUMPS, 0)
-            reached = all(newest.get(topic, -1) >= stamp for topic, stamp in marks.items())
-            return self.desk.jumps > jumps or (self.desk.jumps == jumps and reached)
-        if command.name not in events.MEASURED:
-            return True
-        wanted = (command.stamp_ns or 0) + int(self.config.lateness_s * 1e9)
-        return newest.get(JOINTS, -1) >= wanted
 
     def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
         handlers: dict[str, Callable[[Command, int], Outcome]] = {
@@ -223,7 +201,7 @@ class ThermalSession:
 
     def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
         data, fixed = self.windows.of(command)
-        reference = Beside(fixed, self._readings(command, data))
+        reference = self._beside(command, data, fixed)
         outcome = self._set_up.capture(command, data, reference, wall_ns)
         self._close_cycle(command)
         return outcome
@@ -231,15 +209,19 @@ class ThermalSession:
     def _identify(self, command: Command, wall_ns: int) -> Outcome:
         method = self._proposer.method(command)
         data, fixed = self.windows.of(command)
-        beside = Beside(fixed, self._readings(command, data))
+        beside = self._beside(command, data, fixed)
         outcome = self._proposer.identify(command, data, beside, method, wall_ns)
         self._close_cycle(command)
         return outcome
 
-    def _readings(self, command: Command, data: Measurements) -> list[tuple[int, Array]]:
-        """Motor temperatures up to the middle of what was measured."""
+    def _beside(self, command: Command, data: Measurements, fixed: Array) -> Beside:
+        """With the motor temperatures up to the middle of what was measured."""
         newest = (command.marks or {}).get(TEMPERATURES, -1)
-        return self.temperatures.until(min(data.middle_ns, newest))
+        until_ns = min(data.middle_ns, newest)
+        follower = self.follower
+        after_ns = 0 if follower is None else follower.read_ns
+        readings = self.temperatures.between(after_ns, until_ns)
+        return Beside(fixed, readings, self.temperatures.at(until_ns))
 
     def _close_cycle(self, command: Command) -> None:
         self.cycle.close()
@@ -268,7 +250,10 @@ class ThermalSession:
             raise ConflictError(_NO_REFERENCE)
         try:
             return self._identify(command, wall_ns)
-        except RobocalError:
+        except StorageError:
+            self.cycle.postponed_ns = self.desk.newest_ns.get(JOINTS, 0)
+            raise
+        except Exception:
             if command.arguments.get("by") == TIME_OUT:
                 self._close_cycle(command)
             raise
@@ -288,8 +273,7 @@ class ThermalSession:
 
     def accuracy(self, stamp_ns: int) -> Accuracy:
         """How far the tool may be off at a stamp with the model in force."""
-        readings = self.temperatures.until(stamp_ns)
-        return accuracy_of(self._following, self._current, self.config, readings, stamp_ns)
+        return accuracy_of(self._following, self._current, self.config, self.temperatures, stamp_ns)
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""

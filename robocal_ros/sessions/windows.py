@@ -26,16 +26,13 @@ class Beside:
     """What was measured beside the targets.
 
     ``fixed`` (n, 3): centres of a sphere fixed in the cell, m; ``temperatures``: stamps and
-    temperatures (n,) of all motors up to then, degrees Celsius.
+    temperatures (n,) of all motors since the last cycle, degrees Celsius; ``temperature`` (n,):
+    those of that time, None where they are not known.
     """
 
     fixed: Array
     temperatures: Sequence[tuple[int, Array]]
-
-    @property
-    def temperature(self) -> Array | None:
-        """The last of them."""
-        return self.temperatures[-1][1] if self.temperatures else None
+    temperature: Array | None
 
 
 class Windows:
@@ -90,7 +87,7 @@ class Windows:
         """
         desk, cycle = self._desk, self._cycle
         last_ns = max(desk.latest_ns, cycle.begun_ns if cycle.id else 0)
-        due_ns = last_ns + self._pause_ns
+        due_ns = max(last_ns, cycle.postponed_ns) + self._pause_ns
         if not last_ns or desk.newest_ns.get(JOINTS, 0) <= due_ns:
             return None
         if not cycle.id and not self._half_visited():
@@ -103,7 +100,7 @@ class Windows:
         if reference is None:
             return 0, 0
         start = desk.from_ns if self._cycle.id else desk.last_run_ns(self._pause_ns)
-        q = [o.q for o in desk.unused(start) if o.topic != FIXED]
+        q = [o.q for o in desk.unused(start)]
         return len(reference.spots.visited(np.array(q))), reference.spots.poses
 
     def _half_visited(self) -> bool:

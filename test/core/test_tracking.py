@@ -253,8 +253,6 @@ def test_temperatures_that_cannot_be_used_are_refused(arm):
     tracker.read_temperatures(np.ones(6), 60.0)
     with pytest.raises(InputError, match="older than the last"):
         tracker.read_temperatures(np.ones(6), 30.0)
-    with pytest.raises(StaleError, match="1140 s old"):
-        tracker.take(visit(cell, q), 1200.0)
 
 
 def test_temperatures_no_longer_read_are_held_with_a_growing_doubt(arm):
@@ -272,6 +270,22 @@ def test_temperatures_no_longer_read_are_held_with_a_growing_doubt(arm):
         assert mean == pytest.approx(10.0 * known[:, 0])
         sigma = np.sqrt(np.diag(covariance))
         assert sigma == pytest.approx(doubt_k * known[:, 0], rel=1e-3, abs=1e-8)
+
+
+def test_a_warming_that_nobody_read_is_no_step(arm):
+    """Ten kelvin unread for an hour: taken; read as none: refused."""
+    cell, q, k = cell_of(arm), postures(6), len(arm.parameters)
+    known = np.zeros((k, 3))
+    known[:, 0] = np.sqrt(np.diag(drift_prior(arm))) / 20.0
+    gains = HeatGains(known.ravel(), 1e-30 * np.eye(3 * k), 3600.0)
+    spots = ColdSpots.of(cell, visit(cell, q))
+    warm = visit(drifted(cell, 10.0 * known[:, 0]), q)
+    for silent in (True, False):
+        process = DriftProcess(1e-6 * drift_prior(arm))
+        tracker = DriftTracker(spots, process, SIGMA, gains=gains)
+        tracker.read_temperatures(np.zeros(6), 60.0 if silent else 3660.0)
+        assert tracker.take(warm, 3660.0).applied == silent
+        assert np.trace(tracker.expected_drift()) > 100.0 * np.trace(process.covariance)
 
 
 def test_a_process_that_forgets_too_soon_is_refused(arm):

@@ -87,9 +87,11 @@ def of_kind(samples: Sequence[Sample], kind: type) -> list[Sample]:
     return [sample for sample in samples if isinstance(sample, kind)]
 
 
-def knocked(samples: Iterable[Sample]) -> list[Sample]:
-    """The sensor was moved by a millimetre: every point it measures is off the same way."""
-    T = frames.transform(frames.exp_rotation([0.0, 1e-3, 0.0]), [8e-4, 0.0, 5e-4])
+KNOCK = frames.transform(frames.exp_rotation([0.0, 1e-3, 0.0]), [8e-4, 0.0, 5e-4])
+
+
+def knocked(samples: Iterable[Sample], T: np.ndarray = KNOCK) -> list[Sample]:
+    """The sensor was moved, by a millimetre: every point it measures is off the same way."""
     return [
         replace(s, position_m=T[:3, :3] @ s.position_m + T[:3, 3])
         if isinstance(s, PointSample)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from shift import Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
+from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
 from robocal_ros.core.samples import JointSample, PointSample
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
@@ -329,6 +330,66 @@ def test_a_clock_that_jumps_back_does_not_stop_the_cycles(cell):
     assert found.status is not Code.SENSOR_OR_ROBOT_MOVED
     assert cell.session.desk.jumps == 1
     assert cell.session.accuracy(cell.shift.now_ns).error is not None
+
+
+def test_a_step_does_not_become_plausible_by_waiting(cell):
+    """0.3 mm of the sensor: refused at once, and after every quarter of an hour for six hours."""
+    cell.visit(0.0, after_h=0.25)
+    assert cell.ask(events.END_CYCLE).calibration_id
+    moved = frames.transform(np.eye(3), [3e-4, 0.0, 0.0])
+    for _ in range(24):
+        cell.feed(knocked(cell.shift.visit(cell.cold, cell.q, after_h=0.25), moved))
+        assert cell.ask(events.END_CYCLE).status is Code.SENSOR_OR_ROBOT_MOVED
+    again = cell.start().follower.state
+    assert again.moved_s is not None
+    cell.feed(knocked(cell.shift.visit(cell.cold, cell.q, after_h=0.25), moved))
+    assert cell.ask(events.END_CYCLE).status is Code.SENSOR_OR_ROBOT_MOVED
+    cell.visit(0.0)  # put back
+    assert cell.ask(events.END_CYCLE).status is not Code.SENSOR_OR_ROBOT_MOVED
+    assert cell.session.follower.state.moved_s is None
+
+
+@pytest.mark.parametrize("hours", [0.0, -1.0, -1e5])
+def test_accuracy_is_told_at_any_stamp(cell, hours):
+    """At the cold visit itself, before it, and at a clock that has not begun."""
+    cold_ns = cell.session.reference.data.middle_ns
+    found = cell.session.accuracy(max(cold_ns + round(hours * 3600 * NS), 0))
+    assert found.error is not None
+    assert np.isfinite([found.error.rms_m, found.error.bound_m, found.due_in_s]).all()
+    assert (found.error.rms_m == 0.0) == (hours == 0.0)
+
+
+def test_an_open_cycle_times_out_after_a_jump_back_too(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    cell.shift.now_ns -= 500 * NS
+    cell.visit(0.0, slice(2))
+    cell.idle(61.0)
+    assert cell.session.desk.jumps == 1
+    assert cell.session.overdue() is not None
+
+
+def test_a_fixed_sphere_alone_keeps_no_cycle_open(cell):
+    cell.ask(events.BEGIN_CYCLE, cycle_id="c1")
+    cell.visit(0.0, slice(6), after_h=0.1)
+    for _ in range(8):
+        samples = list(cell.shift.visit(cell.cold, cell.q[:1], after_h=0.005))
+        fixed = fixed_points(samples, moved=False)
+        cell.feed(s for s in fixed if getattr(s, "target", "") != "ball")
+    assert cell.session.overdue() is not None
+
+
+def test_a_time_out_on_a_full_disk_keeps_the_cycle(cell):
+    cell.visit(15.0, after_h=2.0)
+    cell.idle(61.0)
+    path = cell.session._history.path
+    path.rename(path.with_suffix(".away"))
+    cell.session.submit(cell.session.overdue())
+    assert cell.session.advance(wall_ns=1, force=True)[-1].status is Code.STORAGE_FAILED
+    assert cell.session.overdue() is None  # not at once again
+    path.with_suffix(".away").rename(path)
+    cell.idle(61.0)
+    cell.session.submit(cell.session.overdue())
+    assert cell.session.advance(wall_ns=1, force=True)[-1].samples == POSES
 
 
 def test_stamps_of_joints_alone_do_not_end_a_cycle_early(cell):

@@ -73,13 +73,12 @@ def test_the_history_teaches_what_drift_to_expect(tmp_path):
     default = drift_prior(robot.nominal)
     assert np.trace(found.process.covariance) < np.trace(default)
     assert found.sigma_m == pytest.approx(NOISE_M, rel=0.25)
-    assert np.array_equal(robot.session.expected.process.covariance, default)
+    assert np.array_equal(robot.session.expected_drift(), default)
     robot.start("learned")
-    assert np.array_equal(robot.session.expected.process.covariance, default)  # of this reference
+    assert np.array_equal(robot.session.expected_drift(), default)  # of this reference
     captured = robot.visit(events.CAPTURE_REFERENCE, 0.0, 12.0)
     assert "learned from 1 shifts" in captured.message
-    kept = robot.session.expected
-    assert np.array_equal(kept.process.covariance, found.process.covariance)
+    assert np.array_equal(robot.session.expected_drift(), found.process.covariance)
 
 
 def test_too_little_teaches_nothing_and_says_so(tmp_path):
@@ -129,7 +128,7 @@ def test_temperatures_tell_the_drift_between_cycles(learned):
     now_ns = learned.shift.now_ns
     arm = session.reference.cell.arm
     before = follower.state
-    with follower.looking_ahead(session.temperatures.until(now_ns)):
+    with follower.looking_ahead(session.temperatures.between(follower.read_ns, now_ns)):
         told, _ = follower.forecast(session.arm).drift_at(follower.time_s(now_ns))
     assert follower.state is before
     true = arm.parameters.read(warmed(learned.cold, 15.0).mdh - learned.cold.mdh)
@@ -151,18 +150,45 @@ def test_a_restart_keeps_the_temperatures_course(learned):
     assert np.array_equal(back.heat.array(), state.heat.array())
 
 
-def test_silent_temperatures_are_refused_with_what_to_do(learned):
+def test_silent_temperatures_cost_certainty_and_not_the_cycle(learned):
+    """An hour without a reading: the cycle counts, and less is known than with readings."""
+    follower = learned.session.follower
+    forecast = follower.forecast(learned.session.arm)
+    _, before = forecast.drift_at(follower.time_s(learned.shift.now_ns))
     learned.temperatures = False
     try:
-        refused = learned.visit(events.IDENTIFY, 9.0, 1.0)
+        learned.shift.now_ns += 3600 * NS
+        _, silent = forecast.drift_at(follower.time_s(learned.shift.now_ns))
+        found = learned.visit(events.IDENTIFY, 9.0, 0.0)
     finally:
         learned.temperatures = True
-    assert refused.status.name == "STALE"
-    assert "check their topic" in refused.message
+    assert np.trace(silent) > 2.0 * np.trace(before)
+    assert found.calibration_id
+    assert found.status.name != "SENSOR_OR_ROBOT_MOVED"
+    assert "motor_temperature" not in learned.history.inputs(found.calibration_id)
+    assert follower.state.heat.time_s < follower.state.tracker.time_s - 3000.0
+
+
+def test_a_clock_that_jumps_back_stops_nothing(learned):
+    """With temperatures: cycles go on, and accuracy ages on the new clock."""
+    learned.shift.now_ns -= 6 * 3600 * NS
+    statuses = [learned.visit(events.IDENTIFY, 9.0, 0.2).status.name for _ in range(3)]
+    assert "STALE" not in statuses
+    follower = learned.session.follower
+    assert follower.state.heat.time_s > follower.state.tracker.time_s - 600.0
+    bounds = [
+        learned.session.accuracy(learned.shift.now_ns + hours * 3600 * NS).error.bound_m
+        for hours in (0, 1, 4)
+    ]
+    assert bounds == sorted(bounds)
+    assert bounds[2] > bounds[0]
+    state = follower.state
+    again = learned.start("learned").follower.state
+    assert np.array_equal(state.tracker.covariance, again.tracker.covariance)
 
 
 def test_readings_do_not_depend_on_their_order():
-    """All joints known; the last of each ten seconds."""
+    """The first of each ten seconds of each joint; both joints known, none silent."""
     samples = [TemperatureSample(s * NS, name, s + 0.1) for s in range(1, 40) for name in "ab"]
     straight, shuffled = MotorTemperatures(("a", "b")), MotorTemperatures(("a", "b"))
     for sample in samples:
@@ -170,6 +196,18 @@ def test_readings_do_not_depend_on_their_order():
     for i in np.random.default_rng(0).permutation(len(samples)):
         shuffled.add(samples[i])
     for found in (straight, shuffled):
-        assert [stamp // NS for stamp, _ in found.until(35 * NS)] == [9, 19, 29]
-        assert [t.tolist() for _, t in found.until(25 * NS)] == [[9.1, 9.1], [19.1, 19.1]]
-    assert straight.until(0) == []
+        readings = found.between(0, 35 * NS)
+        assert [stamp // NS for stamp, _ in readings] == [1, 10, 20, 30]
+        assert [t.tolist() for _, t in readings[1:3]] == [[10.1, 10.1], [20.1, 20.1]]
+        assert found.at(25 * NS).tolist() == [20.1, 20.1]
+        assert found.at(2000 * NS) is None
+    straight.add(TemperatureSample(1500 * NS, "a", 50.0))
+    assert straight.at(1600 * NS) is None  # b has been silent
+
+
+def test_one_motor_that_is_never_read_fills_no_memory():
+    found = MotorTemperatures(("a", "b"))
+    for i in range(25_000):
+        found.add(TemperatureSample(i * 10 * NS + 1, "a", 30.0))
+    assert found.at(250_000 * NS) is None
+    assert len(found._kept) <= 20_000

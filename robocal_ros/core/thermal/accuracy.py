@@ -78,6 +78,8 @@ class AccuracyForecast:
         variance = 4.0 * np.einsum("pi,pij,pj->p", miss, C, miss)
         variance += 2.0 * np.einsum("pij,pij->p", C, C)
         all_mean = float(mean.mean())
+        if all_mean == 0.0:  # at the cold visit itself
+            return ToolError(0.0, 0.0)
         all_variance = float(np.mean(variance + mean**2)) - all_mean**2
         scale, freedom = all_variance / (2.0 * all_mean), 2.0 * all_mean**2 / all_variance
         bound = scale * chi2_quantile(0.95, freedom)

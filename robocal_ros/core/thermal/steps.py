@@ -53,9 +53,13 @@ class FixedSphere:
 
 
 def fixed_sphere(cold: Array, now: Array, sigma_m: float) -> FixedSphere:
-    """Compare measured centres (n, 3) of a fixed sphere; ``sigma_m`` of one coordinate of one."""
-    shift = now.mean(axis=0) - cold.mean(axis=0)
-    variance = sigma_m**2 * (1.0 / len(cold) + 1.0 / len(now)) + SENSOR_WANDER_M**2
+    """Compare measured centres (n, 3) of a fixed sphere; ``sigma_m`` of one coordinate of one.
+
+    Medians: a wrong one among three or more does no harm.
+    """
+    shift = np.median(now, axis=0) - np.median(cold, axis=0)
+    each = [(1.0 if len(p) < 3 else np.pi / 2.0) / len(p) for p in (cold, now)]
+    variance = sigma_m**2 * sum(each) + SENSOR_WANDER_M**2
     limit = chi2_quantile(1.0 - FIXED_FALSE_ALARM, 3)
     return FixedSphere(shift, bool(shift @ shift > limit * variance))
 

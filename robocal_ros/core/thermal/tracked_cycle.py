@@ -42,12 +42,13 @@ def track_cycle(
     *,
     in_force: SerialArm,
     fixed: FixedSphere | None = None,
+    doubt_s: float | None = None,
 ) -> TrackedCycle:
     """Update the tracker with a cycle and judge the model that follows from it.
 
     A cycle that the drift since the last one cannot explain, or during which a sphere that is
     fixed in the cell (``fixed``) moved, leaves the tracker as it was, and is refused as
-    SENSOR_OR_ROBOT_MOVED with what it may be.
+    SENSOR_OR_ROBOT_MOVED with what it may be. ``doubt_s``: see `DriftTracker.take`.
 
     Raises
     ------
@@ -62,11 +63,13 @@ def track_cycle(
     warm = spots.average(warm, tracker.sigma_m)
     if len(warm) < FEWEST_POSES:
         raise TooFewSamplesError("one pose cannot show a drift: measure at least five")
-    last, before = tracker.state, tracker.at(time_s)
-    innovation = tracker.take(warm, time_s)
+    last = tracker.state
+    innovation = tracker.take(warm, time_s, doubt_s)
+    taken, tracker.state = tracker.state, last
+    before = tracker.at(innovation.time_s)
     moved = not innovation.applied or (fixed is not None and fixed.moved)
-    if moved:
-        tracker.state = last
+    if not moved:
+        tracker.state = taken
     miss, spread, drifts = _left_out(tracker, before, warm, innovation)
     found = _found(tracker, warm, time_s, innovation, miss, spread)
     arm = spots.cell.arm
@@ -105,7 +108,7 @@ def _found(
     return CycleDrift(
         drift=drift,
         covariance=covariance,
-        prior_covariance=tracker.process.covariance,
+        prior_covariance=tracker.expected_drift(),
         arm=arm.with_mdh(chosen.add(arm.mdh, drift)),
         warm=warm,
         left_out=miss,

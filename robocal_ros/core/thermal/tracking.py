@@ -17,6 +17,7 @@ from robocal_ros.core.errors import InputError, StaleError
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.agreement import agreeing
 from robocal_ros.core.thermal.heat import SOURCES, Heat, HeatGains, joints_of, swing_k
+from robocal_ros.core.thermal.priors import PLAUSIBLE_WARMING_K
 from robocal_ros.core.thermal.process import DriftProcess
 from robocal_ros.core.thermal.spots import ColdSpots
 
@@ -26,7 +27,6 @@ FALSE_ALARM = 0.001  # chance that a sound cycle is not applied
 FEWEST_SHARE = 0.5  # of a cycle's samples that must agree
 SETUP = 6
 OUTLIER_M = 1e-3  # a sample that fits nothing lies anywhere within so much
-LONGEST_SILENCE_S = 900.0  # a cycle needs motor temperatures that are no older
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,7 @@ class Innovation:
 
     Attributes
     ----------
+    time_s : at which the expectation was.
     squared, freedom : normalised square of the innovation, and its degrees of freedom.
     limit : the square above which a cycle is not applied.
     applied : whether it was.
@@ -54,6 +55,7 @@ class Innovation:
     whitened : (freedom,) the innovation in units of its own spread: standard normal.
     """
 
+    time_s: float
     squared: float
     freedom: int
     limit: float
@@ -160,15 +162,30 @@ class DriftTracker:
         Where motor temperatures are in use, those after the last reading are held, with a doubt
         that grows.
         """
-        state, k = self.at(time_s), self.count
+        state = self.at(time_s)
         rows = self.drift_rows(time_s)
-        covariance = rows @ state.covariance @ rows.T
-        if self.heat is not None:
-            gain = state.mean[self._gains].reshape(k, SOURCES)[:, 0]
-            sigma = swing_k(time_s - self.heat.time_s) * gain
-            same = self._joint[:, None] == self._joint
-            covariance += same * np.outer(sigma, sigma)
+        covariance = rows @ state.covariance @ rows.T + self._swing(time_s)
         return rows @ state.mean, covariance
+
+    def _swing(self, time_s: float) -> Array:
+        """Covariance (k, k) of what the motors may have done since they were last read."""
+        if self.heat is None:
+            return np.zeros((self.count, self.count))
+        gain = self.state.mean[self._gains].reshape(self.count, SOURCES)[:, 0]
+        sigma = swing_k(time_s - self.heat.time_s) * gain
+        same = self._joint[:, None] == self._joint
+        return np.asarray(same * np.outer(sigma, sigma))
+
+    def expected_drift(self) -> Array:
+        """Covariance (k, k) of the drift that a shift may bring, SI: by all motors' warmth too."""
+        total, gains, heat = self.process.covariance.copy(), self.gains, self.heat
+        if gains is None or heat is None:
+            return total
+        for warm in PLAUSIBLE_WARMING_K * np.eye(len(heat.motor)):
+            rows = Heat(0.0, warm, warm, heat.lag_s).rows(self._joint)
+            drift = rows @ gains.mean
+            total += np.outer(drift, drift) + rows @ gains.covariance @ rows.T
+        return total
 
     def drift_rows(self, time_s: float) -> Array:
         """Drift (k, d) of the parameters by the state."""
@@ -179,8 +196,11 @@ class DriftTracker:
             rows[:, self._gains] = self.heat.held(time_s).rows(self._joint)
         return rows
 
-    def take(self, cycle: Measurements, time_s: float) -> Innovation:
+    def take(self, cycle: Measurements, time_s: float, doubt_s: float | None = None) -> Innovation:
         """Update with a cycle, unless the process cannot explain it.
+
+        ``doubt_s``: a cycle must fit with the doubt of this earlier time too, as after a step:
+        waiting must not make it plausible.
 
         ``cycle.sigma`` (m,), where given, is each coordinate's noise.
 
@@ -189,10 +209,19 @@ class DriftTracker:
         InputError
             When a sample has no cold counterpart.
         StaleError
-            When the cycle is older than the last one, or the motor temperatures much older.
+            When the cycle is older than the last one.
         """
-        state = self.at(time_s)
-        self._require_temperatures(time_s)
+        if doubt_s is not None and not (early := self._examine(cycle, doubt_s)[0]).applied:
+            return early
+        innovation, state = self._examine(cycle, time_s)
+        self.state = self.state if state is None else state
+        return innovation
+
+    def _examine(
+        self, cycle: Measurements, time_s: float
+    ) -> tuple[Innovation, TrackerState | None]:
+        """What a cycle brings, and the state after it; None where it is not applied."""
+        state, after = self.at(time_s), None
         y, H, R = self.observation(cycle, time_s)
         deviation, expected = y - H @ state.mean, H @ state.covariance @ H.T + R
         keep = agreeing(deviation, expected, len(cycle))
@@ -206,8 +235,9 @@ class DriftTracker:
         if applied:
             gain = np.linalg.solve(S, PH.T).T
             P = state.covariance - gain @ PH.T
-            self.state = TrackerState(time_s, state.mean + gain @ v, 0.5 * (P + P.T))
-        return Innovation(
+            after = TrackerState(time_s, state.mean + gain @ v, 0.5 * (P + P.T))
+        innovation = Innovation(
+            time_s=time_s,
             squared=squared,
             freedom=len(v),
             limit=limit,
@@ -220,18 +250,13 @@ class DriftTracker:
             - 3.0 * float(np.sum(~keep)) * np.log(OUTLIER_M),
             whitened=whitened,
         )
-
-    def _require_temperatures(self, time_s: float) -> None:
-        """Refuse a cycle without recent temperatures: the process alone would not explain it."""
-        if self.heat is None or time_s - self.heat.time_s <= LONGEST_SILENCE_S:
-            return
-        raise StaleError(
-            f"the motor temperatures are {time_s - self.heat.time_s:.0f} s old, a cycle needs "
-            f"them within {LONGEST_SILENCE_S:.0f} s: check their topic, or track without them"
-        )
+        return innovation, after
 
     def observation(self, cycle: Measurements, time_s: float) -> tuple[Array, Array, Array]:
-        """Drift of the spots (3m,), its rows (3m, d) in the state, and its noise (3m, 3m)."""
+        """Drift of the spots (3m,), its rows (3m, d) in the state, and its noise (3m, 3m).
+
+        Silent motors are part of the noise.
+        """
         spots, m = self.spots, len(cycle)
         spot = spots.match(cycle)
         parameters, setup = spots.rows(cycle.q, spots.target[spot])
@@ -241,4 +266,6 @@ class DriftTracker:
         columns = self._gains.stop + 3 * spot[:, None] + np.arange(3)
         H[np.arange(m)[:, None], np.arange(3), columns] = -1.0
         sigma = np.full(m, self.sigma_m) if cycle.sigma is None else cycle.sigma
-        return spots.drift(cycle).ravel(), H.reshape(3 * m, -1), np.diag(np.repeat(sigma**2, 3))
+        A = parameters.reshape(3 * m, -1)
+        noise = np.diag(np.repeat(sigma**2, 3)) + A @ self._swing(time_s) @ A.T
+        return spots.drift(cycle).ravel(), H.reshape(3 * m, -1), noise
