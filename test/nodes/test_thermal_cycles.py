@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from cell import Cell, message_of
 from robocal_msgs.msg import AccuracyState
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, Temperature
 from shift import NS, Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.samples import JointSample
+from robocal_ros.nodes.conversions import time_message
 from robocal_ros.storage.robots import load_robot
 
 POSES = 6
@@ -232,3 +233,30 @@ def test_nothing_is_known_without_a_reference(graph):
     refused = cell.call("begin_cycle", cycle_id="c1")
     assert (refused.success, refused.status) == (False, Code.CONFLICT)
     assert np.isfinite(said.due_in_s)
+
+
+def test_a_start_before_any_clock(cell, graph):
+    """Simulated time that has not begun, a reference, no model: told, and the node lives on."""
+    cell.process.kill()
+    cell.accuracies.clear()
+    cell.parameters = cell.parameters | {"use_sim_time": True}
+    cell.process = cell.start()
+    graph.spin_until(lambda: len(cell.accuracies) > 1, "accuracy is told")
+    assert np.isfinite(cell.accuracies[-1].predicted_error_mm)
+    assert cell.process.process.poll() is None
+
+
+def test_silent_and_wrong_temperatures(cell, graph, robot):
+    """An optional input does no harm, whatever comes of it; what cannot be used is said."""
+    temperatures = graph.publisher(Temperature, "/motor_temperatures")
+    for name, value in (("joint_a1", 30.0), ("gearbox", 30.0), ("joint_a2", float("nan"))):
+        message = Temperature(temperature=value)
+        message.header.frame_id = name
+        message.header.stamp = time_message(robot.shift.now_ns)
+        temperatures.publish(message)
+    graph.spin_until(
+        lambda: any("gearbox" in v.value for v in getattr(cell.status(), "values", [])),
+        "it is said",
+    )
+    cell.play(robot.visit(WARM_K, after_h=2.0))
+    assert end(cell, "c1").status == Code.ACCEPT
