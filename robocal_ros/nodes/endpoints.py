@@ -97,9 +97,6 @@ class EndpointNode(LifecycleNode):
                 count.invalid += 1
                 if self._log_limit.allows(topic, str(error), time.monotonic()):
                     self.get_logger().warning(f"{topic}: {error}")
-            except Exception as error:
-                count.invalid += 1
-                self._tell_defect(topic, error)
 
         def lose(event: Any) -> None:
             count.lost += event.total_count_change
@@ -160,22 +157,11 @@ class EndpointNode(LifecycleNode):
         ``steady``: of the steady clock, which runs on when a simulation stops.
         """
         clock = Clock(clock_type=ClockType.STEADY_TIME) if steady else None
-
-        def tick() -> None:
-            try:
-                if self.is_active:
-                    callback()
-            except Exception as error:
-                self._tell_defect(f"timer of {period_s:g} s", error)
-
-        timer = self.create_timer(period_s, tick, clock=clock)
+        timer = self.create_timer(
+            period_s, lambda: callback() if self.is_active else None, clock=clock
+        )
         self._release.append(lambda: self.destroy_timer(timer))
         return timer
-
-    def _tell_defect(self, where: str, error: Exception) -> None:
-        """A defect of this software is logged, and does not end the node."""
-        if self._log_limit.allows(where, str(error), time.monotonic()):
-            self.get_logger().error(f"{where}:\n{''.join(traceback.format_exception(error))}")
 
     def release_endpoints(self) -> None:
         """Take down all of them, the last one first."""

@@ -22,8 +22,6 @@ from robocal_ros.nodes.endpoints import LOG_EVERY_S, LogLimit
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sessions.ignored import MOST_REASONS
 
-BUG = 13.0
-
 
 class Doubler(HouseNode):
     """Doubles numbers; refuses negative ones."""
@@ -40,8 +38,6 @@ class Doubler(HouseNode):
         self.factor = self.settings["factor"]
         self.output = self.add_output(Float64, "~/doubled", qos.RELIABLE)
         self.add_input(Float64, "number", self.on_number, qos.RELIABLE)
-        self.add_timer(0.05, self.on_tick)
-        self.ticks = 0
         self.add_service(Decide, "~/decide", self.on_decide)
         self.add_service(Trigger, "~/decide_trigger", self.on_trigger)
         self.decide = self.create_client(Decide, "~/decide")
@@ -59,15 +55,9 @@ class Doubler(HouseNode):
     def on_number(self, message: Float64) -> None:
         if message.data < 0:
             raise InputError(f"{message.data} is negative")
-        if message.data == BUG:
-            raise ZeroDivisionError("a bug")
         if message.data > 1e6:
             raise InputError(f"{message.data} is too large")
         self.output.publish(Float64(data=self.factor * message.data))
-
-    def on_tick(self) -> None:
-        self.ticks += 1
-        raise ZeroDivisionError("a bug in a timer")
 
     def on_decide(self, request: Decide.Request, response: Decide.Response) -> Decide.Response:
         if request.id == 0:
@@ -204,19 +194,6 @@ def test_an_invalid_message_is_counted_and_does_no_harm(graph: Any) -> None:
     number.publish(Float64(data=1.0))
     graph.spin_until(lambda: doubled, "a doubled number")
     assert (node.inputs["number"].received, node.inputs["number"].invalid) == (2, 1)
-
-
-def test_a_defect_ends_neither_the_node_nor_its_timer(graph: Any, capfd: Any) -> None:
-    node = graph.add(Doubler)
-    doubled = graph.collect(Float64, "/doubler/doubled")
-    number = graph.publisher(Float64, "number")
-    number.publish(Float64(data=BUG))
-    number.publish(Float64(data=21.0))
-    graph.spin_until(lambda: doubled and node.ticks > 2, "it works on")
-    assert node.inputs["number"].invalid == 1
-    said = capfd.readouterr().err
-    assert said.count("timer of 0.05 s") == 1  # once in a while
-    assert "ZeroDivisionError: a bug" in said
 
 
 def test_services_answer_errors_with_their_code_and_may_wait_for_others(graph: Any) -> None:
