@@ -31,7 +31,7 @@ EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 # Domains whose ports lie below those that Linux hands out to any program.
 DOMAINS = range(1, 102)
 DEADLINE_S = 10.0
-DISCOVERY_S = 0.05
+DISCOVERY_S = 0.25
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -104,12 +104,14 @@ class Graph:
             "PYTHONUNBUFFERED": "1",
         }
         self._nodes: list[Any] = []
+        self._clients: dict[str, Any] = {}
         self._executables: list[Executable] = []
 
     def add(
         self, node_class: type, parameters: dict[str, Any] | None = None, **options: Any
     ) -> Any:
         """Start a house node in this process, as ``run`` would."""
+        self._forget_clients()
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
         node = node_class(
             context=self.context,
@@ -130,6 +132,7 @@ class Graph:
         *arguments: str,
     ) -> Executable:
         """Start an executable of the install tree (or a script); it is ended with the test."""
+        self._forget_clients()
         ros = [f"-p{name}:={value}" for name, value in (parameters or {}).items()]
         ros += [f"-r{old}:={new}" for old, new in (remap or {}).items()]
         ros_arguments = [item for pair in ros for item in (pair[:2], pair[2:])]
@@ -163,16 +166,22 @@ class Graph:
 
     def call(self, kind: type, name: str, within_s: float = DEADLINE_S, **fields: Any) -> Any:
         """Call a service, waiting for it to appear, and return its response."""
-        client = self.probe.create_client(kind, name)
-        try:
+        client = self._clients.get(name)
+        if client is None:
+            client = self._clients[name] = self.probe.create_client(kind, name)
             self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
             # A server drops its answer to a client that it has not discovered itself yet.
             self.spin_for(DISCOVERY_S)
-            future = client.call_async(kind.Request(**fields))
-            self.spin_until(future.done, f"service {name} answers", within_s)
-            return future.result()
-        finally:
+        self.spin_until(client.service_is_ready, f"service {name} appears", within_s)
+        future = client.call_async(kind.Request(**fields))
+        self.spin_until(future.done, f"service {name} answers", within_s)
+        return future.result()
+
+    def _forget_clients(self) -> None:
+        """A node that starts has to discover whom it answers."""
+        for client in self._clients.values():
             self.probe.destroy_client(client)
+        self._clients.clear()
 
     def collect(self, kind: type, topic: str, profile: QoSProfile = qos.RELIABLE) -> list[Any]:
         """Subscribe; return the list that gathers what arrives."""
