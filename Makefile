@@ -90,19 +90,20 @@ setup-ros: $(STAMPS)/robocal_ros
 
 COLCON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$(CURDIR)/$(VENV)" \
 	CMAKE_PREFIX_PATH="$(CURDIR)/$(VENV)" \
-	colcon --log-base log build --symlink-install --base-paths . msg_defs \
+	colcon --log-base log build --symlink-install --base-paths . msg_defs tools/interfaces \
 	--event-handlers console_cohesion- --packages-select
 
 # Build folders remember absolute paths and half-done work: these start afresh.
-$(STAMPS)/robocal_msgs: $(STAMPS)/wheels $(shell find msg_defs -type f)
-	@echo "Building robocal_msgs (about half a minute, once)"
+INTERFACES := robocal_msgs tf2_msgs
+$(STAMPS)/interfaces: $(STAMPS)/wheels $(shell find msg_defs tools/interfaces -type f)
+	@echo "Building $(INTERFACES) (about half a minute, once)"
 	command -v c++ >/dev/null || { echo "make: a C++ compiler is needed (apt install g++)" >&2; exit 1; }
-	rm -rf build/robocal_msgs install/robocal_msgs
-	$(COLCON) robocal_msgs --cmake-args -GNinja -DBUILD_TESTING=OFF
+	rm -rf $(INTERFACES:%=build/%) $(INTERFACES:%=install/%)
+	$(COLCON) $(INTERFACES) --cmake-args -GNinja -DBUILD_TESTING=OFF
 	touch $@
 
 # Python sources are linked, not copied: only new entry points, config and launch files need this again.
-$(STAMPS)/robocal_ros: $(STAMPS)/robocal_msgs $(PYTHON_FILES) resource/robocal_ros $(shell find config launch)
+$(STAMPS)/robocal_ros: $(STAMPS)/interfaces $(PYTHON_FILES) resource/robocal_ros $(shell find config launch)
 	@rm -rf build/robocal_ros install/robocal_ros
 	$(COLCON) robocal_ros
 	touch $@
