@@ -14,6 +14,8 @@ if TYPE_CHECKING:  # the history is listed without loading NumPy
     from numpy.typing import NDArray
 
 THERMAL = "thermal"
+TOOL = "tool"
+HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
 
 
 class Action(StrEnum):

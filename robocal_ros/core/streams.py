@@ -136,6 +136,12 @@ class JointStream:
         self._stamp[self._size], self._q[self._size] = stamp_ns, q
         self._size += 1
 
+    def window(self, from_ns: int, to_ns: int) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (k,) and joints (k, n) of the readings from ``from_ns`` up to ``to_ns``."""
+        stamps = self._stamp[: self._size]
+        low, high = np.searchsorted(stamps, from_ns), np.searchsorted(stamps, to_ns, side="right")
+        return stamps[low:high].copy(), self._q[low:high].copy()
+
     def standstill(self, stamp_ns: int, rule: StandstillRule) -> Reading | None:
         """Joints at an instant at which the robot stands still; None while readings are to come.
 

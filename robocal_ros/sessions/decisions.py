@@ -3,16 +3,20 @@
 from dataclasses import replace
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 
+START_OF = {THERMAL: "the nominal model", TOOL: "the taught tool"}
 ONLY, NEWEST = "only", "newest"  # which pending candidate a command without an id is about
 
 
-def decide(history: History, command: Command, expected: int, wall_ns: int) -> Outcome:
-    """Accept, reject or roll back, where revision ``expected`` is in force.
+def decide(
+    history: History, command: Command, expected: int, wall_ns: int, kind: str = THERMAL
+) -> Outcome:
+    """Accept, reject or roll back a calibration of a kind whose revision in force is ``expected``.
 
     A command with ``choose`` (`ONLY`, `NEWEST`) in place of an id is about a candidate that is
     pending now, not when it was given. The outcome's command says which: replay obeys that.
@@ -23,13 +27,15 @@ def decide(history: History, command: Command, expected: int, wall_ns: int) -> O
         When the history refuses.
     """
     if "choose" in command.arguments:
-        command = _named(history, command)
+        command = _named(history, command, kind)
     arguments = command.arguments
     if "refused" in arguments:
         return Outcome(command, Code.CONFLICT, str(arguments["refused"]))
     chosen = int(arguments.get("id", 0))
     by, why = str(arguments.get("by", "")), str(arguments.get("reason", ""))
     try:
+        if command.name != events.ROLLBACK and (own := history.get(chosen).kind) != kind:
+            raise InputError(f"calibration {chosen} is of kind {own}, not {kind}")
         if command.name == events.REJECT:
             history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
             return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
@@ -44,19 +50,20 @@ def decide(history: History, command: Command, expected: int, wall_ns: int) -> O
                 reason=why,
                 expected_head=expected,
                 wall_ns=wall_ns,
+                kind=kind,
             )
     except RobocalError as error:
         return Outcome(command, error.code, str(error))
     chosen = head.calibration_id or 0
-    what = f"calibration {chosen}" if chosen else "the nominal model"
+    what = f"calibration {chosen}" if chosen else START_OF[kind]
     message = f"revision {head.revision}: {what} in force"
     return Outcome(command, Code.ACCEPT, message, None, chosen)
 
 
-def _named(history: History, command: Command) -> Command:
+def _named(history: History, command: Command, kind: str) -> Command:
     """Put the candidate's id, or why there is none to choose, in place of ``choose``."""
     arguments = dict(command.arguments)
-    pending = [entry.id for entry in history.pending()]
+    pending = [entry.id for entry in history.pending(kind)]
     choose = arguments.pop("choose")
     if not pending:
         arguments["refused"] = "no fresh candidate is pending: identify first"

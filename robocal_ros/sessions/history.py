@@ -48,8 +48,14 @@ class History(Protocol):
     def list(self, limit: int = ...) -> Sequence[Entry]:
         """The latest calibrations, newest first."""
 
+    def get(self, calibration_id: int) -> Entry:
+        """A calibration by its id."""
+
     def model(self, calibration_id: int) -> dict[str, Any]:
         """A calibration's model in full precision."""
+
+    def document(self, calibration_id: int) -> dict[str, Any]:
+        """A calibration's JSON document."""
 
     def inputs(self, calibration_id: int) -> dict[str, NDArray[Any]]:
         """The arrays that a calibration was solved from."""

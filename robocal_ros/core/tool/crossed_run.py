@@ -52,6 +52,7 @@ class ToolEstimate:
     radius : (circles, 2) of the tool as each circle and beam sees it, m.
     misfit_m : rms of the edges' residuals, m.
     shift_m : largest shift of a step against the others, m.
+    widening : factor of the covariance: 1 where the sigmas explain edges, shifts and what was held.
     """
 
     T_flange_tool: Array
@@ -61,6 +62,7 @@ class ToolEstimate:
     radius: Array
     misfit_m: float
     shift_m: float
+    widening: float
     estimate: Estimate[ToolState]
 
     @property
@@ -111,14 +113,16 @@ def estimate_tool(
     _require_fit(problem, steps, found)
     state = found.state
     R = retaught(T_flange_tool[:3, :3], state.axis)
+    widening = _widening(problem, found)
     return ToolEstimate(
         T_flange_tool=frames.transform(R, state.tip),
-        covariance=_tool_covariance(problem, found, R),
+        covariance=widening * _tool_covariance(found, R),
         latency_s=state.latency_s,
         latency_sigma_s=float(np.sqrt(found.covariance[5, 5])),
         radius=state.radius,
         misfit_m=_misfit(problem, found),
         shift_m=float(np.linalg.norm(state.shift, axis=1).max()),
+        widening=widening,
         estimate=found,
     )
 
@@ -269,14 +273,16 @@ def _require_fit(
         )
 
 
-def _tool_covariance(
-    problem: RunProblem, found: Estimate[ToolState], R_flange_tool: Array
-) -> Array:
-    """(5, 5), widened where edges and shifts together are larger than their sigmas explain."""
-    turn = np.eye(5)
-    turn[3:, 3:] = R_flange_tool[:, :2].T @ across(found.state.axis)
+def _widening(problem: RunProblem, found: Estimate[ToolState]) -> float:
+    """Misfit per degree of freedom where it is larger than the sigmas explain, else 1."""
     away = problem.deviation(found.state)
     misfit = float(np.sum(found.residual**2) + away @ problem.prior @ away)
     free = len(found.residual) - problem.undetermined
-    wide = misfit / free if free > 0 and misfit > chi2_quantile(SOUND_FIT, free) else 1.0
-    return np.asarray(wide * turn @ found.covariance[:5, :5] @ turn.T)
+    return misfit / free if free > 0 and misfit > chi2_quantile(SOUND_FIT, free) else 1.0
+
+
+def _tool_covariance(found: Estimate[ToolState], R_flange_tool: Array) -> Array:
+    """(5, 5) of the tip and of the tilts along the tool's x and y."""
+    turn = np.eye(5)
+    turn[3:, 3:] = R_flange_tool[:, :2].T @ across(found.state.axis)
+    return np.asarray(turn @ found.covariance[:5, :5] @ turn.T)

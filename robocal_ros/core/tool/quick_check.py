@@ -17,6 +17,7 @@ Answer = Literal["pass", "recalibrate", "cannot tell"]
 
 ERROR_CHANCE = 0.05  # of a pass, or a recalibration, that is wrong
 HELD_TILT_RAD = 1e-3  # one circle does not see the tilt: near the stored one
+HELD_ALONG_M = 5e-3  # nor how far the tip reaches
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class QuickCheck:
     Attributes
     ----------
     deviation : (3,) of the tip from the stored one, tool axes, m; ``covariance`` (3, 3) of it.
+        Along the axis 0 where the tip is too far off sideways for the plunge to tell.
     deviation_m, sigma_m : length of it, and the standard deviation along it.
     tilt_rad : the tilt that moves the tip sideways by as much, if the tool bent at its mount; one
         circle cannot tell a tilt from a shift.
@@ -77,17 +79,36 @@ def quick_check(
     BeamError, RankDeficientError, ResidualError
         As `estimate_tool`: edges that are missing or make no sense also ask for a full run.
     """
-    found = estimate_tool(
-        laser, path, steps, T_flange_tool, noise=noise, held=Held(tilt_rad=HELD_TILT_RAD)
-    )
+    # A tip that is round is hit late beside its axis: sideways the circle alone tells.
+    circles = [step for step in steps if step.kind == "circle"]
+    held = Held(tilt_rad=HELD_TILT_RAD, along_m=HELD_ALONG_M)
+    sideways = estimate_tool(laser, path, circles, T_flange_tool, noise=noise, held=held)
+    check = _compared(sideways, T_flange_tool, rule, stored_covariance, SIDEWAYS)
+    if check.answer == "recalibrate":
+        return check
+    held = Held(tilt_rad=HELD_TILT_RAD)
+    both = estimate_tool(laser, path, steps, T_flange_tool, noise=noise, held=held)
+    return _compared(both, T_flange_tool, rule, stored_covariance, EVERY_WAY)
+
+
+SIDEWAYS, EVERY_WAY = np.diag([1.0, 1.0, 0.0]), np.eye(3)  # what a comparison looks at, tool axes
+
+
+def _compared(
+    found: ToolEstimate,
+    T_flange_tool: Array,
+    rule: CheckRule,
+    stored_covariance: Array | None,
+    ways: Array,
+) -> QuickCheck:
     R = T_flange_tool[:3, :3]
-    deviation = R.T @ (found.tip - T_flange_tool[:3, 3])
+    deviation = ways @ R.T @ (found.tip - T_flange_tool[:3, 3])
     spread = found.covariance[:3, :3]
     if stored_covariance is not None:
         spread = spread + stored_covariance
     covariance = R.T @ spread @ R
     size = float(np.linalg.norm(deviation))
-    along = deviation / size if size > 0.0 else np.array([0.0, 0.0, 1.0])
+    along = deviation / size if size > 0.0 else np.array([1.0, 0.0, 0.0])
     sigma = float(np.sqrt(along @ covariance @ along))
     answer, reason = _answer(size, sigma, rule)
     return QuickCheck(

@@ -1,0 +1,129 @@
+"""Is a measured tool good, in mm? Against the tool in force, within what may change."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.codes import Code
+from robocal_ros.core.descent import chi2_quantile
+from robocal_ros.core.tool.crossed_run import ToolEstimate
+from robocal_ros.core.tool.tool_axis import minimal_rotation
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+
+UNCHANGED = 0.95  # a difference below this quantile of its noise is none
+
+
+@dataclass(frozen=True)
+class ToolLimits:
+    """What a tool measurement may say without being doubted.
+
+    Attributes
+    ----------
+    sigma_m : largest standard deviation of the tip in any direction.
+    change_m, tilt_rad : largest change from the taught tool.
+    """
+
+    sigma_m: float = 2e-4
+    change_m: float = 1.5e-2
+    tilt_rad: float = float(np.radians(10.0))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownTool:
+    """A tool as it is kept: pose (4, 4) in the flange frame and covariance (5, 5), or None."""
+
+    T_flange_tool: Array
+    covariance: Array | None = None
+
+    def document(self) -> Document:
+        """In full precision, SI; `of_document` reads it back to the last bit."""
+        return {
+            "T_flange_tool": self.T_flange_tool.tolist(),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+        }
+
+    @classmethod
+    def of_document(cls, document: Document) -> "KnownTool":
+        """Read what `document` gave."""
+        covariance = document["covariance"]
+        return cls(
+            np.array(document["T_flange_tool"]),
+            None if covariance is None else np.array(covariance),
+        )
+
+
+@dataclass(frozen=True)
+class ToolChange:
+    """How far a tool is from another one: of the tip, m; of the axis, rad."""
+
+    tip_m: float
+    axis_rad: float
+
+
+def change_between(before: Array, after: Array) -> ToolChange:
+    """From one T_flange_tool (4, 4) to another."""
+    cross = float(np.linalg.norm(np.cross(before[:3, 2], after[:3, 2])))
+    angle = float(np.arctan2(cross, before[:3, 2] @ after[:3, 2]))
+    return ToolChange(float(np.linalg.norm(after[:3, 3] - before[:3, 3])), angle)
+
+
+def changed_tool(taught: Array, healthy: KnownTool, measured: KnownTool) -> KnownTool:
+    """The taught tool with the change between two measurements, both in the same way.
+
+    What both have in common cancels: the error of the laser frame and the robot's absolute one.
+    """
+    turn = minimal_rotation(healthy.T_flange_tool[:3, 2], measured.T_flange_tool[:3, 2])
+    tip = taught[:3, 3] + measured.T_flange_tool[:3, 3] - healthy.T_flange_tool[:3, 3]
+    both = [known.covariance for known in (healthy, measured)]
+    known = [c for c in both if c is not None]
+    covariance = np.sum(known, axis=0) if len(known) == len(both) else None
+    return KnownTool(frames.transform(turn @ taught[:3, :3], tip), covariance)
+
+
+def judge_tool(
+    found: KnownTool, estimate: ToolEstimate, taught: Array, in_force: KnownTool, limits: ToolLimits
+) -> Verdict:
+    """Decide whether a measured tool may replace the one in force.
+
+    Refused: a tip not known well enough, a change from the taught tool beyond what may be, and
+    a tool that is the one in force as far as its noise tells.
+    """
+    covariance = estimate.covariance
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    moved = change_between(in_force.T_flange_tool, found.T_flange_tool)
+    what = (
+        f"tip {moved.tip_m * 1e3:.3f} mm and axis {np.degrees(moved.axis_rad):.3f} deg from the "
+        f"tool in force; known to {sigma * 1e3:.3f} mm; edges within "
+        f"{estimate.misfit_m * 1e3:.3f} mm"
+    )
+    if not sigma <= limits.sigma_m:
+        words = f"{what}: allowed {limits.sigma_m * 1e3:.3f} mm; measure with a faster input"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    total = change_between(taught, found.T_flange_tool)
+    if total.tip_m > limits.change_m or total.axis_rad > limits.tilt_rad:
+        return Verdict(
+            Code.LIMIT_EXCEEDED,
+            f"{what}; {total.tip_m * 1e3:.2f} mm and {np.degrees(total.axis_rad):.2f} deg from the "
+            f"taught tool (allowed {limits.change_m * 1e3:.0f} mm, "
+            f"{np.degrees(limits.tilt_rad):.0f} deg): straighten or change the tool",
+        )
+    if unchanged(found, in_force):
+        return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{what}; the tool has not moved")
+    return Verdict(Code.ACCEPT, what)
+
+
+def unchanged(found: KnownTool, in_force: KnownTool) -> bool:
+    """Whether two measured tools differ by no more than their noise (chi-square, 5 unknowns)."""
+    if found.covariance is None or in_force.covariance is None:
+        return False
+    R = in_force.T_flange_tool[:3, :3]
+    tilt = R[:, :2].T @ (found.T_flange_tool[:3, 2] - in_force.T_flange_tool[:3, 2])
+    d = np.append(found.T_flange_tool[:3, 3] - in_force.T_flange_tool[:3, 3], tilt)
+    distance = float(d @ np.linalg.solve(found.covariance + in_force.covariance, d))
+    return distance <= chi2_quantile(UNCHANGED, len(d))

@@ -1,0 +1,296 @@
+"""The tool session: edges, joint readings and commands in, measured tools out. No clock, no ROS."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import TOOL, Head
+from robocal_ros.core.samples import JointSample
+from robocal_ros.core.streams import JointStream
+from robocal_ros.core.tool.beam_edges import BEAMS, BeamError
+from robocal_ros.core.tool.edge_samples import EdgeSample
+from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
+from robocal_ros.sessions import events
+from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.ignored import Ignored
+from robocal_ros.sessions.in_force import outside_decision
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.tool_config import ToolConfig
+from robocal_ros.sessions.tool_in_force import ToolInForce
+from robocal_ros.sessions.tool_results import MODES, QUICK, ToolResults
+from robocal_ros.sessions.tool_run import ToolRun
+
+EDGES = "beam_events"
+GAP_NS = 250_000_000
+MOST_EDGES = 1000  # of one step: more is a beam that flickers
+SECOND_NS = 1_000_000_000
+
+
+class ToolSession:
+    """Measures the tool of one arm at one station of two crossed beams.
+
+    A command ``measure_tool`` begins a run; each step that `recognised` sees the end of becomes a
+    command of its own, so that a recording holds which samples it was made of.
+
+    Attributes
+    ----------
+    run : the run that is open; None while there is none.
+    received, ignored : samples by topic, and those that were not used.
+    newest_ns : newest stamp of the joints and of each beam's edges.
+    """
+
+    def __init__(
+        self, nominal: SerialArm, history: History, config: ToolConfig, software: str
+    ) -> None:
+        self.nominal, self.config = nominal, config
+        self._history = history
+        self._current = ToolInForce(history, nominal, KnownTool(config.T_flange_taught))
+        self._results = ToolResults(nominal, history, config, software, self._current)
+        self._laser = config.laser
+        self._stream = JointStream(nominal.joint_names)
+        self._edges: list[EdgeSample] = []
+        self._queue: list[Command] = []
+        self._runs = 0
+        self._over: Command | None = None
+        self.run: ToolRun | None = None
+        self.newest_ns: dict[str, int] = {}
+        self.received: Counter[str] = Counter()
+        self.ignored = Ignored()
+
+    # ---- what is in force -----------------------------------------------------------------------
+
+    @property
+    def in_force(self) -> Head:
+        """Head of the tools as the session last saw it."""
+        return self._current.head
+
+    @property
+    def current(self) -> ToolInForce:
+        """Tool, thermal model and healthy tool in force."""
+        return self._current
+
+    @property
+    def awaited(self) -> PlannedStep | None:
+        """The step to be driven now; None while nothing is awaited."""
+        return None if self.run is None else self.run.awaited
+
+    @property
+    def newest_joints_ns(self) -> int:
+        """Stamp of the newest joint reading; 0 before any."""
+        return self.newest_ns.get(JOINTS, 0)
+
+    # ---- samples --------------------------------------------------------------------------------
+
+    def add(self, sample: JointSample | EdgeSample) -> None:
+        """Take a sample.
+
+        Raises
+        ------
+        InputError
+            When it cannot be used; the message says why.
+        """
+        if isinstance(sample, JointSample):
+            self._add_joints(sample)
+        else:
+            self._add_edge(sample)
+
+    def _add_joints(self, sample: JointSample) -> None:
+        began = self._stream.add(sample, GAP_NS).began_ns
+        newest = self._stream.newest_ns
+        if newest is None:
+            return
+        before = self.newest_ns.get(JOINTS, newest)
+        self.received[JOINTS] += 1
+        self.newest_ns[JOINTS] = newest
+        run = self.run
+        if began is not None and newest < before:
+            self._edges.clear()
+            self.newest_ns = {JOINTS: newest}
+            self._end_early("the clock jumped back")
+        elif run is not None and self._over is None and newest > run.from_ns:
+            _, q = self._stream.window(newest, newest)
+            waited_s = (newest - run.from_ns) * 1e-9
+            if run.step_over(newest, q[0]):
+                step = run.awaited
+                arguments = {"run": run.number, "number": step.number, "step": step.name}
+                self._over = Command(events.TOOL_STEP, arguments, newest)
+            elif not run.edges and waited_s > self.config.step_timeout_s:
+                self._end_early(
+                    f"{run.awaited.name}: no edge within {self.config.step_timeout_s:g} s: the "
+                    "robot did not move through the beams, or both are dead"
+                )
+
+    def _end_early(self, reason: str) -> None:
+        if self.run is not None:
+            arguments = {"code": int(Code.BEAM_EDGES_WRONG), "reason": reason}
+            self._over = Command(events.BREAK_OFF, arguments, self.newest_joints_ns)
+
+    def _add_edge(self, sample: EdgeSample) -> None:
+        if self.config.station and sample.station != self.config.station:
+            raise InputError(
+                f"edge of station '{sample.station}', the laser frame is of "
+                f"'{self.config.station}': connect the right station, or calibrate its beams"
+            )
+        topic = f"{EDGES}/{sample.beam}"
+        if sample.stamp_ns <= self.newest_ns.get(topic, -1):
+            raise InputError(
+                f"edge at {sample.stamp_ns} ns is not after {self.newest_ns[topic]} ns"
+            )
+        self.newest_ns[topic] = sample.stamp_ns
+        self.received[EDGES] += 1
+        if len(self._edges) < MOST_EDGES:
+            self._edges.append(sample)
+        if self.run is not None:
+            self.run.watch_edge(sample)
+
+    # ---- commands -------------------------------------------------------------------------------
+
+    def recognised(self) -> Command | None:
+        """The command that follows from the samples: a step is over, or the run is broken off."""
+        found, self._over = self._over, None
+        return found
+
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command; ``step`` carries it out when its samples are complete.
+
+        A command without a stamp gets the newest stamp of the joints, where there is one, so that
+        a clock that is off does not matter.
+        """
+        if command.stamp_ns is None:
+            command = replace(command, stamp_ns=self.newest_joints_ns or clock_ns or 0)
+        self._queue.append(command)
+
+    @property
+    def waiting(self) -> int:
+        """Number of commands not yet carried out."""
+        return len(self._queue)
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command: what was decided outside before it, and it."""
+        if not self._queue or not (force or self._ready(self._queue[0])):
+            return []
+        command = self._queue.pop(0)
+        outside = self.poll()
+        if command.marks is None:
+            command = replace(command, marks=dict(self.newest_ns))
+        outcome = self._carry_out(command, wall_ns)
+        marks = self.newest_ns
+        outside += [outside_decision(d, marks) for d in self._current.look(wall_ns)]
+        return [*outside, replace(outcome, revision=self.in_force.revision)]
+
+    def poll(self) -> list[Outcome]:
+        """Take over what another process decided in the history since the last look."""
+        return [outside_decision(d, self.newest_ns) for d in self._current.look()]
+
+    def _ready(self, command: Command) -> bool:
+        marks = command.marks or {}
+        return all(self.newest_ns.get(topic, -1) >= stamp for topic, stamp in marks.items())
+
+    def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
+        handlers: dict[str, Callable[[Command, int], Outcome]] = {
+            events.MEASURE_TOOL: self._measure,
+            events.TOOL_STEP: self._take_step,
+            events.BREAK_OFF: self._break_off,
+            events.ACCEPT: self._decide,
+            events.REJECT: self._decide,
+            events.ROLLBACK: self._decide,
+        }
+        try:
+            if command.name not in handlers:
+                raise InputError(f"unknown command '{command.name}'; known: {', '.join(handlers)}")
+            return handlers[command.name](command, wall_ns)
+        except RobocalError as error:
+            return Outcome(command, error.code, str(error))
+
+    def _decide(self, command: Command, wall_ns: int) -> Outcome:
+        return decide(self._history, command, self.in_force.revision, wall_ns, TOOL)
+
+    def _measure(self, command: Command, wall_ns: int) -> Outcome:
+        mode, cycle_id = str(command.arguments["mode"]), str(command.arguments.get("cycle_id", ""))
+        if mode not in MODES:
+            raise InputError(f"mode '{mode}' is none of {', '.join(MODES)}")
+        if (before := self._results.of_cycle(cycle_id)) is not None:
+            return replace(before, command=command, repeated=True)
+        if self.run is not None:
+            raise ConflictError(
+                f"run {self.run.number} is open: let it end, or cancel it, before the next one"
+            )
+        if not self.newest_joints_ns:
+            raise ConflictError(f"no joint states yet: does the robot's driver publish {JOINTS}?")
+        config, current = self.config, self._current
+        quick = mode == QUICK
+        tool = self._results.expected() if quick else config.T_flange_taught
+        steps: Mode = "quick" if quick else "full"
+        plan = MeasuringPlan(steps, self._laser, tool, config.motion, config.spin_rad)
+        self._runs += 1
+        begun_ns = command.stamp_ns or 0
+        arm, revision = current.arm, current.thermal.revision
+        self.run = ToolRun(
+            self._runs, mode, cycle_id, plan, config, arm, revision, begun_ns, begun_ns
+        )
+        self._edges.clear()
+        self._over = None
+        words = f"run {self._runs} ({mode}): {', '.join(plan.names)}"
+        return Outcome(command, Code.ACCEPT, words)
+
+    def _take_step(self, command: Command, wall_ns: int) -> Outcome:
+        run = self._require_run()
+        marks = command.marks or {}
+        edges = [
+            sample
+            for sample in self._edges
+            if run.from_ns < sample.stamp_ns <= marks.get(f"{EDGES}/{sample.beam}", -1)
+        ]
+        edges.sort(key=lambda sample: (sample.stamp_ns, BEAMS.index(sample.beam)))
+        stamps, q = self._stream.window(run.from_ns + 1, marks.get(JOINTS, 0))
+        step, count = run.awaited, len(edges)
+        try:
+            if count >= MOST_EDGES:
+                raise BeamError(f"{step.name}: {count} edges: a beam flickers; check its alignment")
+            run.take(edges, stamps, q)
+            if not run.complete:
+                run.from_ns = marks.get(JOINTS, 0)
+                self._edges = [e for e in self._edges if e not in edges]
+                words = f"{step.name} ({step.number} of {step.of}) is measured: {count} edges"
+                return Outcome(command, Code.ACCEPT, words, samples=count)
+            outcome = self._results.finish(run, command, wall_ns)
+        except (RobocalError, np.linalg.LinAlgError) as error:
+            self.run = None
+            code = error.code if isinstance(error, RobocalError) else Code.RESIDUAL_TOO_LARGE
+            return Outcome(command, code, str(error), samples=count)
+        self.run = None
+        return replace(outcome, samples=count)
+
+    def _break_off(self, command: Command, wall_ns: int) -> Outcome:
+        run = self._require_run()
+        self.run = None
+        code = Code(int(command.arguments.get("code", Code.CONFLICT)))
+        reason = str(command.arguments.get("reason", "cancelled"))
+        return Outcome(command, code, f"run {run.number}: {reason}")
+
+    def _require_run(self) -> ToolRun:
+        if self.run is None:
+            raise ConflictError("no measurement is open: begin one first")
+        return self.run
+
+    def document(self) -> dict[str, Any]:
+        """Settings and what is in force, so that a replay starts from the same."""
+        current = self._current
+        return {
+            "robot": self.nominal.name,
+            "model_hash": self.nominal.model_hash,
+            "config": self.config.document(),
+            "model": current.thermal.model,
+            "thermal_revision": current.thermal.revision,
+            "tool": current.head.model,
+            "healthy": current.healthy.model,
+        }

@@ -1,0 +1,169 @@
+"""From a complete run to its answer: a tool in the history, or the answer of a quick check."""
+
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.codes import Code
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import HEALTHY_TOOL, TOOL, Proposal
+from robocal_ros.core.tool.crossed_model import Held
+from robocal_ros.core.tool.judging import KnownTool, change_between, changed_tool, judge_tool
+from robocal_ros.core.tool.quick_check import Answer, quick_check
+from robocal_ros.core.tool.run_documents import change_document, check_document, tool_document
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.tool_config import ToolConfig
+from robocal_ros.sessions.tool_in_force import ToolInForce
+from robocal_ros.sessions.tool_run import ToolRun
+
+Document = dict[str, Any]
+
+FULL, QUICK, REFERENCE = "full", "quick", "reference"
+MODES = (FULL, QUICK, REFERENCE)
+REMEMBERED = 200  # answers, and calibrations back to which a cycle's id is known
+CODE_OF: dict[Answer, Code] = {
+    "pass": Code.ACCEPT,
+    "recalibrate": Code.LIMIT_EXCEEDED,
+    "cannot tell": Code.TOO_FEW_SAMPLES,
+}
+
+
+class ToolResults:
+    """Ends runs and remembers what came of them.
+
+    Parameters
+    ----------
+    current : what is in force, followed by the session.
+    software : version that made the tools.
+    """
+
+    def __init__(
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: ToolConfig,
+        software: str,
+        current: ToolInForce,
+    ) -> None:
+        self._nominal, self._history, self._config = nominal, history, config
+        self._software, self._current = software, current
+        self._answers: OrderedDict[str, Outcome] = OrderedDict()
+
+    def of_cycle(self, cycle_id: str) -> Outcome | None:
+        """The answer of a cycle that has ended, None for a new one."""
+        if not cycle_id:
+            return None
+        if cycle_id in self._answers:
+            return self._answers[cycle_id]
+        kinds = (TOOL, HEALTHY_TOOL)
+        for entry in self._history.list(REMEMBERED):
+            if entry.kind in kinds and entry.cycle_id == cycle_id:
+                document = self._history.document(entry.id)
+                return Outcome(Command(""), entry.code, entry.reason, document, entry.id)
+        return None
+
+    def finish(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
+        """Solve a complete run.
+
+        Raises
+        ------
+        RobocalError
+            When no tool explains it, or the result cannot be kept.
+        """
+        ends = {FULL: self._full, QUICK: self._quick, REFERENCE: self._reference}
+        outcome = ends[run.mode](run, command, wall_ns)
+        if run.cycle_id:
+            self._answers[run.cycle_id] = outcome
+            if len(self._answers) > REMEMBERED:
+                self._answers.popitem(last=False)
+        return outcome
+
+    def _full(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
+        estimate = run.estimate(Held())
+        found = KnownTool(estimate.T_flange_tool, estimate.covariance)
+        taught, healthy = self._config.T_flange_taught, self._current.measured_healthy
+        absolute = healthy is None
+        if healthy is not None:
+            found = changed_tool(taught, healthy, found)
+        in_force = self._current.tool
+        verdict = judge_tool(found, estimate, taught, in_force, self._config.limits)
+        document = tool_document(found, estimate, verdict) | {
+            "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
+            "absolute": absolute,
+        }
+        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, found)
+        return Outcome(command, verdict.code, verdict.reason, document, kept)
+
+    def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
+        """Keep how the healthy tool measures; it moves nothing, and is in force at once."""
+        estimate = run.estimate(Held())
+        found = KnownTool(estimate.T_flange_tool, estimate.covariance)
+        change = change_between(self._config.T_flange_taught, found.T_flange_tool)
+        words = (
+            f"the taught tool measures {change.tip_m * 1e3:.3f} mm and "
+            f"{np.degrees(change.axis_rad):.3f} deg off: later runs give the change against this"
+        )
+        verdict = Verdict(Code.ACCEPT, words)
+        document = tool_document(found, estimate, verdict) | {"change": change_document(change)}
+        kept = self._keep(HEALTHY_TOOL, run, command, wall_ns, verdict, document, found)
+        by = str(command.arguments.get("by", ""))
+        self._history.accept(kept, by=by, reason=words, expected_head=None, wall_ns=wall_ns)
+        return Outcome(command, Code.ACCEPT, words, document, kept)
+
+    def _quick(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
+        check = quick_check(
+            run.plan.laser,
+            run.path,
+            run.steps,
+            run.plan.T_flange_tool,
+            self._config.check,
+            noise=run.config.noise,
+            stored_covariance=self._tip_covariance(),
+        )
+        verdict = Verdict(CODE_OF[check.answer], f"{check.answer}: {check.reason}")
+        document = check_document(check, verdict)
+        return Outcome(command, verdict.code, verdict.reason, document)
+
+    def _tip_covariance(self) -> NDArray[np.float64] | None:
+        covariance = self._current.tool.covariance
+        return None if covariance is None else covariance[:3, :3]
+
+    def expected(self) -> NDArray[np.float64]:
+        """How the tool in force measures: with the healthy tool's own deviation, where known."""
+        tool, healthy = self._current.tool, self._current.measured_healthy
+        if healthy is None:
+            return tool.T_flange_tool
+        taught = KnownTool(self._config.T_flange_taught)
+        return changed_tool(healthy.T_flange_tool, taught, tool).T_flange_tool
+
+    def _keep(
+        self,
+        kind: str,
+        run: ToolRun,
+        command: Command,
+        wall_ns: int,
+        verdict: Verdict,
+        document: Document,
+        found: KnownTool,
+    ) -> int:
+        return self._history.propose(
+            Proposal(
+                kind=kind,
+                model_hash=self._nominal.model_hash,
+                based_on=self._history.head(kind).revision,
+                cycle_id=run.cycle_id,
+                stamp_ns=command.stamp_ns or 0,
+                created_ns=wall_ns,
+                software=self._software,
+                method="crossed beams",
+                code=verdict.code,
+                reason=verdict.reason,
+                document=document,
+                model=found.document() | {"thermal_revision": run.thermal_revision},
+                inputs=run.arrays(),
+            )
+        )
