@@ -38,6 +38,7 @@ setup(
     entry_points={
         "console_scripts": [
             "robocal = robocal_ros.cli.main:main",
+            "tcf_node = robocal_ros.nodes.tcf_node:main",
             "thermal_node = robocal_ros.nodes.thermal_node:main",
             "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
             "replay_node = robocal_ros.nodes.replay_node:main",

@@ -63,7 +63,7 @@ class EndpointNode(LifecycleNode):
         super().__init__(name, **options)
         self.inputs: dict[str, InputCount] = {}
         self._log_limit = LogLimit()
-        self._async_group = ReentrantCallbackGroup()
+        self.async_group = ReentrantCallbackGroup()
         self._release: list[Callable[[], object]] = []
 
     @property
@@ -136,7 +136,7 @@ class EndpointNode(LifecycleNode):
                 except Exception as error:
                     return self._refuse(name, response, error)
 
-            service = self.create_service(kind, name, serve, callback_group=self._async_group)
+            service = self.create_service(kind, name, serve, callback_group=self.async_group)
         else:
 
             def answer(request: Any, response: Any) -> Any:

@@ -1,7 +1,5 @@
 """The thermal node: measurements in, judged models out, decisions kept (docs/thermal_node.md)."""
 
-import time
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +7,6 @@ import numpy as np
 from geometry_msgs.msg import PointStamped, PoseStamped
 from numpy.typing import NDArray
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.task import Future
 from sensor_msgs.msg import JointState, PointCloud2, Temperature
 
 from robocal_ros import __version__
@@ -19,6 +16,7 @@ from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.identification import require_parameters
 from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.data_clock import DataClock
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
@@ -28,7 +26,7 @@ from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.thermal_outputs import ThermalOutputs
 from robocal_ros.nodes.thermal_services import ThermalServices
 from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
-from robocal_ros.sessions.events import CYCLE, Command, Outcome
+from robocal_ros.sessions.events import CYCLE, Outcome
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
 from robocal_ros.sessions.records import configuration
@@ -72,7 +70,6 @@ class ThermalNode(HouseNode):
 
     def configure(self) -> None:
         """Open the history, then the topics and services."""
-        self._asked: deque[Future] = deque()
         self._shown: tuple[Any, ...] = ()
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
@@ -92,14 +89,13 @@ class ThermalNode(HouseNode):
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, message_type in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), STREAM)
-        ThermalServices(self.add_service, self._ask, self._history)
+        self._desk = CommandDesk(self, settings["command_timeout_s"], self._show)
+        ThermalServices(self.add_service, self._desk.ask, self._history)
         SetUpServices(
-            self.add_service, self._ask, self._history, self._nominal, settings, self._prior
+            self.add_service, self._desk.ask, self._history, self._nominal, settings, self._prior
         )
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
-        self._deadline = self.add_timer(settings["command_timeout_s"], self._force, steady=True)
-        self._deadline.cancel()
 
     def activate(self) -> None:
         """Begin a session; it knows nothing of what was measured before."""
@@ -107,16 +103,14 @@ class ThermalNode(HouseNode):
             raise ValueError("activated before it was configured")
         config = session_config(self.settings)
         self._session = ThermalSession(self._nominal, self._history, config, __version__)
+        self._desk.session = self._session
         self._shown = ()
         self._show_in_force()
 
     def deactivate(self) -> None:
         """End the session; calls that wait are answered."""
         self._session = None
-        self._deadline.cancel()
-        while self._asked:
-            error = NotActiveError("deactivated while the command waited: nothing was done")
-            self._asked.popleft().set_exception(error)
+        self._desk.close()
 
     def cleanup(self) -> None:
         """Close the history."""
@@ -139,44 +133,14 @@ class ThermalNode(HouseNode):
                 return
             take_message(session, kind, message)
             if session.waiting:
-                self._step()
+                self._desk.step()
 
         return take
-
-    def _ask(self, command: Command) -> Future:
-        """Give a command to the session; the future becomes its outcome."""
-        if self._session is None:
-            raise NotActiveError("no session: activate the node")
-        future: Future = Future()
-        if not self._asked:
-            self._deadline.reset()
-        self._asked.append(future)
-        self._session.submit(command, self.now_ns())
-        self._step()
-        return future
 
     def _prior(self) -> Array:
         if self._session is None:
             raise NotActiveError("no session: activate the node")
         return self._session.expected_drift()
-
-    def _force(self) -> None:
-        self._step(force=True)
-
-    def _step(self, *, force: bool = False) -> None:
-        """Carry out the commands whose samples are complete."""
-        while self._session is not None and self._asked:
-            try:
-                outcomes = self._session.step(wall_ns=time.time_ns(), force=force)
-            except Exception as error:  # a defect must not end the node: the caller is told
-                self._asked.popleft().set_exception(error)
-                continue
-            if not outcomes:
-                return
-            for outcome in outcomes:
-                self._show(outcome)
-            self._asked.popleft().set_result(outcomes[-1])
-        self._deadline.cancel()
 
     def _poll(self) -> None:
         self._guard.look()
@@ -188,7 +152,7 @@ class ThermalNode(HouseNode):
                 self._show(outcome)
             self._show_in_force()
             if (command := session.overdue()) is not None:
-                self._ask(command)
+                self._desk.ask(command)
         except RobocalError as error:  # the history cannot be read: tried again at the next poll
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
 

@@ -1,0 +1,259 @@
+"""The tool node: edges of two crossed beams in, the tool's frame out (docs/tcf_node.md)."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from rclpy.task import Future
+from robocal_msgs.msg import BeamEvent, ToolFrame
+from sensor_msgs.msg import JointState
+
+from robocal_ros import __version__
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.command_desk import CommandDesk
+from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.endpoints import NotActiveError
+from robocal_ros.nodes.run import run
+from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.tcf_outputs import TcfOutputs
+from robocal_ros.nodes.tcf_services import Runner, TcfServices
+from robocal_ros.nodes.tcf_settings import SETTINGS, session_config
+from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
+from robocal_ros.sessions.events import (
+    BREAK_OFF,
+    CONFIGURE,
+    MEASURE_TOOL,
+    TOOL_STEP,
+    Command,
+    Outcome,
+)
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.tool import EDGES, ToolSession
+from robocal_ros.sessions.tool_inputs import take_tool_message
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.laser_files import read_laser_for
+from robocal_ros.storage.robots import load_robot
+
+COMMAND_S = 1.0
+WATCH_S = 0.02
+INPUTS = {JOINTS: (JointState, STREAM), EDGES: (BeamEvent, qos.RELIABLE)}
+
+
+class TcfNode(HouseNode):
+    """Drives a `ToolSession` with live messages and calls."""
+
+    NAME = "tcf_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._session: ToolSession | None = None
+        self._history: CalibrationHistory | None = None
+        self._services: TcfServices | None = None
+
+    def configure(self) -> None:
+        """Read robot and laser, open the history, then the topics, services and the action."""
+        settings = self.settings
+        self._nominal = load_robot(settings["robot"])
+        if not settings["laser"]:
+            raise InputError("laser is empty: name the file that 'robocal tool beams' wrote")
+        placed = read_laser_for(Path(settings["laser"]), self._nominal)
+        taught = self._nominal.T_flange_tool
+        self._config = session_config(settings, placed.laser, placed.station, taught)
+        self._serial_in_use = settings["serial"] or NO_SERIAL
+        folder = settings["state_dir"]
+        self._history = CalibrationHistory.open(
+            self._serial_in_use,
+            model_hash=self._nominal.model_hash,
+            state_dir=Path(folder) if folder else None,
+        )
+        frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
+        self._outputs = TcfOutputs(self.add_output, self._nominal, self._serial_in_use, frames)
+        self._guard = SourceGuard(self, JOINTS)
+        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
+        for kind, (message_type, profile) in INPUTS.items():
+            self.add_input(message_type, kind, self._taker(kind), profile)
+        self._desk = CommandDesk(self, COMMAND_S, self._show)
+        runner = Runner(self._begin, self._ended, self._cancel, lambda: self._last, self._frame)
+        self._services = TcfServices(self, runner, self._desk.ask, self._history)
+        self.add_timer(POLL_S, self._poll, steady=True)
+        self.add_timer(WATCH_S, self._watch, steady=True)
+
+    def activate(self) -> None:
+        """Begin a session; it knows nothing of what was measured before."""
+        if self._history is None:
+            raise ValueError("activated before it was configured")
+        self._session = ToolSession(self._nominal, self._history, self._config, __version__)
+        self._desk.session = self._session
+        self._last: Outcome | None = None
+        self._run_end: Future = Future()
+        self._shown: tuple[int, int, int] | None = None
+        self._joints_s = time.monotonic()
+        self._show_in_force()
+        self._show_step()
+
+    def deactivate(self) -> None:
+        """End the session; calls that wait are answered."""
+        self._session = None
+        self._desk.close()
+        if not self._run_end.done():
+            self._run_end.set_exception(NotActiveError("deactivated: the run is broken off"))
+
+    def cleanup(self) -> None:
+        """Take the action down and close the history."""
+        self._session = None
+        if self._services is not None:
+            self._services.close()
+        self._services = None
+        if self._history is not None:
+            self._history.close()
+        self._history = None
+
+    # ---- samples and commands -------------------------------------------------------------------
+
+    def _taker(self, kind: str) -> Any:
+        def take(message: Any) -> None:
+            session = self._session
+            if session is None:
+                return
+            if kind == JOINTS:
+                if not session.received[JOINTS]:
+                    self._guard.look()
+                if self._guard.fault:
+                    session.ignored.add(JOINTS, self._guard.fault)
+                    return
+                self._joints_s = time.monotonic()
+            take_tool_message(session, kind, message)
+            if (command := session.recognised()) is not None:
+                self._desk.ask(command)
+            elif session.waiting:
+                self._desk.step()
+
+        return take
+
+    def _begin(self, mode: str, cycle_id: str, by: str) -> Any:
+        return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
+
+    def _ended(self) -> Any:
+        return self._run_end
+
+    def _cancel(self, reason: str) -> Any:
+        return self._break_off(Code.CONFLICT, reason)
+
+    def _break_off(self, code: Code, reason: str) -> Any:
+        return self._desk.ask(Command(BREAK_OFF, {"code": int(code), "reason": reason}))
+
+    def _watch(self) -> None:
+        session = self._session
+        if session is None or session.run is None:
+            return
+        silent_s = time.monotonic() - self._joints_s
+        if silent_s > self.settings["joint_silence_s"]:
+            words = f"joint states are silent for {silent_s:.2f} s: check the robot's driver"
+            self._break_off(Code.TOO_FEW_SAMPLES, words)
+
+    def _poll(self) -> None:
+        self._guard.look()
+        if self._session is None:
+            return
+        for outcome in self._session.poll():
+            self._show(outcome)
+        self._show_in_force()
+
+    # ---- outputs --------------------------------------------------------------------------------
+
+    def _show(self, outcome: Outcome) -> None:
+        name = outcome.command.name
+        words = f"{name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
+        if outcome.repeated or self._session is None:
+            return
+        try:
+            self._outputs.event(outcome.command, outcome)
+            if name == MEASURE_TOOL and outcome.done:
+                self._run_end = Future()
+            if name in (MEASURE_TOOL, TOOL_STEP, BREAK_OFF):
+                self._show_step(words)
+            self._show_in_force()
+        except (RobocalError, ValueError) as error:  # what is done stays done
+            self.get_logger().error(f"{name} was done but not published: {error}")
+        if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None:
+            self._end_run(outcome)
+
+    def _end_run(self, outcome: Outcome) -> None:
+        self._last = outcome
+        if outcome.calibration_id and self._history is not None:
+            model = self._history.model(outcome.calibration_id)
+            self._outputs.candidate(model, outcome.command.stamp_ns or 0)
+        self._outputs.quality(outcome)
+        if not self._run_end.done():
+            self._run_end.set_result(outcome)
+
+    def _show_step(self, words: str = "") -> None:
+        session = self._session
+        if session is None:
+            return
+        step: PlannedStep | None = session.awaited
+        number = 0 if session.run is None else session.run.number
+        message = self._outputs.step(step, number, session.newest_joints_ns)
+        if self._services is not None:
+            self._services.feedback(message, words)
+
+    def _frame(self, outcome: Outcome) -> ToolFrame:
+        if self._history is None:
+            return ToolFrame()
+        model = self._history.model(outcome.calibration_id)
+        return self._outputs.frame(model, outcome.command.stamp_ns or 0)
+
+    def _show_in_force(self) -> None:
+        """Publish the tool in force and record the new state, when either changed."""
+        session, history = self._session, self._history
+        if session is None or history is None:
+            return
+        current = session.current
+        head = current.head
+        shown = head.revision, current.thermal.revision, current.healthy.revision
+        if self._shown == shown:
+            return
+        stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
+        thermal = 0 if head.model is None else int(head.model["thermal_revision"])
+        self._outputs.tool(current.tool, head.revision, thermal, stamp)
+        self._shown = shown
+        arguments = session.document() | {"topics": self._topics}
+        marks = dict(session.newest_ns)
+        self._outputs.event(Command(CONFIGURE, arguments, session.newest_joints_ns, marks), None)
+
+    def health(self) -> Health:
+        """Tell what is in force, what is awaited, what was lost or ignored, what is wrong."""
+        session, history, health = self._session, self._history, Health()
+        if session is None or history is None:
+            return health
+        values: dict[str, object] = {"revision in force": session.in_force.revision}
+        run = session.run
+        values["run"] = "none" if run is None else f"{run.number}, {run.awaited.name} is awaited"
+        values["last run"] = "none" if self._last is None else self._last.message
+        for topic, reasons in session.ignored.items():
+            for reason, count in reasons.items():
+                last = session.ignored.last(topic, reason)
+                values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
+        for fault in (self._guard.fault, session.current.fault):
+            if fault:
+                health.worsen(ERROR, fault)
+        if self._outputs.missing:
+            health.worsen(WARN, self._outputs.missing)
+        if self._serial_in_use == NO_SERIAL:
+            health.worsen(WARN, "no serial is set: the history is kept as 'unset'")
+        health.values = values
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(TcfNode)

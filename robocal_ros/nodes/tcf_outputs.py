@@ -1,0 +1,114 @@
+"""What the tool node says: its topics, and how results get onto them."""
+
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import TransformStamped
+from rclpy.qos import QoSProfile
+from robocal_msgs.msg import CalibrationQuality, SessionEvent, ToolFrame, ToolStep
+
+from robocal_ros.core.documents import Document
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.tool_messages import ToolMessages, step_message
+from robocal_ros.sessions.events import Command, Outcome
+
+AddOutput = Callable[[type, str, QoSProfile], Any]
+
+
+class TcfOutputs:
+    """Publishers of one tool's results.
+
+    Parameters
+    ----------
+    add : creates a publisher.
+    base : name of the base frame.
+
+    Attributes
+    ----------
+    missing : what cannot be published on this machine; empty when everything can.
+    """
+
+    def __init__(
+        self,
+        add: AddOutput,
+        nominal: SerialArm,
+        serial: str,
+        frames: tuple[str, str, str],
+    ) -> None:
+        self._base, flange, tool = frames
+        self._nominal, self._serial = nominal, serial
+        self._messages = ToolMessages(nominal, serial, flange, tool)
+        self._sequence = 0
+        self._step = add(ToolStep, "~/next_step", qos.LATCHED)
+        self._candidate = add(ToolFrame, "~/candidate", qos.LATCHED)
+        self._tool = add(ToolFrame, "~/tool", qos.LATCHED)
+        self._frame = add(TransformStamped, "~/tool_frame", qos.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self._tf: Any = None
+        self.missing = ""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            self.missing = "no /tf_static: tf2_msgs is missing (apt install ros-jazzy-tf2-msgs)"
+        else:
+            self._tf_message = TFMessage
+            self._tf = add(TFMessage, "/tf_static", qos.LATCHED)
+
+    def step(self, step: PlannedStep | None, run: int, stamp_ns: int) -> ToolStep:
+        """Say what is awaited; None: nothing is."""
+        stamp = conversions.header(stamp_ns, self._base)
+        message = (
+            ToolStep(header=stamp, run=run)
+            if step is None
+            else step_message(step, run, stamp_ns, self._base)
+        )
+        self._step.publish(message)
+        return message
+
+    def tool(self, known: KnownTool, revision: int, thermal: int, stamp_ns: int) -> None:
+        """Say what is in force."""
+        state = ToolFrame.ACCEPTED if revision else ToolFrame.NONE
+        self._tool.publish(self._messages.frame(known, revision, thermal, state, stamp_ns))
+        transform = self._messages.transform(known, stamp_ns)
+        self._frame.publish(transform)
+        if self._tf is not None:
+            self._tf.publish(self._tf_message(transforms=[transform]))
+
+    def frame(self, model: Document, stamp_ns: int) -> ToolFrame:
+        """A measured tool."""
+        known, thermal = KnownTool.of_document(model), int(model["thermal_revision"])
+        return self._messages.frame(known, 0, thermal, ToolFrame.CANDIDATE, stamp_ns)
+
+    def candidate(self, model: Document, stamp_ns: int) -> None:
+        """Show what was measured."""
+        self._candidate.publish(self.frame(model, stamp_ns))
+
+    def quality(self, outcome: Outcome) -> None:
+        """Show the verdict on a run."""
+        document = outcome.document or {}
+        sigma_mm = document.get("sigma_mm", 0.0)
+        self._quality.publish(
+            CalibrationQuality(
+                header=conversions.header(outcome.command.stamp_ns or 0, self._base),
+                robot=self._nominal.name,
+                serial=self._serial,
+                candidate_id=outcome.calibration_id,
+                code=int(outcome.status),
+                accept=outcome.done,
+                reason=outcome.message,
+                cycle_id=str(document.get("cycle_id", "")),
+                samples=outcome.samples,
+                candidate_rms_mm=float(document.get("misfit_mm", 0.0)),
+                predicted_rms_mm=max(sigma_mm) if isinstance(sigma_mm, list) else float(sigma_mm),
+            )
+        )
+
+    def event(self, command: Command, outcome: Outcome | None) -> None:
+        """Record a command and what came of it."""
+        self._sequence += 1
+        self._events.publish(conversions.event_message(command, outcome, self._sequence))
