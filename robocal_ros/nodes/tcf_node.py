@@ -21,7 +21,7 @@ from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.tcf_outputs import TcfOutputs
 from robocal_ros.nodes.tcf_services import Runner, TcfServices
-from robocal_ros.nodes.tcf_settings import SETTINGS, session_config
+from robocal_ros.nodes.tcf_settings import SETTINGS, session_config, taught_tool
 from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
 from robocal_ros.sessions.events import (
     BREAK_OFF,
@@ -53,7 +53,7 @@ class TcfNode(HouseNode):
         super().__init__(**options)
         self._session: ToolSession | None = None
         self._history: CalibrationHistory | None = None
-        self._services: TcfServices | None = None
+        self._calls: TcfServices | None = None
 
     def configure(self) -> None:
         """Read robot and laser, open the history, then the topics, services and the action."""
@@ -62,7 +62,7 @@ class TcfNode(HouseNode):
         if not settings["laser"]:
             raise InputError("laser is empty: name the file that 'robocal tool beams' wrote")
         placed = read_laser_for(Path(settings["laser"]), self._nominal)
-        taught = self._nominal.T_flange_tool
+        taught = taught_tool(settings, self._nominal)
         self._config = session_config(settings, placed.laser, placed.station, taught)
         self._serial_in_use = settings["serial"] or NO_SERIAL
         folder = settings["state_dir"]
@@ -78,8 +78,15 @@ class TcfNode(HouseNode):
         for kind, (message_type, profile) in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), profile)
         self._desk = CommandDesk(self, COMMAND_S, self._show)
-        runner = Runner(self._begin, self._ended, self._cancel, lambda: self._last, self._frame)
-        self._services = TcfServices(self, runner, self._desk.ask, self._history)
+        runner = Runner(
+            begin=self._begin,
+            ended=lambda: self._run_end,
+            cancel=lambda reason: self._break_off(Code.CONFLICT, reason),
+            last=lambda: self._last,
+            frame=self._frame,
+            step=lambda: self._step,
+        )
+        self._calls = TcfServices(self, runner, self._desk.ask, self._history)
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(WATCH_S, self._watch, steady=True)
 
@@ -106,9 +113,9 @@ class TcfNode(HouseNode):
     def cleanup(self) -> None:
         """Take the action down and close the history."""
         self._session = None
-        if self._services is not None:
-            self._services.close()
-        self._services = None
+        if self._calls is not None:
+            self._calls.close()
+        self._calls = None
         if self._history is not None:
             self._history.close()
         self._history = None
@@ -137,12 +144,6 @@ class TcfNode(HouseNode):
 
     def _begin(self, mode: str, cycle_id: str, by: str) -> Any:
         return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
-
-    def _ended(self) -> Any:
-        return self._run_end
-
-    def _cancel(self, reason: str) -> Any:
-        return self._break_off(Code.CONFLICT, reason)
 
     def _break_off(self, code: Code, reason: str) -> Any:
         return self._desk.ask(Command(BREAK_OFF, {"code": int(code), "reason": reason}))
@@ -202,9 +203,9 @@ class TcfNode(HouseNode):
             return
         step: PlannedStep | None = session.awaited
         number = 0 if session.run is None else session.run.number
-        message = self._outputs.step(step, number, session.newest_joints_ns)
-        if self._services is not None:
-            self._services.feedback(message, words)
+        self._step = self._outputs.step(step, number, session.newest_joints_ns)
+        if self._calls is not None:
+            self._calls.feedback(self._step, words)
 
     def _frame(self, outcome: Outcome) -> ToolFrame:
         if self._history is None:

@@ -42,6 +42,7 @@ class Runner:
     cancel : breaks the open run off.
     last : the outcome of the last run; None before any.
     frame : the measured tool of an outcome.
+    step : the step that is awaited.
     """
 
     def __init__(
@@ -51,9 +52,10 @@ class Runner:
         cancel: Callable[[str], Awaitable[Outcome]],
         last: Callable[[], Outcome | None],
         frame: Callable[[Outcome], ToolFrame],
+        step: Callable[[], ToolStep],
     ) -> None:
         self.begin, self.ended, self.cancel = begin, ended, cancel
-        self.last, self.frame = last, frame
+        self.last, self.frame, self.step = last, frame, step
 
 
 class TcfServices:
@@ -102,6 +104,7 @@ class TcfServices:
             outcome = await self._runner.begin(MODES[request.mode], request.cycle_id, "action")
             if outcome.done and not outcome.repeated:
                 self._goal = goal
+                self.feedback(self._runner.step(), outcome.message)
                 outcome = await self._runner.ended()
         except RobocalError as error:
             return self._end(goal, error.code, str(error))

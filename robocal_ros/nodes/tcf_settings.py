@@ -1,11 +1,14 @@
 """Parameters of the tool node."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.beam_edges import InputRule
 from robocal_ros.core.tool.crossed_model import RobotNoise
 from robocal_ros.core.tool.judging import ToolLimits
@@ -15,6 +18,7 @@ from robocal_ros.core.tool.quick_check import CheckRule
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 
+ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 PROGRAM, TRAJECTORY = "program", "trajectory"
 
 
@@ -26,9 +30,30 @@ def _speed(name: str, default: float, what: str, high: float) -> Setting:
     return Setting(name, default, what, unit="mm/s", low=0.1, high=high)
 
 
+def _length_fault(length: int) -> Callable[[list[float]], str | None]:
+    return lambda values: None if len(values) == length else f"{length} numbers are wanted"
+
+
 SETTINGS = (
     Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
     Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    Setting(
+        "taught_xyz_mm",
+        ORIGIN,
+        "Taught tool in the flange frame; as the quaternion at its default: the robot file's",
+        unit="mm",
+        low=-5000.0,
+        high=5000.0,
+        check=_length_fault(3),
+    ),
+    Setting(
+        "taught_quat_xyzw",
+        UNTURNED,
+        "Its orientation: z from flange to tip",
+        low=-1.0,
+        high=1.0,
+        check=_length_fault(4),
+    ),
     Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
@@ -110,6 +135,23 @@ SETTINGS = (
         high=10.0,
     ),
 )
+
+
+def taught_tool(settings: Mapping[str, Any], nominal: SerialArm) -> NDArray[np.float64]:
+    """T_flange_tool (4, 4) as taught: by the parameters, else by the robot file.
+
+    Raises
+    ------
+    InputError
+        When the quaternion is not of unit length.
+    """
+    xyz_mm, quat = settings["taught_xyz_mm"], settings["taught_quat_xyzw"]
+    if xyz_mm == ORIGIN and quat == UNTURNED:
+        return nominal.T_flange_tool
+    norm = float(np.linalg.norm(quat))
+    if abs(norm - 1.0) > 1e-3:
+        raise InputError(f"taught_quat_xyzw has length {norm:.6g}, not 1")
+    return frames.transform_from_quat(1e-3 * np.array(xyz_mm), np.array(quat) / norm)
 
 
 def session_config(

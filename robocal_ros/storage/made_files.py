@@ -46,9 +46,7 @@ def read_made(path: Path, arm: SerialArm, keys: Sequence[str], what: str, remedy
     return top
 
 
-def require_made_for(
-    arm: SerialArm, path: Path, robot: str, model_hash: str, remedy: str
-) -> None:
+def require_made_for(arm: SerialArm, path: Path, robot: str, model_hash: str, remedy: str) -> None:
     """Refuse a file that was made for another nominal model than ``arm``.
 
     Raises

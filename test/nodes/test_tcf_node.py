@@ -1,0 +1,150 @@
+"""tcf_node over DDS: a simulated robot drives what the node announces."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import TransformStamped
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.msg import CalibrationQuality, ToolFrame
+from robocal_msgs.srv import Decide
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+from tool_cell_live import LiveCell
+from tool_driver import TAUGHT, TRUTH
+
+from robocal_ros.core.codes import Code
+from robocal_ros.nodes import qos
+from robocal_ros.sim.beams import RoundTool, bent
+
+FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
+
+
+def matrix(transform: Any) -> np.ndarray:
+    from robocal_ros.core import frames
+
+    t, r = transform.translation, transform.rotation
+    return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
+
+
+@pytest.fixture
+def cell(graph: Any, tmp_path: Any) -> LiveCell:
+    return LiveCell(graph, tmp_path, TRUTH)
+
+
+def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCell) -> None:
+    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    frame = graph.collect(TransformStamped, "/tcf_node/tool_frame", qos.LATCHED)
+    tools = graph.collect(ToolFrame, "/tcf_node/tool", qos.LATCHED)
+    result = cell.measure()
+    assert result.success, result.message
+    assert result.status == CalibrationQuality.ACCEPT
+    covariance = np.array(result.tool.covariance).reshape(5, 5)
+    away = matrix(result.tool.tool)[:3, 3] - TRUTH[:3, 3]
+    assert away @ np.linalg.solve(covariance[:3, :3], away) < 16.3  # chi-square, 1e-3
+    names = [f.feedback.step.name for f in cell.feedback]
+    assert names == ["low", "high", "upright", "plunge_1", "plunge_2", ""]
+    # Nothing is in force before somebody accepts it.
+    assert matrix(frame[-1].transform) == pytest.approx(TAUGHT, abs=1e-12)
+    done = graph.call(Decide, "/tcf_node/accept", id=result.candidate_id, by="me")
+    assert done.success, done.message
+    graph.spin_until(lambda: tools[-1].revision == 1, "the tool is in force")
+    graph.spin_until(lambda: len(tf) > 1, "the transform")
+    (transform,) = tf[-1].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("tool0", "tool")
+    assert transform.transform == result.tool.tool == tools[-1].tool == frame[-1].transform
+    quick = cell.measure(QUICK)
+    assert quick.answer == MeasureTool.Result.PASS
+    cell.tool = RoundTool.cylinder(bent(TRUTH, [1e-3, 0.0, 0.0], [0.0, 0.0, 0.0]), 0.0025)
+    quick = cell.measure(QUICK)
+    assert quick.answer == MeasureTool.Result.RECALIBRATE
+    assert abs(quick.deviation_mm - 1.0) < 4.0 * quick.sigma_mm
+
+
+def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Any) -> None:
+    cell = LiveCell(graph, tmp_path, TRUTH, joint_silence_s=5.0)
+    cell.rest(0.1)
+    nothing = graph.call(Trigger, "/tcf_node/result_trigger")
+    assert (nothing.success, nothing.message) == (False, "0 CONFLICT no run has ended yet")
+    begun = graph.call(Trigger, "/tcf_node/measure_trigger")
+    assert begun.success, begun.message
+    again = graph.call(Trigger, "/tcf_node/measure_trigger")
+    assert not again.success
+    assert again.message.startswith("0 CONFLICT run 1 is open")
+    cell.follow(lambda: cell.steps[-1].kind == 0)
+    result = graph.call(Trigger, "/tcf_node/result_trigger")
+    assert result.success
+    assert result.message.startswith("1 ACCEPT tip ")
+    accepted = graph.call(Trigger, "/tcf_node/accept_trigger")
+    assert accepted.message == "1 ACCEPT revision 1: calibration 1 in force"
+    back = graph.call(Trigger, "/tcf_node/rollback_trigger")
+    assert back.message == "0 ACCEPT revision 2: the taught tool in force"
+
+
+def test_a_run_is_cancelled(graph: Any, cell: LiveCell) -> None:
+    handle = cell.begin()
+    ended = handle.get_result_async()
+    cell.graph.spin_until(lambda: cell.steps[-1].name == "low", "the first step")
+    cancelled = handle.cancel_goal_async()
+    graph.spin_until(cancelled.done, "the cancel is answered")
+    assert len(cancelled.result().goals_canceling) == 1
+    graph.spin_until(ended.done, "the result")
+    assert ended.result().status == 5  # STATUS_CANCELED
+    assert not ended.result().result.success
+    assert cell.steps[-1].kind == 0
+    assert cell.measure().success
+
+
+def test_the_answer_of_a_cycle_is_given_again(graph: Any, cell: LiveCell) -> None:
+    first = cell.measure(FULL, "gap-1")
+    again = cell.measure(FULL, "gap-1")
+    assert (first.candidate_id, first.message) == (again.candidate_id, again.message)
+    assert again.success
+
+
+def dead(step: Any, edges: list) -> list:
+    return [e for e in edges if e.beam != "y"]
+
+
+def lost(step: Any, edges: list) -> list:
+    return edges[:-1]
+
+
+def test_edges_that_are_lost_end_the_run(graph: Any, cell: LiveCell) -> None:
+    for edit, words in ((dead, "beam y was never broken"), (lost, "edges")):
+        cell.edit = edit
+        result = cell.measure()
+        assert result.status == Code.BEAM_EDGES_WRONG
+        assert words in result.message
+        assert not result.success
+    cell.edit = lambda step, edges: edges
+    assert cell.measure().success
+
+
+def test_joint_states_that_stop_end_the_run(graph: Any, cell: LiveCell) -> None:
+    handle = cell.begin()
+    ended = handle.get_result_async()
+    graph.spin_until(ended.done, "the run is broken off", within_s=5.0)
+    result = ended.result().result
+    assert result.status == Code.TOO_FEW_SAMPLES
+    assert "joint states are silent" in result.message
+
+
+def test_edges_of_another_station_are_not_used(graph: Any, tmp_path: Any) -> None:
+    cell = LiveCell(graph, tmp_path, TRUTH, step_timeout_s=2.0)
+    cell.station = "south"
+    result = cell.measure()
+    assert result.status == Code.BEAM_EDGES_WRONG
+    assert "no edge within 2 s" in result.message
+    ignored = [key for key in cell.node.health().values if "station 'south'" in key]
+    assert len(ignored) == 1
+
+
+def test_a_laser_of_another_robot_is_refused(graph: Any, tmp_path: Any) -> None:
+    cell = LiveCell(graph, tmp_path, TRUTH)
+    other = graph.add(
+        type(cell.node),
+        {"laser": str(tmp_path / "laser.yaml"), "robot": "kr150_r3100"},
+        namespace="other",
+    )
+    assert other.state == "unconfigured"
