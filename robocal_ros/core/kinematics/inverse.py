@@ -68,7 +68,7 @@ def follow(
     """
     from robocal_ros.core.kinematics import following
 
-    goals = np.ascontiguousarray(T_base_point, dtype=np.float64)
+    goals = np.array(T_base_point, dtype=np.float64, order="C")
     near = np.array(q_near, dtype=np.float64)
     if goals.shape[1:] != (4, 4) or near.shape != (arm.n,) or not len(goals):
         raise ValueError(f"poses {goals.shape}, joints {near.shape}: expected (m, 4, 4), (n,)")
@@ -79,8 +79,8 @@ def follow(
     path = Followed(*(np.zeros((len(goals), arm.n)) for _ in range(3)))
     reached, outcome = following.follow_batch(
         goals,
-        np.ascontiguousarray(twist, dtype=np.float64),
-        np.ascontiguousarray(twist_rate, dtype=np.float64),
+        np.array(twist, dtype=np.float64, order="C"),
+        np.array(twist_rate, dtype=np.float64, order="C"),
         near,
         arm.links,
         ends,
