@@ -14,7 +14,7 @@ MOST_ITERATIONS = 15
 SMALL_RESIDUAL = 1e-12
 SMALL_STEP = 1e-9
 
-REACHED, SINGULAR, MISSED, JUMPED = range(4)
+REACHED, SINGULAR, MISSED = range(3)
 
 
 @kernel
@@ -41,7 +41,7 @@ def _reach(
             x[i] += step[i]
             q[i] = near[i] + x[i]
         if not newton.largest_of(x) <= longest:
-            return JUMPED
+            return MISSED
         small = newton.largest_of(step) <= SMALL_STEP
     return MISSED
 

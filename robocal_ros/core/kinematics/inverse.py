@@ -20,6 +20,9 @@ LONGEST_STEP = 0.2
 # bound a joint may turn by 20 rad per metre of the flange's way: 1 rad/s at 50 mm/s.
 SMALLEST_SINGULAR_VALUE = 0.05
 
+_UNREACHED = "it is out of reach, or the arm would have to jump"
+_WHAT_TO_DO = "Move the station, or begin in another posture"
+
 
 @dataclass(frozen=True, eq=False)
 class Followed:
@@ -92,14 +95,8 @@ def follow(
     require_within_limits(arm, path.q[:reached])
     require_regular(arm, path.q[:reached])
     if outcome != following.REACHED:
-        reason = {
-            following.SINGULAR: "the arm is singular there",
-            following.MISSED: "it is out of reach",
-            following.JUMPED: "the arm would have to jump, or it is out of reach",
-        }[outcome]
-        raise LimitError(
-            f"{_pose(goals, reached)}: {reason}. Move the station, or begin in another posture"
-        )
+        why = "the arm is singular there" if outcome == following.SINGULAR else _UNREACHED
+        raise LimitError(f"{_pose(goals, reached)}: {why}. {_WHAT_TO_DO}")
     return path
 
 
@@ -124,7 +121,7 @@ def require_regular(arm: SerialArm, q: Array) -> None:
         raise LimitError(
             f"{_pose(arm.fk(q), pose)}: near a singularity, smallest singular value of the "
             f"Jacobian {smallest[pose]:.4f}, at least {SMALLEST_SINGULAR_VALUE:g} is needed. "
-            "Move the station, or begin in another posture"
+            + _WHAT_TO_DO
         )
 
 

@@ -102,16 +102,16 @@ class MotionCell:
         stopping = 0.5 * fastest * stop_time(self.arm, self.limits, seen.qd)
         margin = float(np.max(stopping) + np.max(fastest) * np.max(np.diff(seen.time_s)))
         places = self.in_laser(seen.corners)
-        for part, clear in self.tool.clearance(self.housing, places, margin).items():
-            i = int(np.argmin(clear))
-            if clear[i] < 0.0:
+        for part, cut in self.tool.cuts(self.housing, places, margin).items():
+            i = int(np.argmax(cut))
+            if cut[i] > 0.0:
                 x, y, z = 1e3 * places[i, 0]
                 raise LimitError(
-                    f"{name}: {part} would be {(clear[i] + margin) * 1e3:.1f} mm clear of the "
-                    f"station's housing, at least {margin * 1e3:.1f} mm are needed, with the tip "
-                    f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm of the laser frame, "
-                    f"{seen.time_s[i]:.2f} s after the start: drive the tool above the station "
-                    "by hand, or check the sizes of housing, tool and circle"
+                    f"{name}: {part}, with {margin * 1e3:.1f} mm to be kept free, would cut "
+                    f"{cut[i] * 1e3:.1f} mm into the station's housing, the tip at "
+                    f"({x:.1f}, {y:.1f}, {z:.1f}) mm of the laser frame, {seen.time_s[i]:.2f} s "
+                    "after the start: drive the tool above the station by hand, or check the "
+                    "sizes of housing, tool and circle"
                 )
 
     def _sampled(self, plan: JointPlan) -> "_Sampled":

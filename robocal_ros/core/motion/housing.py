@@ -44,11 +44,11 @@ class Housing:
         across = np.hypot(p_laser[0], p_laser[1])
         return bool(across < self.clear_radius_m and self.floor_m < p_laser[2] < self.top_m)
 
-    def clearance(self, start: Array, end: Array, radius_m: float) -> Array:
-        """Least distances (m,) of capsules to the housing; negative: how far one cuts into it.
+    def cut_by(self, start: Array, end: Array, radius_m: float) -> Array:
+        """How far capsules cut into the housing (m,), m; 0 where they are clear of it.
 
-        ``start``, ``end`` (m, 3): ends of their axes, laser frame. At the edge of the opening a
-        capsule counts as the cylinder around it: the distance is never overrated.
+        ``start``, ``end`` (m, 3): ends of their axes, laser frame. At the edge of the opening
+        what is round counts as square: no cut is overlooked.
         """
         swapped = start[:, 2:] > end[:, 2:]
         low, high = np.where(swapped, end, start), np.where(swapped, start, end)
@@ -60,7 +60,8 @@ class Housing:
         widest = np.maximum(np.hypot(low[:, 0], low[:, 1]), np.hypot(cut[:, 0], cut[:, 1]))
         wall = self.clear_radius_m - radius_m - widest
         open_space = np.maximum(wall, low[:, 2] - brim)
-        return np.asarray(np.minimum(open_space, low[:, 2] - radius_m - self.floor_m))
+        above_floor = low[:, 2] - radius_m - self.floor_m
+        return np.asarray(np.maximum(-np.minimum(open_space, above_floor), 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +96,15 @@ class ToolBody:
         upper = self.p_tip - self.length_m * self.T_flange_tool[:3, 2]
         return np.stack([self.p_tip, upper, np.zeros(3)])
 
-    def clearance(self, housing: Housing, p_laser: Array, margin_m: float) -> dict[str, Array]:
-        """Distances (m,) less a margin, by part; ``p_laser`` (m, 3, 3) the corners' places."""
+    def cuts(self, housing: Housing, p_laser: Array, margin_m: float) -> dict[str, Array]:
+        """How far each part, grown by a margin, cuts into the housing (m,), m.
+
+        ``p_laser`` (m, 3, 3): the corners' places.
+        """
         tip, upper, flange = np.swapaxes(p_laser, 0, 1)
         radius = self.radius_m + margin_m
         return {
-            "the tool": housing.clearance(tip, upper, radius),
-            "the tool's upper part": housing.clearance(upper, flange, radius),
-            "the flange": housing.clearance(flange, flange, self.flange_radius_m + margin_m),
+            "the tool": housing.cut_by(tip, upper, radius),
+            "the tool's upper part": housing.cut_by(upper, flange, radius),
+            "the flange": housing.cut_by(flange, flange, self.flange_radius_m + margin_m),
         }

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 SHORTEST_RAMP_S = 0.1  # a controller would round off a shorter one
 SPACING_S = 0.01  # of points; the cubic between two of a circle of 12 mm misses by nanometres
-MOST_POINTS = 300  # of one phase
+MOST_POINTS = 200  # of one phase
 
 
 @dataclass(frozen=True)
