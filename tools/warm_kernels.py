@@ -8,6 +8,7 @@ import numpy as np
 from robocal_ros.core.identification import identify
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.inverse import inverse
 from robocal_ros.core.samples import Measurements
 
 POSES = 30
@@ -43,6 +44,8 @@ def main() -> None:
     arm.jacobian(q)
     arm.parameter_jacobian(q)
     T = arm.fk(q)
+    here = np.array([0.1, -1.2, 1.0, 0.4, 1.2, 0.3])
+    inverse(arm, arm.fk(here)[None], here)
     names = tuple(str(i) for i in range(POSES))
     noise = 1e-5 * rng.standard_normal((POSES, 3))
     position = T[:, :3, 3] + 0.1 * T[:, :3, 2] + noise

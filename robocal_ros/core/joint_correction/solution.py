@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel
 from robocal_ros.core.joint_correction import kernels as k
+from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 
 Array = NDArray[np.float64]
@@ -55,13 +56,13 @@ def _aim(
 ) -> None:
     """Where the actual flange's axes and the tool's origin must go; ``root`` and ``tool`` too."""
     n = q.shape[0]
-    k.pose(reference[n], root)
+    newton.pose(reference[n], root)
     walk(q, reference[:n], root, frames, goal)
-    k.pose(reference[n + 1], spare)
-    k.at_tool(goal, spare)
-    k.pose(actual[n + 1], tool)
+    newton.pose(reference[n + 1], spare)
+    newton.at_tool(goal, spare)
+    newton.pose(actual[n + 1], tool)
     k.swap_tool(goal, spare, tool)
-    k.pose(actual[n], root)
+    newton.pose(actual[n], root)
 
 
 @kernel
@@ -72,8 +73,8 @@ def _residual_at(
     for i in range(q.shape[0]):
         out[i] = q[i] + x[i]
     walk(out[: q.shape[0]], links, ends[0], frames, ends[3])
-    k.at_tool(ends[3], ends[1])
-    return k.residual(ends[2], ends[3], e)
+    newton.at_tool(ends[3], ends[1])
+    return newton.residual(ends[2], ends[3], e)
 
 
 @kernel
@@ -98,18 +99,18 @@ def _first_steps(
     """
     n = q.shape[0]
     x, step = steps[0, :n], steps[1, :n]
-    k.solve(J, L, e, x, step)
+    newton.solve(J, L, e, x, step)
     share = k.share(step, largest)
     for r in range(6):
         steps[2, r] = e[r]
     start = ends[4]
-    k.copy(ends[3], start)
+    newton.copy(ends[3], start)
     if share < 1.0:
         k.part_of_the_way(start, steps[2, :6], share, ends[2])
     for i in range(n):
         x[i] = share * step[i]
     _residual_at(q, x, links, ends, frames, out, e)
-    k.solve(J, L, e, x, step)
+    newton.solve(J, L, e, x, step)
     length, second, along = 1e-300, 0.0, 0.0
     for i in range(n):
         length += x[i] * x[i]
@@ -128,7 +129,7 @@ def _first_steps(
 @kernel
 def _add_step(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
     """One step with a factored matrix."""
-    k.solve(J, L, e, x, step)
+    newton.solve(J, L, e, x, step)
     for i in range(x.shape[0]):
         x[i] += step[i]
 
@@ -166,10 +167,10 @@ def _newton(
     for i in range(n):
         x[i] = 0.0
     share, iterations = 1.0, 0
-    converged = k.largest_of(e) <= SMALL_RESIDUAL
+    converged = newton.largest_of(e) <= SMALL_RESIDUAL
     while not converged and iterations < MOST_ITERATIONS:
-        k.columns(links, frames, ends[3], J)
-        if not k.factor(J, L):
+        newton.columns(links, frames, ends[3], J)
+        if not newton.factor(J, L):
             if iterations == 0:
                 share, converged = 0.0, True
             break
@@ -183,7 +184,7 @@ def _newton(
             # a second step with the same matrix: third order for little more
             _add_step(J, L, e, x, step)
             converged = _residual_at(q, x, links, ends, frames, out, e) <= SMALL_RESIDUAL
-        if converged or (iterations > 1 and k.largest_of(step) <= SMALL_STEP):
+        if converged or (iterations > 1 and newton.largest_of(step) <= SMALL_STEP):
             _add_step(J, L, e, x, step)
             converged = True
     out[n + CONVERGED] = _take(q, x, largest, converged, out)
@@ -214,16 +215,16 @@ def correct_point(
     links = actual[:n]
     _aim(q, reference, actual, frames, ends[0], ends[1], ends[4], goal)
     walk(q, links, ends[0], frames, here)
-    k.at_tool(here, ends[1])
-    k.residual(goal, here, e)
-    out[n + TCP_SHIFT], out[n + TCP_ROTATION] = k.length(e, 0), k.length(e, 3)
-    k.copy(goal, ends[2])
+    newton.at_tool(here, ends[1])
+    newton.residual(goal, here, e)
+    out[n + TCP_SHIFT], out[n + TCP_ROTATION] = newton.length(e, 0), newton.length(e, 3)
+    newton.copy(goal, ends[2])
     _newton(q, links, ends, largest, frames, J, L, steps, out, e)
     if out[n + SHARE] < 1.0:
         walk(out[:n], links, ends[0], frames, here)
-        k.at_tool(here, ends[1])
-        k.residual(goal, here, e)
-    out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = k.length(e, 0), k.length(e, 3)
+        newton.at_tool(here, ends[1])
+        newton.residual(goal, here, e)
+    out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = newton.length(e, 0), newton.length(e, 3)
 
 
 @kernel

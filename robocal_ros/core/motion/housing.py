@@ -1,0 +1,110 @@
+"""The housing of a beam station, and the tool and flange that must stay clear of it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Housing:
+    """What is solid at a station, seen from the laser frame: z up, the crossing as origin.
+
+    Solid is all that lies below ``top_m`` outside a cylinder about z, and all below ``floor_m``.
+
+    Attributes
+    ----------
+    clear_radius_m : of that cylinder, the opening.
+    top_m, floor_m : heights above the beam plane; the floor's is negative.
+    retract_m : height of the tool's tip on a way over the housing.
+    """
+
+    clear_radius_m: float
+    top_m: float
+    floor_m: float
+    retract_m: float
+
+    def __post_init__(self) -> None:
+        if not np.all(np.isfinite(list(vars(self).values()))):
+            raise InputError(f"{self}: all sizes must be finite")
+        if not (self.clear_radius_m > 0.0 > self.floor_m and self.top_m >= 0.0):
+            raise InputError(f"{self}: clear_radius_m > 0, top_m >= 0 and floor_m < 0 are needed")
+        if not self.retract_m > self.top_m:
+            raise InputError(
+                f"retract_m = {self.retract_m:g} must be above top_m = {self.top_m:g}: "
+                "the tip passes over the housing at this height"
+            )
+
+    def opening_holds(self, p_laser: Array) -> bool:
+        """Whether a point (3,) is in the opening."""
+        across = np.hypot(p_laser[0], p_laser[1])
+        return bool(across < self.clear_radius_m and self.floor_m < p_laser[2] < self.top_m)
+
+    def cut_by(self, start: Array, end: Array, radius_m: float) -> Array:
+        """How far capsules cut into the housing (m,), m; 0 where they are clear of it.
+
+        ``start``, ``end`` (m, 3): ends of their axes, laser frame. At the edge of the opening
+        what is round counts as square: no cut is overlooked.
+        """
+        swapped = start[:, 2:] > end[:, 2:]
+        low, high = np.where(swapped, end, start), np.where(swapped, start, end)
+        brim = self.top_m + radius_m
+        rise = np.maximum(high[:, 2] - low[:, 2], 1e-300)
+        share = np.clip((brim - low[:, 2]) / rise, 0.0, 1.0)[:, None]
+        cut = low + share * (high - low)
+        # The distance from z is convex along the axis: it is largest at an end of what is below.
+        widest = np.maximum(np.hypot(low[:, 0], low[:, 1]), np.hypot(cut[:, 0], cut[:, 1]))
+        wall = self.clear_radius_m - radius_m - widest
+        open_space = np.maximum(wall, low[:, 2] - brim)
+        above_floor = low[:, 2] - radius_m - self.floor_m
+        return np.asarray(np.maximum(-np.minimum(open_space, above_floor), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ToolBody:
+    """A tool as two capsules, along its axis from the tip and on to the flange, and the flange.
+
+    Attributes
+    ----------
+    T_flange_tool : (4, 4) tip, and axis from flange to tip along z.
+    length_m, radius_m : of the part along the axis; the rest of the tool has this radius too.
+    flange_radius_m : of a ball around the flange's origin.
+    """
+
+    T_flange_tool: Array
+    length_m: float
+    radius_m: float
+    flange_radius_m: float
+
+    def __post_init__(self) -> None:
+        for name in ("length_m", "radius_m", "flange_radius_m"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"{name} = {getattr(self, name)}: must be positive and finite")
+
+    @property
+    def p_tip(self) -> Array:
+        """(3,) flange frame."""
+        return np.asarray(self.T_flange_tool[:3, 3])
+
+    @property
+    def corners(self) -> Array:
+        """Tip, upper end of the axis, flange (3, 3), flange frame."""
+        upper = self.p_tip - self.length_m * self.T_flange_tool[:3, 2]
+        return np.stack([self.p_tip, upper, np.zeros(3)])
+
+    def cuts(self, housing: Housing, p_laser: Array, margin_m: float) -> dict[str, Array]:
+        """How far each part, grown by a margin, cuts into the housing (m,), m.
+
+        ``p_laser`` (m, 3, 3): the corners' places.
+        """
+        tip, upper, flange = np.swapaxes(p_laser, 0, 1)
+        radius = self.radius_m + margin_m
+        return {
+            "the tool": housing.cut_by(tip, upper, radius),
+            "the tool's upper part": housing.cut_by(upper, flange, radius),
+            "the flange": housing.cut_by(flange, flange, self.flange_radius_m + margin_m),
+        }

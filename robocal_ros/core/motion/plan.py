@@ -1,0 +1,82 @@
+"""A motion of the joints over time, as a trajectory controller will interpolate it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class JointPlan:
+    """Points of a joint trajectory, at rest at its end.
+
+    Between points it is the cubic through positions and velocities: what a trajectory controller
+    makes of points that carry these two. ``qdd`` is the exact path's; sent along, it would turn
+    the cubic into a quintic.
+
+    Attributes
+    ----------
+    time_s : (k,) from the start, increasing, the first 0.
+    q, qd, qdd : (k, n) joints, rad (prismatic: m), and their derivatives.
+    """
+
+    time_s: Array
+    q: Array
+    qd: Array
+    qdd: Array
+
+    @property
+    def duration_s(self) -> float:
+        """From its start to rest."""
+        return float(self.time_s[-1])
+
+    @cached_property
+    def _cubics(self) -> tuple[Any, Any]:
+        from scipy.interpolate import CubicHermiteSpline
+
+        spline = CubicHermiteSpline(self.time_s, self.q, self.qd)
+        return spline, spline.derivative()
+
+    def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
+        """Joints (..., n) and their velocity; before the start as there, after the end at rest."""
+        t = np.asarray(time_s, dtype=np.float64)
+        position, velocity = self._cubics
+        inside = np.clip(t, 0.0, self.duration_s)
+        moving = (t <= self.duration_s)[..., None]
+        return np.asarray(position(inside)), np.where(moving, velocity(inside), 0.0)
+
+    def peaks(self) -> tuple[Array, Array]:
+        """Largest speed and acceleration (n,) of each joint, exactly, between points too."""
+        h = np.diff(self.time_s)[:, None]
+        way, before, after = np.diff(self.q, axis=0) / h, self.qd[:-1], self.qd[1:]
+        first = (6.0 * way - 4.0 * before - 2.0 * after) / h
+        last = (4.0 * after + 2.0 * before - 6.0 * way) / h
+        # The velocity is a parabola, with its vertex between the points where these differ in sign.
+        turns = first * last < 0.0
+        vertex = before + 0.5 * h * first**2 / np.where(turns, first - last, np.inf)
+        speed = np.maximum(np.max(np.abs(self.qd), axis=0), np.max(np.abs(vertex), axis=0))
+        return speed, np.max(np.maximum(np.abs(first), np.abs(last)), axis=0)
+
+    def slower(self, factor: float) -> "JointPlan":
+        """The same way in ``factor`` times the time."""
+        return JointPlan(
+            self.time_s * factor, self.q, self.qd / factor, self.qdd / (factor * factor)
+        )
+
+
+def joined(plans: Sequence[JointPlan]) -> JointPlan:
+    """Plans one after the other; each begins where the one before came to rest."""
+    starts = np.cumsum([0.0, *(plan.duration_s for plan in plans[:-1])])
+    rest = [slice(None), *([slice(1, None)] * (len(plans) - 1))]
+    return JointPlan(
+        np.concatenate([p.time_s[r] + t for p, r, t in zip(plans, rest, starts, strict=True)]),
+        *(
+            np.concatenate([getattr(p, name)[r] for p, r in zip(plans, rest, strict=True)])
+            for name in ("q", "qd", "qdd")
+        ),
+    )
