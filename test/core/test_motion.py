@@ -264,6 +264,19 @@ def test_slow_joints_make_an_approach_slow_but_not_a_circle(robot):
 
 
 @ROBOTS
+def test_an_approach_takes_all_that_the_limits_give(robot):
+    for limits, share in (
+        (MotionLimits(joint_velocity=0.01, joint_acceleration=50.0), 0),
+        (MotionLimits(joint_velocity=5.0, joint_acceleration=0.1), 1),
+    ):
+        cell = make_motion_cell(robot, limits=limits)
+        q = started(cell, circle_step(cell), robot)
+        peaks = approach(cell, plunge_step(cell), q).peaks()
+        limit = limits.of_joints(cell.arm)[share]
+        assert np.max(peaks[share] / limit) == pytest.approx(1.0, rel=1e-6)
+
+
+@ROBOTS
 @pytest.mark.parametrize("joint", range(6))
 def test_a_robot_elsewhere_is_refused_and_the_joint_named(robot, joint):
     cell = make_motion_cell(robot)
@@ -295,6 +308,15 @@ def test_a_circle_too_wide_for_the_opening_is_refused(robot):
     limits = MotionLimits(stop_deceleration=20.0)
     wide = make_motion_cell(robot, housing=replace(OPENING, clear_radius_m=0.0178), limits=limits)
     assert measuring(wide, step, started(wide, step, robot)).duration_s > 0.0
+
+
+@ROBOTS
+def test_room_for_a_stop_is_kept_to_the_housing(robot):
+    limits = MotionLimits(stop_deceleration=0.5)  # 0.1 rad/s: 0.2 s, 5 mm at 50 mm/s
+    cell = make_motion_cell(robot, housing=replace(OPENING, clear_radius_m=0.0178), limits=limits)
+    step = circle_step(cell)
+    with pytest.raises(LimitError, match=r"mm to be kept free"):
+        measuring(cell, step, started(cell, step, robot))
 
 
 @ROBOTS
@@ -333,6 +355,36 @@ def test_a_joint_limit_on_the_way_is_named():
     near = replace(cell, arm=replace(cell.arm, upper=upper))
     with pytest.raises(LimitError, match=f"{cell.arm.joint_names[joint]} would be at"):
         measuring(near, step, q)
+
+
+def test_joints_keep_their_limits_between_points_too():
+    cell = make_motion_cell("ur10")
+    step = circle_step(cell)
+    q = started(cell, step, "ur10")
+    free = measuring(cell, step, q)
+    between = np.max(free.at(instants(free, 1e-4))[0], axis=0)
+    at_points = np.max(free.q, axis=0)
+    joint = int(np.argmax(between - at_points))
+    assert between[joint] - at_points[joint] > 1e-9
+    upper = cell.arm.upper.copy()
+    upper[joint] = at_points[joint] + 0.1 * (between[joint] - at_points[joint])
+    near = replace(cell, arm=replace(cell.arm, upper=upper))
+    with pytest.raises(LimitError, match=f"{cell.arm.joint_names[joint]} would be at"):
+        measuring(near, step, q)
+
+
+@ROBOTS
+def test_accelerations_of_a_turn_are_those_of_its_velocities(robot):
+    cell = make_motion_cell(robot)
+    step = circle_step(cell)
+    plan = measuring(cell, step, started(cell, step, robot))
+    begin, end = turn_s(step, cell.limits)
+    turn = (plan.time_s > begin + 1e-9) & (plan.time_s < end - 1e-9)
+    slope = np.gradient(plan.qd, plan.time_s, axis=0)[turn]
+    # of a sine: omega^2 h^2 / 6 of its size
+    size = np.max(np.abs(slope))
+    allowed = size * (step.speed_m_s / step.radius_m * 0.01) ** 2
+    np.testing.assert_allclose(plan.qdd[turn], slope, atol=allowed)
 
 
 def test_a_station_near_a_singularity_or_out_of_reach_is_refused():
