@@ -15,6 +15,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import (
     ReplayReport,
     automatic_commands,
@@ -77,7 +78,7 @@ def replay_bag(request: Request, watch: Watch) -> Document:
             session = _session(recording, arm, history)
             commands = _commands(request, recording, arm, history, watch)
             samples = watch("replaying", recording)
-            report = replay(session, samples, commands, recording.inputs)
+            report = replay(session, samples, commands, recording.inputs, take_message)
             used = commands is recording.commands
             document = _document(report, session, recording) | {"recorded": used}
             document["warnings"] += [kept] if kept else []
@@ -126,7 +127,7 @@ def _commands(
         return recording.commands
     scout = _session(recording, arm, history)
     for sample in watch("looking for cycles", recording):
-        feed(scout, sample, recording.inputs)
+        feed(scout, sample, recording.inputs, take_message)
     observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:
         lost = scout.desk.ignored.words()

@@ -25,7 +25,6 @@ from robocal_ros.nodes.tcf_settings import SETTINGS, session_config, taught_tool
 from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
 from robocal_ros.sessions.events import (
     BREAK_OFF,
-    CONFIGURE,
     MEASURE_TOOL,
     TOOL_STEP,
     Command,
@@ -34,6 +33,7 @@ from robocal_ros.sessions.events import (
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool import EDGES, ToolSession
 from robocal_ros.sessions.tool_inputs import take_tool_message
+from robocal_ros.sessions.tool_recorded import configuration
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.laser_files import read_laser_for
 from robocal_ros.storage.robots import load_robot
@@ -227,9 +227,7 @@ class TcfNode(HouseNode):
         thermal = 0 if head.model is None else int(head.model["thermal_revision"])
         self._outputs.tool(current.tool, head.revision, thermal, stamp)
         self._shown = shown
-        arguments = session.document() | {"topics": self._topics}
-        marks = dict(session.newest_ns)
-        self._outputs.event(Command(CONFIGURE, arguments, session.newest_joints_ns, marks), None)
+        self._outputs.event(configuration(session, self._topics), None)
 
     def health(self) -> Health:
         """Tell what is in force, what is awaited, what was lost or ignored, what is wrong."""

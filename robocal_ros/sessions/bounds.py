@@ -1,5 +1,6 @@
 """Which samples a command is about: its stamp, its marks, and whether all of them have come."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -50,11 +51,16 @@ class Bounds:
         """Whether its samples are complete."""
         newest = self._desk.newest_ns
         if command.marks is not None:
-            marks = dict(command.marks)
-            jumps = marks.pop(JUMPS, 0)
-            reached = all(newest.get(topic, -1) >= stamp for topic, stamp in marks.items())
-            return self._desk.jumps > jumps or (self._desk.jumps == jumps and reached)
+            return reached(command.marks, newest, self._desk.jumps)
         if command.name not in events.MEASURED:
             return True
         wanted = (command.stamp_ns or 0) + int(self._config.lateness_s * 1e9)
         return newest.get(JOINTS, -1) >= wanted
+
+
+def reached(marks: Mapping[str, int], newest_ns: Mapping[str, int], jumps: int) -> bool:
+    """Whether samples have come as far as the marks of a recorded command."""
+    wanted = marks.get(JUMPS, 0)
+    topics = (topic for topic in marks if topic != JUMPS)
+    near = all(newest_ns.get(topic, -1) >= marks[topic] for topic in topics)
+    return jumps > wanted or (jumps == wanted and near)

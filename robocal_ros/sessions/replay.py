@@ -1,9 +1,9 @@
 """A recorded stream through the thermal session: the live node's results, off line."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -12,12 +12,10 @@ from robocal_ros.core.samples import stamp_ns
 from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observation import Observation
 from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
 from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.temperatures import TEMPERATURES
-from robocal_ros.sessions.thermal import ThermalSession
 
 EVENTS = "session_events"
 UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
@@ -34,6 +32,23 @@ class Recorded(Protocol):
     @property
     def message(self) -> Any:
         """The message."""
+
+
+class Replayed(Protocol):
+    """What a session does with commands."""
+
+    @property
+    def newest_joints_ns(self) -> int:
+        """Time of the data: what a replay's history has in place of the wall clock."""
+
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command."""
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command."""
+
+
+S = TypeVar("S", bound=Replayed)
 
 
 @dataclass
@@ -117,7 +132,10 @@ def input_topics(topics: Iterable[str], configured: Command | None = None) -> di
 
 
 def feed(
-    session: ThermalSession, recorded: Recorded, topics: Mapping[str, str] | None = None
+    session: S,
+    recorded: Recorded,
+    topics: Mapping[str, str] | None,
+    take: Callable[[S, str, Any], None],
 ) -> None:
     """Give a recorded sample to the session; one that cannot be used is counted.
 
@@ -125,42 +143,38 @@ def feed(
     """
     topic = recorded.topic
     kind = topic_kind(topic) if topics is None else topics.get(topic, "")
-    take_message(session, kind, recorded.message)
+    take(session, kind, recorded.message)
 
 
 def replay(
-    session: ThermalSession,
+    session: S,
     messages: Iterable[Recorded],
     commands: Sequence[tuple[Command, Mapping[str, Any]]],
-    topics: Mapping[str, str] | None = None,
+    topics: Mapping[str, str] | None,
+    take: Callable[[S, str, Any], None],
 ) -> ReplayReport:
     """Play samples through a session and carry out commands where they were carried out.
 
     ``commands``: each with its recorded outcome (empty: none was recorded). Ids of calibrations
     differ between histories; a recorded id is translated to the one given here.
-    ``topics``: see `input_topics`.
+    ``topics``: see `input_topics`; ``take`` gives a message of an input to the session.
     """
     report = ReplayReport(commands=len(commands))
     expected = iter(commands)
     ids: dict[int, int] = {}
     awaited = _submit_next(session, expected, ids)
     for recorded in messages:
-        feed(session, recorded, topics)
-        while awaited is not None and (done := session.step(wall_ns=_now(session))):
+        feed(session, recorded, topics, take)
+        while awaited is not None and (done := session.step(wall_ns=session.newest_joints_ns)):
             awaited = _take(session, report, done, awaited, expected, ids)
     while awaited is not None:
-        done = session.step(wall_ns=_now(session), force=True)
+        done = session.step(wall_ns=session.newest_joints_ns, force=True)
         awaited = _take(session, report, done, awaited, expected, ids)
     return report
 
 
-def _now(session: ThermalSession) -> int:
-    """Time of the data: what a replay's history has in place of the wall clock."""
-    return session.desk.newest_ns.get(JOINTS, 0)
-
-
 def _submit_next(
-    session: ThermalSession,
+    session: Replayed,
     expected: Iterator[tuple[Command, Mapping[str, Any]]],
     ids: Mapping[int, int],
 ) -> Mapping[str, Any] | None:
@@ -176,7 +190,7 @@ def _submit_next(
 
 
 def _take(
-    session: ThermalSession,
+    session: Replayed,
     report: ReplayReport,
     done: list[Outcome],
     recorded: Mapping[str, Any],

@@ -55,17 +55,18 @@ def session_as_recorded(
         raise InputError(f"the recorded configuration lacks {error}") from error
     fresh = not history.list(1)
     if fresh:
-        _bring_into_force(history, THERMAL, nominal, model, software)
-        _bring_into_force(history, REFERENCE, nominal, reference, software)
+        bring_into_force(history, THERMAL, nominal, model, software)
+        bring_into_force(history, REFERENCE, nominal, reference, software)
     session = ThermalSession(nominal, history, config_of(arguments), software)
     if fresh and tracker is not None and session.follower is not None:
         session.follower.go_on_from(FollowerState.of_document(tracker))
     return session
 
 
-def _bring_into_force(
+def bring_into_force(
     history: History, kind: str, nominal: SerialArm, model: Mapping[str, Any] | None, software: str
 ) -> None:
+    """Accept what was in force when a recording began; None: nothing was."""
     if model is None:
         return
     calibration_id = history.propose(

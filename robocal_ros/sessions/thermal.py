@@ -102,6 +102,11 @@ class ThermalSession:
         return self._current.fault
 
     @property
+    def newest_joints_ns(self) -> int:
+        """Stamp of the newest joint reading; 0 before any."""
+        return self.desk.newest_ns.get(JOINTS, 0)
+
+    @property
     def arm(self) -> SerialArm:
         """The arm with the model in force."""
         return self._current.arm

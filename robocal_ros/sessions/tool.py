@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -18,12 +17,13 @@ from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.sessions import events
+from robocal_ros.sessions.bounds import reached
 from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.ignored import Ignored
 from robocal_ros.sessions.in_force import outside_decision
-from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.observations import JOINTS, JUMPS
 from robocal_ros.sessions.tool_config import ToolConfig
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_results import MODES, QUICK, ToolResults
@@ -59,7 +59,7 @@ class ToolSession:
         self._stream = JointStream(nominal.joint_names)
         self._edges: list[EdgeSample] = []
         self._queue: list[Command] = []
-        self._runs = 0
+        self._runs = self._jumps = 0
         self._over: Command | None = None
         self.run: ToolRun | None = None
         self.newest_ns: dict[str, int] = {}
@@ -82,6 +82,11 @@ class ToolSession:
     def awaited(self) -> PlannedStep | None:
         """The step to be driven now; None while nothing is awaited."""
         return None if self.run is None else self.run.awaited
+
+    @property
+    def marks(self) -> dict[str, int]:
+        """How far the samples have come: newest stamps, and jumps of the clock."""
+        return self.newest_ns | {JUMPS: self._jumps}
 
     @property
     def newest_joints_ns(self) -> int:
@@ -114,6 +119,7 @@ class ToolSession:
         run = self.run
         if began is not None and newest < before:
             self._edges.clear()
+            self._jumps += 1
             self.newest_ns = {JOINTS: newest}
             self._end_early("the clock jumped back")
         elif run is not None and self._over is None and newest > run.from_ns:
@@ -181,23 +187,22 @@ class ToolSession:
         command = self._queue.pop(0)
         outside = self.poll()
         if command.marks is None:
-            command = replace(command, marks=dict(self.newest_ns))
+            command = replace(command, marks=self.marks)
         outcome = self._carry_out(command, wall_ns)
-        marks = self.newest_ns
-        outside += [outside_decision(d, marks) for d in self._current.look(wall_ns)]
+        outside += [outside_decision(d, self.marks) for d in self._current.look(wall_ns)]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
 
     def poll(self) -> list[Outcome]:
         """Take over what another process decided in the history since the last look."""
-        return [outside_decision(d, self.newest_ns) for d in self._current.look()]
+        return [outside_decision(d, self.marks) for d in self._current.look()]
 
     def _ready(self, command: Command) -> bool:
-        marks = command.marks or {}
-        return all(self.newest_ns.get(topic, -1) >= stamp for topic, stamp in marks.items())
+        return command.marks is None or reached(command.marks, self.newest_ns, self._jumps)
 
     def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
         handlers: dict[str, Callable[[Command, int], Outcome]] = {
             events.MEASURE_TOOL: self._measure,
+            events.STEP_BEGINS: self._step_begins,
             events.TOOL_STEP: self._take_step,
             events.BREAK_OFF: self._break_off,
             events.ACCEPT: self._decide,
@@ -242,6 +247,12 @@ class ToolSession:
         words = f"run {self._runs} ({mode}): {', '.join(plan.names)}"
         return Outcome(command, Code.ACCEPT, words)
 
+    def _step_begins(self, command: Command, wall_ns: int) -> Outcome:
+        """What was seen on the way to the step does not belong to it."""
+        run = self._require_run()
+        run.begin_step((command.marks or {}).get(JOINTS, 0))
+        return Outcome(command, Code.ACCEPT, f"{run.awaited.name} begins")
+
     def _take_step(self, command: Command, wall_ns: int) -> Outcome:
         run = self._require_run()
         marks = command.marks or {}
@@ -258,7 +269,7 @@ class ToolSession:
                 raise BeamError(f"{step.name}: {count} edges: a beam flickers; check its alignment")
             run.take(edges, stamps, q)
             if not run.complete:
-                run.from_ns = marks.get(JOINTS, 0)
+                run.begin_step(marks.get(JOINTS, 0))
                 self._edges = [e for e in self._edges if e not in edges]
                 words = f"{step.name} ({step.number} of {step.of}) is measured: {count} edges"
                 return Outcome(command, Code.ACCEPT, words, samples=count)
@@ -281,16 +292,3 @@ class ToolSession:
         if self.run is None:
             raise ConflictError("no measurement is open: begin one first")
         return self.run
-
-    def document(self) -> dict[str, Any]:
-        """Settings and what is in force, so that a replay starts from the same."""
-        current = self._current
-        return {
-            "robot": self.nominal.name,
-            "model_hash": self.nominal.model_hash,
-            "config": self.config.document(),
-            "model": current.thermal.model,
-            "thermal_revision": current.thermal.revision,
-            "tool": current.head.model,
-            "healthy": current.healthy.model,
-        }

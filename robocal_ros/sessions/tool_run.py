@@ -65,6 +65,10 @@ class ToolRun:
         """How many edges the awaited step had so far."""
         return 0 if self._watch is None else self._watch.edges
 
+    def begin_step(self, stamp_ns: int) -> None:
+        """The awaited step counts from a stamp."""
+        self.from_ns, self._watch = stamp_ns, None
+
     def watch_edge(self, sample: EdgeSample) -> None:
         """Take an edge of the awaited step."""
         if sample.stamp_ns > self.from_ns:
@@ -93,7 +97,6 @@ class ToolRun:
         self.steps.append(BeamStep(step.name, step.kind, debounced(found, rule.debounce_s)))
         self._time.append(1e-9 * (stamps - self.begun_ns).astype(np.float64))
         self._q.append(q)
-        self._watch = None
         if self.complete:
             return
         if self.plan.needs_tool(len(self.steps) + 1):

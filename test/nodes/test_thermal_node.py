@@ -32,6 +32,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.diagnostics import Health
 from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.replay import input_topics, read_events, replay
 from robocal_ros.sessions.thermal import ThermalSession
@@ -348,6 +349,7 @@ def test_live_equals_replay_bit_for_bit(graph, visits, nominal, tmp_path):
             bag.messages(list(topics)),
             commands,
             input_topics(bag.info.topics, configured),
+            take_message,
         )
     assert report.differs == []
     assert len(report.outcomes) == COMMANDS

@@ -136,7 +136,7 @@ def test_a_recording_gives_the_live_results_bit_for_bit(nominal, visits, tmp_pat
     configured, commands = read_events(log)
     again = session_in(tmp_path / "again", nominal, config_of(configured.arguments))
     samples = [recorded(s) for part in visits for s in part]
-    report = replay(again, samples, commands)
+    report = replay(again, samples, commands, None, take_message)
     assert report.differs == []
     assert [digest(o.document) for o in report.outcomes] == [
         json.loads(r.message.outcome)["digest"] for r in log[1:]
@@ -163,7 +163,9 @@ def test_ids_of_another_history_are_translated(nominal, visits, tmp_path):
     )
     assert again._history.propose(other) == 1  # ids are shifted now
     _, commands = read_events(log)
-    report = replay(again, [recorded(s) for part in visits for s in part], commands)
+    report = replay(
+        again, [recorded(s) for part in visits for s in part], commands, None, take_message
+    )
     assert report.differs == []
     assert again.in_force.calibration_id == 4
 
@@ -174,7 +176,7 @@ def test_other_samples_are_reported_as_a_difference(nominal, visits, tmp_path):
     samples = [recorded(s) for part in visits for s in part]
     at = next(i for i, s in enumerate(samples[800:], 800) if s.topic.endswith("point"))
     lost = samples[: at - 1] + samples[at:]  # the joint reading beside one warm measurement
-    report = replay(session_in(tmp_path / "again", nominal), lost, commands)
+    report = replay(session_in(tmp_path / "again", nominal), lost, commands, None, take_message)
     assert report.differs
     assert "identify at" in report.differs[0]
 
@@ -221,7 +223,7 @@ def test_a_clock_that_jumped_back_in_the_recording(nominal, visits, tmp_path, ju
     assert [r.message.command for r in log[1:]] == ["reject", "capture_reference", "identify"]
     _, commands = read_events(log)
     samples = [recorded(s) for part in parts for s in part]
-    report = replay(session_in(tmp_path / "again", nominal), samples, commands)
+    report = replay(session_in(tmp_path / "again", nominal), samples, commands, None, take_message)
     assert report.differs == []
     assert [o.samples for o in report.outcomes] == [0, POSES, POSES]
 
@@ -256,7 +258,7 @@ def test_topics_by_their_names():
 def test_samples_that_cannot_be_used_are_counted(nominal, tmp_path):
     session = session_in(tmp_path, nominal)
     bad = point_message(5 * NS, "sensor/ball", float("nan"), 0.0, 0.0)
-    feed(session, Recorded("/cell/measured_point", bad))
+    feed(session, Recorded("/cell/measured_point", bad), None, take_message)
     odd = Message(
         header=Message(stamp=stamp(5 * NS), frame_id="sensor"),
         pose=Message(
@@ -264,9 +266,9 @@ def test_samples_that_cannot_be_used_are_counted(nominal, tmp_path):
             orientation=Message(x=0.0, y=0.0, z=0.0, w=0.7),
         ),
     )
-    feed(session, Recorded("/cell/measured_pose", odd))
+    feed(session, Recorded("/cell/measured_pose", odd), None, take_message)
     short = joint_message(JointSample(5 * NS, ("a1", "a2"), np.zeros(1)))
-    feed(session, Recorded("/cell/joint_states", short))
+    feed(session, Recorded("/cell/joint_states", short), None, take_message)
     assert {topic: sum(c.values()) for topic, c in session.desk.ignored.items()} == {
         POINT: 1,
         POSE: 1,
@@ -291,12 +293,12 @@ def test_cycles_are_found_where_no_command_was_recorded(nominal, visits, tmp_pat
     scout = session_in(tmp_path / "scout", nominal)
     samples = [recorded(s) for part in visits[:3] for s in part]
     for sample in samples:
-        feed(scout, sample)
+        feed(scout, sample, None, take_message)
     found = scout.desk.window(-1, 2**62, {JOINTS: 2**62, POINT: 2**62})
     assert len(found) == 3 * POSES
     commands = automatic_commands(found)
     assert [c.name for c, _ in commands] == ["capture_reference", "identify", "identify"]
-    report = replay(session_in(tmp_path / "real", nominal), samples, commands)
+    report = replay(session_in(tmp_path / "real", nominal), samples, commands, None, take_message)
     assert [o.samples for o in report.outcomes] == [POSES] * 3
     assert [o.status for o in report.outcomes] == [Code.ACCEPT] * 3
 
@@ -322,7 +324,7 @@ def test_windows_take_what_lies_in_them(nominal, visits, tmp_path):
     samples = [recorded(s) for part in visits for s in part]
     edges = [(part[0].stamp_ns, part[-1].stamp_ns) for part in visits]
     commands = window_commands(edges[0], [edges[2]])
-    report = replay(session_in(tmp_path, nominal), samples, commands)
+    report = replay(session_in(tmp_path, nominal), samples, commands, None, take_message)
     captured, identified = report.outcomes
     assert (captured.samples, identified.samples) == (POSES, POSES)
     assert identified.command.arguments["cycle_id"] == "window-1"

@@ -31,9 +31,9 @@ def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:
 def approach(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPlan:
     """From measured joints (n,) to where a step begins.
 
-    With the tip in the housing's opening: straight. Else up along the laser's z, over the
-    housing at its retract height, where the tool is turned, and down. Each part is a straight
-    line of the tip from rest to rest, as fast as all limits allow.
+    Up along the laser's z, over, where the tool is turned, and down: over the housing at its
+    retract height, within its opening at the higher of both ends, so that no beam is broken on the
+    way. Each part is a straight line of the tip from rest to rest, as fast as all limits allow.
 
     Raises
     ------
@@ -101,9 +101,8 @@ def _corners(cell: MotionCell, here: Array, step: PlannedStep) -> list[Array]:
     """Where the tip goes in turn; the last is the step's start."""
     there = cell.tip_of(start_pose(step, cell.limits))
     first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
-    if cell.housing.opening_holds(first) and cell.housing.opening_holds(last):
-        return [there]
-    height = max(first[2], last[2], cell.housing.retract_m)
+    inside = cell.housing.opening_holds(first) and cell.housing.opening_holds(last)
+    height = max(first[2], last[2], -np.inf if inside else cell.housing.retract_m)
     way = [_raised(cell, here, height - first[2]), _raised(cell, there, height - last[2])]
     moves = [
         a for a, b in zip(way, [here, *way], strict=False) if _way(cell, a, b) > SHORTEST_WAY_M
