@@ -12,16 +12,17 @@ from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.nodes import qos
+from robocal_ros.nodes import qos, tcf_motion
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.tcf_motion import TcfMotion
 from robocal_ros.nodes.tcf_outputs import TcfOutputs
 from robocal_ros.nodes.tcf_services import Runner, TcfServices
-from robocal_ros.nodes.tcf_settings import SETTINGS, session_config, taught_tool
+from robocal_ros.nodes.tcf_settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
 from robocal_ros.sessions.events import (
     BREAK_OFF,
@@ -47,13 +48,14 @@ class TcfNode(HouseNode):
     """Drives a `ToolSession` with live messages and calls."""
 
     NAME = "tcf_node"
-    SETTINGS = SETTINGS
+    SETTINGS = (*SETTINGS, *tcf_motion.SETTINGS)
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._session: ToolSession | None = None
         self._history: CalibrationHistory | None = None
         self._calls: TcfServices | None = None
+        self._motion: TcfMotion | None = None
 
     def configure(self) -> None:
         """Read robot and laser, open the history, then the topics, services and the action."""
@@ -87,6 +89,8 @@ class TcfNode(HouseNode):
             step=lambda: self._step,
         )
         self._calls = TcfServices(self, runner, self._desk.ask, self._history)
+        if settings["motion"] == TRAJECTORY:
+            self._motion = TcfMotion(self, settings, self._desk.ask)
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(WATCH_S, self._watch, steady=True)
 
@@ -100,11 +104,15 @@ class TcfNode(HouseNode):
         self._run_end: Future = Future()
         self._shown: tuple[int, int, int] | None = None
         self._joints_s = time.monotonic()
+        if self._motion is not None:
+            self._motion.activate(self._session)
         self._show_in_force()
         self._show_step()
 
     def deactivate(self) -> None:
-        """End the session; calls that wait are answered."""
+        """Stop what moves and end the session; calls that wait are answered."""
+        if self._motion is not None:
+            self._motion.deactivate()
         self._session = None
         self._desk.close()
         if not self._run_end.done():
@@ -112,7 +120,7 @@ class TcfNode(HouseNode):
 
     def cleanup(self) -> None:
         """Take the action down and close the history."""
-        self._session = None
+        self._session = self._motion = None
         if self._calls is not None:
             self._calls.close()
         self._calls = None
@@ -134,6 +142,8 @@ class TcfNode(HouseNode):
                     session.ignored.add(JOINTS, self._guard.fault)
                     return
                 self._joints_s = time.monotonic()
+                if self._motion is not None:
+                    self._motion.take(message)
             take_tool_message(session, kind, message)
             if (command := session.recognised()) is not None:
                 self._desk.ask(command)
@@ -143,6 +153,8 @@ class TcfNode(HouseNode):
         return take
 
     def _begin(self, mode: str, cycle_id: str, by: str) -> Any:
+        if self._motion is not None:
+            self._motion.require_armed()
         return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
 
     def _break_off(self, code: Code, reason: str) -> Any:
@@ -190,6 +202,8 @@ class TcfNode(HouseNode):
 
     def _end_run(self, outcome: Outcome) -> None:
         self._last = outcome
+        if self._motion is not None:
+            self._motion.run_ended(outcome)
         if outcome.calibration_id and self._history is not None:
             model = self._history.model(outcome.calibration_id)
             self._outputs.candidate(model, outcome.command.stamp_ns or 0)

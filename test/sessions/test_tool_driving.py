@@ -1,0 +1,244 @@
+"""A session's steps driven as joint motions: by a simulated robot that follows what it is sent."""
+
+import numpy as np
+import pytest
+from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError
+from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.limits import MotionLimits
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.samples import JointSample
+from robocal_ros.core.tool.edge_samples import EdgeSample
+from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.sessions.events import MEASURE_TOOL, Command
+from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_driving import DrivingConfig, Phase, ToolDriver
+from robocal_ros.sim.beams import RoundTool, bent
+from robocal_ros.sim.tool_cell import joints_at
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+PERIOD_S = 0.008
+LAG_S = 0.02  # of the controller behind its trajectory
+HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.05)
+
+
+class Robot:
+    """Follows plans with a lag; its beams see the true tool."""
+
+    def __init__(self, history, tool=TRUTH, **changes):
+        self.cell = noisy_cell()
+        arm = self.cell.arm
+        self.session = ToolSession(arm, history, config_of(self.cell), "test")
+        config = DrivingConfig(HOUSING, 0.1, 0.008, 0.05, **changes)
+        self.driver = ToolDriver(self.session, config, self.send, self.ask)
+        self.tool = RoundTool.cylinder(tool, 0.0025)
+        self.rng = np.random.default_rng(3)
+        above = self.cell.pose(TAUGHT, 0.0)
+        above[:3, 3] += 0.08 * self.cell.up
+        self.q = joints_at(arm, above[None], self.cell.q_near)[0]
+        self.now_s = 0.0
+        self.plan: JointPlan | None = None
+        self.sent: list[tuple[float, JointPlan]] = []
+        self.outcomes = []
+        self.edges: list[EdgeSample] = []
+        self.path: list[np.ndarray] = []
+        self.silent = False
+        self.offset = np.zeros(arm.n)
+
+    def send(self, plan: JointPlan) -> None:
+        self.sent.append((self.now_s, plan))
+        assert plan.q[0] == pytest.approx(self.q, abs=0.02)  # continuous: no jump is commanded
+        self.plan, self.start_s = plan, self.now_s + LAG_S
+        fk = self.cell.arm.fk
+        moved = self.cell.station.edges(
+            self.tool, lambda t: fk(plan.at(t)[0]), (0.0, plan.duration_s), self.rng
+        )
+        self.edges = [
+            EdgeSample(self.ns(e.time_s + self.start_s), "", e.beam, e.blocked, e.sigma_s)
+            for e in moved
+        ]
+
+    def ask(self, command: Command) -> None:
+        self.session.submit(command)
+        self.outcomes += self.session.step(wall_ns=START_NS + len(self.outcomes))
+        outcome = self.outcomes[-1]
+        if self.session.run is None and not outcome.done:
+            self.driver.run_failed(outcome.message, self.now_s)
+
+    def measure(self, mode="full") -> None:
+        self.driver.require_armed()
+        self.ask(Command(MEASURE_TOOL, {"mode": mode}))
+
+    @staticmethod
+    def ns(time_s: float) -> int:
+        return START_NS + round(time_s * 1e9)
+
+    def run(self, seconds: float, until=lambda: False) -> None:
+        """Let time pass."""
+        for _ in range(round(seconds / PERIOD_S)):
+            self.step()
+            if until():
+                return
+
+    def step(self) -> None:
+        self.now_s += PERIOD_S
+        if self.plan is not None:
+            self.q = self.plan.at(self.now_s - self.start_s)[0]
+        self.path.append(self.q.copy())
+        while self.edges and self.edges[0].stamp_ns <= self.ns(self.now_s):
+            self.session.add(self.edges.pop(0))
+        if self.silent:
+            self.driver.tick(self.now_s)
+            return
+        q = self.q + self.offset
+        self.driver.reading(self.now_s, q, self.now_s)
+        self.session.add(JointSample(self.ns(self.now_s), self.cell.arm.joint_names, q))
+        if (command := self.session.recognised()) is not None:
+            self.ask(command)
+
+    def stands_still(self, since_s: float) -> bool:
+        count = round((self.now_s - since_s) / PERIOD_S)
+        return bool(np.ptp(np.array(self.path[-count:]), axis=0).max() < 1e-9)
+
+
+@pytest.fixture
+def history(tmp_path):
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
+        yield opened
+
+
+@pytest.fixture
+def robot(history) -> Robot:
+    made = Robot(history)
+    made.run(0.2)
+    return made
+
+
+def test_a_whole_run_is_driven_and_then_disarmed(robot, history):
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.run(60.0, until=lambda: not robot.driver.armed)
+    last = robot.outcomes[-1]
+    assert last.status is Code.ACCEPT, last.message
+    found = KnownTool.of_document(history.model(last.calibration_id))
+    away = found.T_flange_tool[:3, 3] - TRUTH[:3, 3]
+    assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3  # chi-square, 1e-3
+    assert robot.driver.phase is Phase.IDLE
+    assert robot.driver.told == "the run has ended"
+    assert len(robot.sent) == 10  # a way and a motion for each of five steps
+
+
+def test_speeds_stay_within_the_limits(robot):
+    robot.driver.arm(robot.now_s)
+    robot.measure("quick")
+    robot.run(40.0, until=lambda: not robot.driver.armed)
+    path = np.array(robot.path)
+    rate = np.diff(path, axis=0) / PERIOD_S
+    limits = MotionLimits()
+    assert np.abs(rate).max() <= limits.joint_velocity
+    tip = (robot.cell.arm.fk(path) @ np.append(TAUGHT[:3, 3], 1.0))[:, :3]
+    speed = np.linalg.norm(np.diff(tip, axis=0), axis=1) / PERIOD_S
+    assert speed.max() <= limits.tcp_speed_m_s * (1.0 + 1e-6)
+
+
+def test_nothing_moves_before_it_is_armed(robot):
+    with pytest.raises(ConflictError, match="not armed"):
+        robot.measure()
+    robot.ask(Command(MEASURE_TOOL, {"mode": "full"}))
+    robot.run(1.0)
+    assert robot.sent == []
+
+
+def test_it_disarms_itself_after_a_while(robot):
+    robot.driver.arm(robot.now_s)
+    robot.run(59.5)
+    assert robot.driver.armed
+    robot.run(1.0)
+    assert not robot.driver.armed
+    assert "no run within 60 s" in robot.driver.told
+
+
+def stopped(robot, words):
+    """The robot was sent a stop, stands still within its time, and the run has ended."""
+    at_s, plan = robot.sent[-1]
+    assert plan.duration_s <= 0.2  # 1 rad/s by 10 rad/s^2 at the most
+    assert np.all(plan.qd[-1] == 0.0)
+    assert robot.now_s > at_s + plan.duration_s + LAG_S + 0.1
+    assert robot.stands_still(at_s + plan.duration_s + LAG_S + PERIOD_S)
+    assert not robot.driver.armed
+    assert words in robot.driver.told
+    assert robot.session.run is None
+
+
+def driving(robot, phase, for_s=0.4):
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.run(20.0, until=lambda: robot.driver.phase is phase)
+    robot.run(for_s)
+    assert robot.driver.phase is phase
+
+
+@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+def test_silent_joint_states_stop_it(robot, phase):
+    driving(robot, phase)
+    at_s = robot.now_s
+    robot.silent = True
+    robot.run(0.15)
+    assert robot.sent[-1][0] - at_s <= 0.1 + 2 * PERIOD_S
+    robot.silent = False
+    robot.run(0.5)
+    stopped(robot, "joint states are silent")
+
+
+def test_a_break_on_the_way_stops_it(robot):
+    driving(robot, Phase.APPROACH)
+    robot.edges.insert(0, EdgeSample(robot.ns(robot.now_s), "", "x", True, 1e-4))
+    robot.run(0.5)
+    stopped(robot, "a beam was broken on the way")
+
+
+def test_a_deviation_from_the_plan_stops_it(robot):
+    driving(robot, Phase.MEASURE)
+    robot.offset[2] = np.radians(0.6)
+    robot.run(0.5)
+    stopped(robot, "deg away from its plan")
+
+
+def test_a_cancel_stops_it(robot):
+    driving(robot, Phase.MEASURE)
+    robot.ask(Command("break_off", {"reason": "cancelled"}))
+    robot.run(0.5)
+    stopped(robot, "cancelled")
+
+
+def test_disarming_stops_it(robot):
+    driving(robot, Phase.APPROACH)
+    robot.driver.disarm("disarmed by the operator", robot.now_s)
+    robot.run(0.5)
+    stopped(robot, "disarmed by the operator")
+
+
+def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
+    robot = Robot(history)
+    beside = robot.cell.pose(TAUGHT, 0.0)
+    beside[:3, 3] += [0.1, 0.0, 0.0]
+    robot.q = joints_at(robot.cell.arm, beside[None], robot.cell.q_near)[0]
+    robot.run(0.2)
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.run(0.5)
+    assert robot.sent == []
+    assert robot.outcomes[-1].status is Code.LIMIT_EXCEEDED
+    assert "housing" in robot.driver.told
+
+
+def test_a_tool_bent_beyond_the_circle_stops_the_run(history):
+    robot = Robot(history, bent(TAUGHT, [0.012, 0.0, 0.0], [0.0, 0.0, 0.0]))
+    robot.run(0.2)
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.run(30.0, until=lambda: not robot.driver.armed)
+    assert robot.outcomes[-1].status is Code.BEAM_EDGES_WRONG
+    assert robot.session.run is None
