@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 REST_RAD = 1e-4  # within that span a robot that rests moves less
 REST_WITHIN_S = 2.0  # after a motion's end
-LATE_S = 0.4  # a controller lags at most so far behind its trajectory
+LATE_S = 0.15  # a controller lags at most so far behind its trajectory
 
 
 class Phase(Enum):
