@@ -48,9 +48,7 @@ SETTINGS = (
         high=10000.0,
     ),
     _length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
-    _length(
-        "opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3
-    ),
+    _length("opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3),
     _length("housing_top_mm", 30.0, "Height of the housing above the beams", 0.0, 1e3),
     _length("housing_depth_mm", 120.0, "Depth of the opening below the beams", 1.0, 1e3),
     _length("retract_mm", 50.0, "Height of the tip above the beams on its way", 1.0, 2e3),

@@ -173,12 +173,23 @@ def _joints_at(cell, T_base_flange, posture):
 
 
 @ROBOTS
-def test_from_step_to_step_the_tip_goes_straight_within_the_opening(robot):
+def test_to_a_plunge_the_tip_rises_before_it_goes_over_the_beams(robot):
+    cell = make_motion_cell(robot)
+    q = started(cell, circle_step(cell), robot)
+    plan = approach(cell, plunge_step(cell), q)
+    require_kept(cell, plan, cell.limits.tcp_speed_m_s)
+    tip = tip_in_laser(cell, plan.at(instants(plan))[0])
+    beside = np.hypot(*(tip - tip[0])[:, :2].T) > MICROMETRE
+    assert np.all(tip[beside, 2] > tip[-1, 2] - MICROMETRE)
+    assert np.count_nonzero(beside) > 10
+
+
+@ROBOTS
+def test_from_circle_to_circle_the_tip_goes_straight_within_the_opening(robot):
     cell = make_motion_cell(robot)
     step = plunge_step(cell)
-    first = circle_step(cell)
-    q = started(cell, first, robot)
-    plan = approach(cell, step, q)
+    q = started(cell, step, robot)
+    plan = approach(cell, circle_step(cell), q)
     require_kept(cell, plan, cell.limits.tcp_speed_m_s)
     tip = tip_in_laser(cell, plan.at(instants(plan))[0])
     along = tip[-1] - tip[0]

@@ -201,7 +201,7 @@ def test_a_break_on_the_way_stops_it(robot):
 
 def test_a_deviation_from_the_plan_stops_it(robot):
     driving(robot, Phase.MEASURE)
-    robot.offset[2] = np.radians(1.0)
+    robot.offset[4] = np.radians(1.0)
     robot.run(0.5)
     stopped(robot, "deg away from its plan")
 

@@ -33,7 +33,8 @@ def approach(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPlan
 
     Up along the laser's z, over, where the tool is turned, and down: over the housing at its
     retract height, within its opening at the higher of both ends, so that no beam is broken on the
-    way. Each part is a straight line of the tip from rest to rest, as fast as all limits allow.
+    way; there from circle to circle straight. Each part is a straight line of the tip from rest to
+    rest, as fast as all limits allow.
 
     Raises
     ------
@@ -102,6 +103,8 @@ def _corners(cell: MotionCell, here: Array, step: PlannedStep) -> list[Array]:
     there = cell.tip_of(start_pose(step, cell.limits))
     first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
     inside = cell.housing.opening_holds(first) and cell.housing.opening_holds(last)
+    if inside and step.kind == "circle":  # both begin far from the beams, in one quadrant
+        return [there]
     height = max(first[2], last[2], -np.inf if inside else cell.housing.retract_m)
     way = [_raised(cell, here, height - first[2]), _raised(cell, there, height - last[2])]
     moves = [
