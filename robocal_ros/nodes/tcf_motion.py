@@ -41,7 +41,7 @@ SETTINGS = (
     Setting("tcp_speed_mm_s", 50.0, "Largest speed of the tip", unit="mm/s", low=1.0, high=250.0),
     Setting(
         "tcp_acceleration_mm_s2",
-        750.0,
+        1200.0,
         "Largest acceleration of the tip on its path",
         unit="mm/s^2",
         low=1.0,

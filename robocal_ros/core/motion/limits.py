@@ -27,7 +27,7 @@ class MotionLimits:
     joint_acceleration: ArrayLike = 5.0
     stop_deceleration: ArrayLike = 10.0
     tcp_speed_m_s: float = 0.05
-    tcp_acceleration_m_s2: float = 0.75
+    tcp_acceleration_m_s2: float = 1.2
     plunge_speed_m_s: float = 0.01
     plunge_depth_m: float = 0.02
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SHORTEST_RAMP_S = 0.1  # a controller would round off a shorter one
+SHORTEST_RAMP_S = 0.07  # a controller smooths over some of its cycles
 SPACING_S = 0.01  # of points; the cubic between two of a circle of 12 mm misses by nanometres
 MOST_POINTS = 200  # of one phase
 
