@@ -10,9 +10,10 @@ from robocal_ros.core.samples import stamp_ns
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.observations import JOINTS, MEASURING
 from robocal_ros.sessions.replay import EVENTS, input_topics, read_events, topic_kind
+from robocal_ros.sessions.tool import EDGES
 from robocal_ros.storage.bags import BagMessage, BagReader
 
-INPUTS = (JOINTS, *MEASURING)
+INPUTS = (JOINTS, *MEASURING, EDGES)
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Recording:
     def warnings(self) -> list[str]:
         """What is wrong with the bag, as far as it was read, and what it lacks."""
         info = self.reader.info
-        lacking = not set(MEASURING) & set(self.inputs.values())
+        lacking = not {*MEASURING, EDGES} & set(self.inputs.values())
         words = f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}"
         return [*info.notes, words] if lacking else list(info.notes)
 

@@ -24,6 +24,9 @@ def show_replay(console: "Console", document: Document) -> None:
     """Print a replay; a single candidate in full, several as a table."""
     from rich.text import Text
 
+    if "runs" in document:
+        _show_runs(console, document)
+        return
     candidates = document["candidates"]
     if len(candidates) == 1:
         show_identification(console, candidates[0])
@@ -37,6 +40,21 @@ def show_replay(console: "Console", document: Document) -> None:
             console.print(Text(words, style="red"), soft_wrap=True)
         elif entry["command"] != "identify":
             console.print(Text(f"{entry['command']}: {entry['message']}"), soft_wrap=True)
+    _show_losses(console, document)
+    _show_equality(console, document)
+
+
+def _show_runs(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    for entry in document["commands"]:
+        style = "" if entry["code"] == "ACCEPT" else "red"
+        words = f"{entry['command']}: {entry['code']}: {entry['message']}"
+        console.print(Text(words, style=style), soft_wrap=True)
+    where = ", ".join(f"{x:.3f}" for x in document["final_tool"]["xyz_mm"])
+    console.print(
+        f"In force at the end: revision {document['final_tool']['revision']}, ({where}) mm"
+    )
     _show_losses(console, document)
     _show_equality(console, document)
 

@@ -10,6 +10,8 @@ from typing import Any
 from robocal_ros import __version__
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
+from robocal_ros.cli.tool_replaying import replay_tool
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
@@ -26,6 +28,7 @@ from robocal_ros.sessions.replay import (
 from robocal_ros.sessions.seeding import session_as_recorded
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
+from robocal_ros.sessions.tool_recorded import is_tool_session
 from robocal_ros.storage.bags import BagMessage, BagReader
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -74,6 +77,8 @@ def replay_bag(request: Request, watch: Watch) -> Document:
             raise InputError(words, file=str(request.bag))
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
+            if is_tool_session(recording.configured):
+                return replay_tool(recording, arm, history, watch("replaying", recording))
             kept = _GOES_ON.format(history.path) if history.list(1) else ""
             session = _session(recording, arm, history)
             commands = _commands(request, recording, arm, history, watch)
@@ -147,7 +152,6 @@ def _document(report: ReplayReport, session: ThermalSession, recording: Recordin
     head = session.in_force
     topic = {kind: name for name, kind in recording.inputs.items()}
     ignored = {topic.get(kind, kind): dict(why) for kind, why in session.desk.ignored.items()}
-    stream, damaged = session.desk.stream, recording.reader.info.lost
     return _failure(report, made) | {
         "robot": session.nominal.name,
         "model_hash": session.nominal.model_hash,
@@ -162,12 +166,8 @@ def _document(report: ReplayReport, session: ThermalSession, recording: Recordin
         "final_model": model_document(session.arm) | {"revision": head.revision},
         "ignored": {name: sum(why.values()) for name, why in ignored.items()},
         "ignored_reasons": ignored,
-        "gaps": {
-            "count": stream.gap_count,
-            "longest_s": stream.longest_gap_ns * 1e-9,
-            "damaged": [{"from_ns": part.from_ns, "to_ns": part.to_ns} for part in damaged],
-        },
-        "commands": [_command(outcome) for outcome in report.outcomes],
+        "gaps": gaps_document(session.desk.stream, recording),
+        "commands": [command_document(outcome) for outcome in report.outcomes],
         "differs": report.differs,
         "warnings": recording.warnings,
     }
@@ -188,30 +188,16 @@ def _failure(report: ReplayReport, made: list[Outcome]) -> Document:
     return refusal(first.status, first.message)
 
 
-def _seconds(stamp_ns: int | None) -> float:
-    return (stamp_ns or 0) * 1e-9
-
-
 def _candidate(outcome: Outcome) -> Document:
-    return {"stamp": _seconds(outcome.command.stamp_ns), **dict(outcome.document or {})}
+    return {"stamp": seconds(outcome.command.stamp_ns), **dict(outcome.document or {})}
 
 
 def _accepted(outcome: Outcome, place: Mapping[int, int]) -> Document:
     arguments = outcome.command.arguments
     return {
-        "stamp": _seconds(outcome.command.stamp_ns),
+        "stamp": seconds(outcome.command.stamp_ns),
         "revision": outcome.revision,
         "candidate": place.get(outcome.calibration_id),
         "by": str(arguments.get("by", "")),
         "reason": str(arguments.get("reason", "")),
-    }
-
-
-def _command(outcome: Outcome) -> Document:
-    return {
-        "command": outcome.command.name,
-        "stamp": _seconds(outcome.command.stamp_ns),
-        "code": outcome.status.name,
-        "message": outcome.message,
-        "samples": outcome.samples,
     }

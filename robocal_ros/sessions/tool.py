@@ -44,6 +44,7 @@ class ToolSession:
     Attributes
     ----------
     run : the run that is open; None while there is none.
+    stream : the joint readings.
     received, ignored : samples by topic, and those that were not used.
     newest_ns : newest stamp of the joints and of each beam's edges.
     """
@@ -56,7 +57,7 @@ class ToolSession:
         self._current = ToolInForce(history, nominal, KnownTool(config.T_flange_taught))
         self._results = ToolResults(nominal, history, config, software, self._current)
         self._laser = config.laser
-        self._stream = JointStream(nominal.joint_names)
+        self.stream = JointStream(nominal.joint_names)
         self._edges: list[EdgeSample] = []
         self._queue: list[Command] = []
         self._runs = self._jumps = 0
@@ -109,8 +110,8 @@ class ToolSession:
             self._add_edge(sample)
 
     def _add_joints(self, sample: JointSample) -> None:
-        began = self._stream.add(sample, GAP_NS).began_ns
-        newest = self._stream.newest_ns
+        began = self.stream.add(sample, GAP_NS).began_ns
+        newest = self.stream.newest_ns
         if newest is None:
             return
         before = self.newest_ns.get(JOINTS, newest)
@@ -123,7 +124,7 @@ class ToolSession:
             self.newest_ns = {JOINTS: newest}
             self._end_early("the clock jumped back")
         elif run is not None and self._over is None and newest > run.from_ns:
-            _, q = self._stream.window(newest, newest)
+            _, q = self.stream.window(newest, newest)
             waited_s = (newest - run.from_ns) * 1e-9
             if run.step_over(newest, q[0]):
                 step = run.awaited
@@ -262,7 +263,7 @@ class ToolSession:
             if run.from_ns < sample.stamp_ns <= marks.get(f"{EDGES}/{sample.beam}", -1)
         ]
         edges.sort(key=lambda sample: (sample.stamp_ns, BEAMS.index(sample.beam)))
-        stamps, q = self._stream.window(run.from_ns + 1, marks.get(JOINTS, 0))
+        stamps, q = self.stream.window(run.from_ns + 1, marks.get(JOINTS, 0))
         step, count = run.awaited, len(edges)
         try:
             if count >= MOST_EDGES:

@@ -55,7 +55,7 @@ def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCe
     assert transform.transform == result.tool.tool == tools[-1].tool == frame[-1].transform
     quick = cell.measure(QUICK)
     assert quick.answer == MeasureTool.Result.PASS
-    cell.tool = RoundTool.cylinder(bent(TRUTH, [1e-3, 0.0, 0.0], [0.0, 0.0, 0.0]), 0.0025)
+    cell.program.tool = RoundTool.cylinder(bent(TRUTH, [1e-3, 0.0, 0.0], [0.0, 0.0, 0.0]), 0.0025)
     quick = cell.measure(QUICK)
     assert quick.answer == MeasureTool.Result.RECALIBRATE
     assert abs(quick.deviation_mm - 1.0) < 4.0 * quick.sigma_mm
@@ -112,12 +112,12 @@ def lost(step: Any, edges: list) -> list:
 
 def test_edges_that_are_lost_end_the_run(graph: Any, cell: LiveCell) -> None:
     for edit, words in ((dead, "beam y was never broken"), (lost, "edges")):
-        cell.edit = edit
+        cell.program.edit = edit
         result = cell.measure()
         assert result.status == Code.BEAM_EDGES_WRONG
         assert words in result.message
         assert not result.success
-    cell.edit = lambda step, edges: edges
+    cell.program.edit = lambda step, edges: edges
     assert cell.measure().success
 
 

@@ -10,7 +10,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import BeamEvent, ToolStep
 from sensor_msgs.msg import JointState
-from tool_driver import START_NS, TAUGHT, Driver, noisy_cell
+from tool_driver import TAUGHT, Driver, noisy_cell
 
 from robocal_ros.core import frames
 from robocal_ros.core.samples import JointSample
@@ -127,11 +127,7 @@ class LiveCell(Driver):
                 return
             if step.kind != ToolStep.NONE and (step.run, step.number) > driven:
                 driven = (step.run, step.number)
-                self.drive(planned(step))
+                self.play(self.program.drive(planned(step)))
             elif not self.silent:
                 self.rest(0.25)
         raise AssertionError("the run never ends")
-
-    @property
-    def start_ns(self) -> int:
-        return START_NS

@@ -70,7 +70,9 @@ def test_a_quick_check_passes_an_unchanged_tool_and_finds_a_bent_one(history):
     driver.command(Command(ACCEPT, {"id": full.calibration_id, "by": "me"}))
     unchanged = driver.measure("quick")
     assert (unchanged.status, unchanged.document["answer"]) == (Code.ACCEPT, "pass")
-    driver.tool = RoundTool.cylinder(bent(TRUTH, [0.001, 0.0, 0.0], [0.0, 0.005, 0.0]), 0.0025)
+    driver.program.tool = RoundTool.cylinder(
+        bent(TRUTH, [0.001, 0.0, 0.0], [0.0, 0.005, 0.0]), 0.0025
+    )
     moved = driver.measure("quick")
     assert moved.status is Code.LIMIT_EXCEEDED
     assert moved.document["answer"] == "recalibrate"
@@ -98,7 +100,7 @@ def test_the_healthy_tool_takes_the_robots_absolute_error_away(history):
     healthy = driver.measure("reference")
     assert healthy.done, healthy.message
     assert healthy.document["change"]["tip_mm"] == pytest.approx(np.linalg.norm(off) * 1e3, abs=0.2)
-    driver.tool = RoundTool.cylinder(TRUTH, 0.0025)
+    driver.program.tool = RoundTool.cylinder(TRUTH, 0.0025)
     bent_one = driver.measure()
     found = KnownTool.of_document(history.model(bent_one.calibration_id))
     assert bent_one.document["absolute"] is False
@@ -155,18 +157,18 @@ def chatter(step, edges):
 )
 def test_wrong_edges_end_the_run_and_say_why(history, edit, words):
     driver = driver_of(history, step_timeout_s=2.0)
-    driver.edit = edit
+    driver.program.edit = edit
     outcome = driver.measure()
     assert outcome.status is Code.BEAM_EDGES_WRONG
     assert words in outcome.message
     assert history.list(5) == ()
-    driver.edit = lambda step, edges: edges
+    driver.program.edit = lambda step, edges: edges
     assert driver.measure().done
 
 
 def test_a_tool_too_thick_for_the_circle_is_refused(history):
     driver = driver_of(history)
-    driver.tool = RoundTool.cylinder(TRUTH, 0.013)
+    driver.program.tool = RoundTool.cylinder(TRUTH, 0.013)
     driver.measure()
     assert driver.outcomes[-1].status in (Code.BEAM_EDGES_WRONG, Code.TOO_FEW_SAMPLES)
 
@@ -182,12 +184,12 @@ def test_a_robot_moved_by_hand_in_between_is_refused(history):
         shifted = replace(driver.cell.station, beams=tuple(
             replace(b, start=b.start + moved, end=b.end + moved) for b in driver.cell.station.beams
         ))  # fmt: skip
-        from tool_driver import move_of
+        from robocal_ros.sim.robot_program import move_of
 
         move = move_of(step, edges[0].time_s - 0.55)
-        return shifted.edges(driver.tool, move, move.window, driver.rng)
+        return shifted.edges(driver.program.tool, move, move.window, np.random.default_rng(5))
 
-    driver.edit = edit
+    driver.program.edit = edit
     outcome = driver.measure()
     assert outcome.status in (Code.RESIDUAL_TOO_LARGE, Code.BEAM_EDGES_WRONG)
 
@@ -202,12 +204,15 @@ def test_joint_states_that_pause_are_refused(history):
     driver = driver_of(history)
     play = driver.play
 
-    def gappy(time, q, edges):
-        keep = np.ones(len(time), dtype=bool)
-        if edges:
-            at = np.searchsorted(time, edges[4].time_s)
-            keep[at - 10 : at + 10] = False
-        play(time[keep], q[keep], edges)
+    def gappy(samples):
+        at = [s.stamp_ns for s in samples if not isinstance(s, JointSample)][4:5]
+        play(
+            [
+                s
+                for s in samples
+                if not at or abs(s.stamp_ns - at[0]) > 80_000_000 or s.stamp_ns == at[0]
+            ]
+        )
 
     driver.play = gappy
     outcome = driver.measure()
@@ -230,8 +235,8 @@ def test_a_clock_that_jumps_back_ends_the_run(history):
     driver.rest(0.1)
     driver.command(Command("measure_tool", {"mode": "full"}))
     for k in range(3):
-        stamp = driver.ns(-100.0 + 0.008 * k)
-        driver.give(JointSample(stamp, driver.cell.arm.joint_names, driver.q))
+        stamp = driver.program.ns(-100.0 + 0.008 * k)
+        driver.give(JointSample(stamp, driver.cell.arm.joint_names, driver.program.q))
     assert "jumped back" in driver.outcomes[-1].message
     assert driver.session.run is None
 

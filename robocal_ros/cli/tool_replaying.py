@@ -1,0 +1,61 @@
+"""From the bag of a tool node to its tools: what ``robocal replay`` computes of it."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from robocal_ros import __version__
+from robocal_ros.cli.output import Document
+from robocal_ros.cli.recording import Recording
+from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
+from robocal_ros.core.documents import transform_document
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.replay import ReplayReport, replay
+from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_inputs import take_tool_message
+from robocal_ros.sessions.tool_recorded import tool_session_as_recorded
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+
+def replay_tool(
+    recording: Recording, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+) -> Document:
+    """Replay what a tool node recorded: each run with its answer.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag lacks what a replay needs.
+    """
+    if recording.configured is None:
+        raise InputError("the bag holds no configuration of a tool node")
+    session = tool_session_as_recorded(arm, history, recording.configured, __version__)
+    report = replay(session, samples, recording.commands, recording.inputs, take_tool_message)
+    return _document(report, session, recording)
+
+
+def _document(report: ReplayReport, session: ToolSession, recording: Recording) -> Document:
+    topic = {kind: name for name, kind in recording.inputs.items()}
+    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
+    return {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "start_ns": recording.start_ns,
+        "topics": topic,
+        "recorded": True,
+        "runs": [_run(o) for o in report.outcomes if o.document is not None],
+        "final_tool": transform_document(session.current.tool.T_flange_tool)
+        | {"revision": session.in_force.revision},
+        "ignored": {name: sum(why.values()) for name, why in ignored.items()},
+        "ignored_reasons": ignored,
+        "gaps": gaps_document(session.stream, recording),
+        "commands": [command_document(outcome) for outcome in report.outcomes],
+        "differs": report.differs,
+        "warnings": recording.warnings,
+    }
+
+
+def _run(outcome: Outcome) -> Document:
+    number = outcome.command.arguments.get("run", 0)
+    return {"stamp": seconds(outcome.command.stamp_ns), "run": number, **(outcome.document or {})}
