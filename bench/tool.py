@@ -33,6 +33,7 @@ from robocal_ros.sim.beams import (
     beams_of,
 )
 from robocal_ros.sim.tool_cell import MeasuredRun, RunPlan, ToolCell
+from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -40,10 +41,6 @@ Array = NDArray[np.float64]
 RUNS = 500
 JITTER_S = 2e-5
 RADIUS, PERIOD_S, START_RAD = 0.012, 2.0, float(np.pi / 4.0)
-Q_NEAR = np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618])
-BETA, GAP_M = float(np.radians(92.2)), 5.8e-5
-T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.04, 0.01]), [0.7994, -0.1263, 0.1945])
-TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.15])
 SHIM_RAD = 0.025  # each way: 3.7 mm at the tip
 TOOL_RADIUS = 2.5e-3
 SOURCE = TrueInput(latency_s=0.004, sample_period_s=0.002)
@@ -111,7 +108,7 @@ def circle_table() -> Table:
         (0.5e-3, (0.0, 0.0)), (2.5e-3, (3e-3, -4e-3)), (4e-3, (6e-3, 5e-3)), (4e-3, (-6e-3, 0.0)),
         (4e-3, (6e-3, 6e-3)),
     ]  # fmt: skip
-    for beta in (np.pi / 2.0, BETA):
+    for beta in (np.pi / 2.0, BETA_RAD):
         for rho, centre in cases:
             _add_circle(table, rho, centre, float(beta))
     return table
@@ -159,7 +156,7 @@ def make_cell(case: Case, rng: np.random.Generator) -> ToolCell:
     """A cell with a laser frame of its own calibration."""
     beams = tuple(
         TrueBeam(b.start, b.end, b.diameter, *case.light)
-        for b in beams_of(T_BASE_LASER, BETA, GAP_M)
+        for b in beams_of(T_BASE_LASER, BETA_RAD, GAP_M)
     )
     station = BeamStation((beams[0], beams[1]), case.source, case.noise)
     if case.sweeps:

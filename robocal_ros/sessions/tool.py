@@ -269,12 +269,13 @@ class ToolSession:
             if count >= MOST_EDGES:
                 raise BeamError(f"{step.name}: {count} edges: a beam flickers; check its alignment")
             run.take(edges, stamps, q)
-            if not run.complete:
+            early = None if run.complete else self._results.early(run, command)
+            if not run.complete and early is None:
                 run.begin_step(marks.get(JOINTS, 0))
                 self._edges = [e for e in self._edges if e not in edges]
                 words = f"{step.name} ({step.number} of {step.of}) is measured: {count} edges"
                 return Outcome(command, Code.ACCEPT, words, samples=count)
-            outcome = self._results.finish(run, command, wall_ns)
+            outcome = early or self._results.finish(run, command, wall_ns)
         except (RobocalError, np.linalg.LinAlgError) as error:
             self.run = None
             code = error.code if isinstance(error, RobocalError) else Code.RESIDUAL_TOO_LARGE

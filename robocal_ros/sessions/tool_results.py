@@ -1,6 +1,7 @@
 """From a complete run to its answer: a tool in the history, or the answer of a quick check."""
 
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, TOOL, Proposal
 from robocal_ros.core.tool.crossed_model import Held
 from robocal_ros.core.tool.judging import KnownTool, change_between, changed_tool, judge_tool
-from robocal_ros.core.tool.quick_check import Answer, quick_check
+from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
 from robocal_ros.core.tool.run_documents import change_document, check_document, tool_document
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
@@ -75,7 +76,9 @@ class ToolResults:
             When no tool explains it, or the result cannot be kept.
         """
         ends = {FULL: self._full, QUICK: self._quick, REFERENCE: self._reference}
-        outcome = ends[run.mode](run, command, wall_ns)
+        return self._remembered(run, ends[run.mode](run, command, wall_ns))
+
+    def _remembered(self, run: ToolRun, outcome: Outcome) -> Outcome:
         if run.cycle_id:
             self._answers[run.cycle_id] = outcome
             if len(self._answers) > REMEMBERED:
@@ -114,8 +117,20 @@ class ToolResults:
         self._history.accept(kept, by=by, reason=words, expected_head=None, wall_ns=wall_ns)
         return Outcome(command, Code.ACCEPT, words, document, kept)
 
+    def early(self, run: ToolRun, command: Command) -> Outcome | None:
+        """The answer of a quick check whose circle says enough; None: go on."""
+        if run.mode != QUICK:
+            return None
+        check = self._checked(sideways_check, run)
+        if check.answer != "recalibrate":
+            return None
+        return self._remembered(run, self._answer(check, command))
+
     def _quick(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
-        check = quick_check(
+        return self._answer(self._checked(quick_check, run), command)
+
+    def _checked(self, check: Callable[..., QuickCheck], run: ToolRun) -> QuickCheck:
+        return check(
             run.plan.laser,
             run.path,
             run.steps,
@@ -124,6 +139,8 @@ class ToolResults:
             noise=run.config.noise,
             stored_covariance=self._tip_covariance(),
         )
+
+    def _answer(self, check: QuickCheck, command: Command) -> Outcome:
         verdict = Verdict(CODE_OF[check.answer], f"{check.answer}: {check.reason}")
         document = check_document(check, verdict)
         return Outcome(command, verdict.code, verdict.reason, document)

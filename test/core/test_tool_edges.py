@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from beam_cell import TAUGHT, make_cell
+from beam_cell import make_cell
 
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.tool.beam_edges import (
@@ -15,6 +15,7 @@ from robocal_ros.core.tool.beam_edges import (
 )
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.sim.tool_cell import joints_at
+from robocal_ros.sim.ur10_station import TAUGHT
 
 SIGMA = 2e-5
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from beam_cell import BETA, GAP, T_BASE_LASER, laser_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -26,6 +25,7 @@ from robocal_ros.sim.beams import (
     TrueNoise,
     beams_of,
 )
+from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, T_BASE_LASER, laser_of
 
 PUBLISHED_MM = {  # thesis table 5-3
     "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),
@@ -67,16 +67,16 @@ def test_moving_the_base_moves_the_frame_and_nothing_else():
 def test_simulated_sweeps_give_the_true_frame():
     """A gap and beams that cross at 92.2 deg, level in base."""
     level = frames.transform(frames.exp_rotation([0.0, 0.0, 0.03]), T_BASE_LASER[:3, 3])
-    station = BeamStation(beams_of(level, BETA, GAP), PERFECT, NO_NOISE)
+    station = BeamStation(beams_of(level, BETA_RAD, GAP_M), PERFECT, NO_NOISE)
     found = calibrate_laser(laser_points(station, level, np.random.default_rng(0)))
     assert found.T_base_laser == pytest.approx(level, abs=1e-9)
-    assert found.gap_m == pytest.approx(GAP, abs=1e-12)
-    assert found.beam_angle_rad == pytest.approx(BETA, abs=1e-9)
+    assert found.gap_m == pytest.approx(GAP_M, abs=1e-12)
+    assert found.beam_angle_rad == pytest.approx(BETA_RAD, abs=1e-9)
 
 
 def test_a_constant_latency_cancels_in_sweeps_back_and_forth():
     source = TrueInput(latency_s=0.02, jitter_s=0.0)
-    station = BeamStation(beams_of(T_BASE_LASER, BETA, GAP), source, NO_NOISE)
+    station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), source, NO_NOISE)
     found = calibrate_laser(laser_points(station, T_BASE_LASER, np.random.default_rng(0)))
     assert found.T_base_laser == pytest.approx(T_BASE_LASER, abs=1e-9)
 
@@ -85,7 +85,9 @@ def test_a_constant_latency_cancels_in_sweeps_back_and_forth():
 def test_a_cylinder_of_known_radius_gives_the_beams_reach(light):
     """Beams that lean by 2 deg in base: exact to the square of that."""
     beams = tuple(
-        TrueBeam(b.start, b.end, 8e-4, light, light) for b in beams_of(T_BASE_LASER, BETA, GAP)
+        TrueBeam(b.start, b.end, 8e-4, light, light)
+        for b in beams_of(T_BASE_LASER, BETA_RAD, GAP_M)
+        for b in beams_of(T_BASE_LASER, BETA_RAD, GAP_M)
     )
     station = BeamStation(beams, PERFECT, NO_NOISE)
     points = laser_points(station, T_BASE_LASER, np.random.default_rng(0))
@@ -96,7 +98,7 @@ def test_a_cylinder_of_known_radius_gives_the_beams_reach(light):
 
 def test_scatter_of_the_points_is_what_is_said():
     source, noise = TrueInput(sample_period_s=0.002), TrueNoise(3e-5, 1e-5)
-    station = BeamStation(beams_of(T_BASE_LASER, BETA, GAP), source, noise)
+    station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), source, noise)
     exact = BeamStation(station.beams, PERFECT, NO_NOISE)
     true = calibrate_laser(laser_points(exact, T_BASE_LASER, np.random.default_rng(0)))
     errors = []
@@ -111,7 +113,7 @@ def test_scatter_of_the_points_is_what_is_said():
 
 
 def test_what_gives_no_frame_is_refused():
-    points = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA))).points
+    points = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA_RAD))).points
     with pytest.raises(InputError, match="points B3, C1 are missing"):
         calibrate_laser({k: v for k, v in published().items() if k not in ("B3", "C1")})
     with pytest.raises(RankDeficientError, match=r"two points on the y-beam are 0\.00 mm apart"):
@@ -171,7 +173,7 @@ def test_the_taught_turn_about_the_axis_stays():
 
 def two_centres(v_flange, order):
     """Where a straight tool passes the beam plane at two heights of the flange."""
-    laser = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA)))
+    laser = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA_RAD)))
     R = laser.T_base_laser[:3, :3] @ np.diag([1.0, -1.0, -1.0]) @ frames.exp_rotation([0, 0, 0.4])
     poses, centres = [], []
     for height in order:
@@ -200,7 +202,7 @@ def test_one_height_gives_none():
 
 
 def test_the_upright_pose_sets_the_axis_down_and_the_point_on_the_crossing():
-    laser = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA)))
+    laser = laser_of(BeamStation(beams_of(T_BASE_LASER, BETA_RAD)))
     v = np.array([0.1, 0.05, 1.0]) / np.linalg.norm([0.1, 0.05, 1.0])
     T = upright_pose(laser, np.eye(4), v, [0.01, 0.02, 0.15])
     assert T[:3, :3] @ v == pytest.approx(-laser.T_base_laser[:3, 2])

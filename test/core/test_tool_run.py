@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beam_cell import BETA, SILENT, T_BASE_LASER, TAUGHT, laser_of, make_cell
+from beam_cell import SILENT, make_cell
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, RankDeficientError, ResidualError
@@ -18,6 +18,7 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.quick_check import CheckRule, quick_check
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.sim.tool_cell import MeasuredRun, RunPlan, ToolCell
+from robocal_ros.sim.ur10_station import BETA_RAD, T_BASE_LASER, TAUGHT, laser_of
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
 NOISE = TrueNoise(3e-5, 1e-5)
@@ -291,4 +292,4 @@ def test_a_quick_check_is_wrong_as_rarely_as_it_says():
 
 
 def test_the_station_of_the_tests_is_not_square():
-    assert laser_of(make_cell().station).beam_angle_rad == pytest.approx(BETA)
+    assert laser_of(make_cell().station).beam_angle_rad == pytest.approx(BETA_RAD)

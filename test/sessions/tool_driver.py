@@ -7,7 +7,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "core"))  # for beam_cell
 
-from beam_cell import TAUGHT, make_cell
+from beam_cell import make_cell
 
 from robocal_ros.core.tool.beam_edges import InputRule
 from robocal_ros.core.tool.crossed_model import RobotNoise
@@ -17,6 +17,7 @@ from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.sim.robot_program import RobotProgram, Sample
 from robocal_ros.sim.tool_cell import ToolCell
+from robocal_ros.sim.ur10_station import TAUGHT
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
 NOISE = TrueNoise(3e-5, 1e-5)

@@ -79,16 +79,35 @@ def quick_check(
     BeamError, RankDeficientError, ResidualError
         As `estimate_tool`: edges that are missing or make no sense also ask for a full run.
     """
-    # A tip that is round is hit late beside its axis: sideways the circle alone tells.
-    circles = [step for step in steps if step.kind == "circle"]
-    held = Held(tilt_rad=HELD_TILT_RAD, along_m=HELD_ALONG_M)
-    sideways = estimate_tool(laser, path, circles, T_flange_tool, noise=noise, held=held)
-    check = _compared(sideways, T_flange_tool, rule, stored_covariance, SIDEWAYS)
-    if check.answer == "recalibrate":
-        return check
+    beside = sideways_check(
+        laser, path, steps, T_flange_tool, rule, noise=noise, stored_covariance=stored_covariance
+    )
+    if beside.answer == "recalibrate":
+        return beside
     held = Held(tilt_rad=HELD_TILT_RAD)
     both = estimate_tool(laser, path, steps, T_flange_tool, noise=noise, held=held)
     return _compared(both, T_flange_tool, rule, stored_covariance, EVERY_WAY)
+
+
+def sideways_check(
+    laser: LaserFrame,
+    path: FlangePath,
+    steps: Sequence[BeamStep],
+    T_flange_tool: Array,
+    rule: CheckRule,
+    *,
+    noise: RobotNoise = DEFAULT_NOISE,
+    stored_covariance: Array | None = None,
+) -> QuickCheck:
+    """What the circle alone tells: a tool that it finds far off need not plunge.
+
+    A tip that is round is hit late beside its axis, so that sideways the circle alone counts.
+    Arguments and errors as `quick_check`.
+    """
+    circles = [step for step in steps if step.kind == "circle"]
+    held = Held(tilt_rad=HELD_TILT_RAD, along_m=HELD_ALONG_M)
+    found = estimate_tool(laser, path, circles, T_flange_tool, noise=noise, held=held)
+    return _compared(found, T_flange_tool, rule, stored_covariance, SIDEWAYS)
 
 
 SIDEWAYS, EVERY_WAY = np.diag([1.0, 1.0, 0.0]), np.eye(3)  # what a comparison looks at, tool axes

@@ -1,0 +1,192 @@
+"""Make the golden tool bag: ``python bags/make_tool_runs.py``, ``tool_runs.mcap``.
+
+Simulated: a UR10 with a pin, two crossed beams, an input that is read every 2 ms and lags by 4 ms.
+The healthy tool is measured as reference and passes a quick check; somebody bumps it; the quick
+check says so; in the next run an edge is lost, which is refused; the one after it measures the bent
+tool, which is accepted and passes. The bag holds:
+
+- ``joint_states``, ``beam_events``: what the robot and the input say;
+- ``/tcf_node/session_events``: what a tool session made of it, for ``robocal replay``;
+- ``/truth/tool``: for judging only: the true tool, from when on.
+"""
+
+import json
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robocal_ros import __version__
+from robocal_ros.core.samples import JointSample
+from robocal_ros.core.tool.beam_edges import BeamEdge, InputRule
+from robocal_ros.core.tool.edge_samples import BREAK, RESTORE
+from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.records import arguments_text, outcome_text
+from robocal_ros.sessions.tool import EDGES, ToolSession
+from robocal_ros.sessions.tool_config import ToolConfig, rows_of
+from robocal_ros.sessions.tool_recorded import configuration
+from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
+from robocal_ros.sim.robot_program import RobotProgram, Sample
+from robocal_ros.sim.tool_cell import ToolCell
+from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT, laser_of
+from robocal_ros.storage.bags import BagWriter
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+BAG = Path(__file__).with_name("tool_runs.mcap")
+SEED = 11
+START_NS = 1_790_000_000_000_000_000
+STATION = "north"
+RADIUS_M = 2.5e-3
+BENT = bent(TAUGHT, [0.003, -0.002, 0.001], [0.03, -0.02, 0.0])
+INPUT = TrueInput(latency_s=0.004, sample_period_s=0.002)
+NOISE = TrueNoise(3e-5, 1e-5)
+JOINTS, EVENTS, TRUTH = "joint_states", "/tcf_node/session_events", "/truth/tool"
+BY = "cell controller"
+
+
+def lose_an_edge(step: PlannedStep, edges: list[BeamEdge]) -> list[BeamEdge]:
+    """The input misses one edge of the second circle."""
+    return [e for i, e in enumerate(edges) if step.name != "high" or i != 3]
+
+
+class Recorder:
+    """A cell, its tool session, and the bag in which all of it is written."""
+
+    def __init__(self, bag: BagWriter, history: CalibrationHistory) -> None:
+        arm = load_robot("ur10")
+        station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), INPUT, NOISE)
+        laser = laser_of(station)
+        cell = ToolCell(arm, station, laser, Q_NEAR)
+        config = ToolConfig(
+            points_m=rows_of(laser.points),
+            taught=rows_of(TAUGHT),
+            station=STATION,
+            input=InputRule(sample_period_s=INPUT.sample_period_s),
+        )
+        self.session = ToolSession(arm, history, config, __version__)
+        healthy = RoundTool.cylinder(TAUGHT, RADIUS_M)
+        rng = np.random.default_rng(SEED)
+        self.program = RobotProgram(cell, healthy, rng, START_NS, STATION)
+        self._bag, self._sequence, self._now_ns = bag, 0, START_NS
+        self._shown: tuple[int, int] | None = None
+        self._show_in_force()
+
+    def run(self, mode: str, cycle_id: str) -> Outcome:
+        """A run with all its steps; the outcome of the last."""
+        self._give(self.program.rest(0.5))
+        outcome = self.command(events.MEASURE_TOOL, mode=mode, cycle_id=cycle_id, by=BY)
+        while outcome.done and (step := self.session.awaited) is not None:
+            taken = self._give(self.program.drive(step))
+            while taken is None:  # a program waits for the next step
+                taken = self._give(self.program.rest(0.25))
+            outcome = taken
+        print(f"{cycle_id}: {outcome.status.name} {outcome.message}")
+        return outcome
+
+    def command(self, name: str, **arguments: Any) -> Outcome:
+        """Give a command to the session, and record what came of it."""
+        return self._carry_out(Command(name, arguments))
+
+    def truth(self, tool: np.ndarray) -> None:
+        """Mount another tool."""
+        self.program.tool = self.program.tool.mounted(tool)
+        told = {"simulated": True, "T_flange_tool": tool.tolist(), "time_s": self.program.now_s}
+        self._write(TRUTH, "std_msgs/msg/String", {"data": json.dumps(told)})
+
+    def _give(self, samples: list[Sample]) -> Outcome | None:
+        last = None
+        for sample in samples:
+            self._now_ns = max(self._now_ns, sample.stamp_ns)
+            self._write_sample(sample)
+            self.session.add(sample)
+            if (command := self.session.recognised()) is not None:
+                last = self._carry_out(command)
+        return last
+
+    def _carry_out(self, command: Command) -> Outcome:
+        self.session.submit(command)
+        (outcome,) = self.session.step(wall_ns=self._now_ns)
+        self._event(outcome.command, outcome)
+        self._show_in_force()
+        return outcome
+
+    def _show_in_force(self) -> None:
+        current = self.session.current
+        shown = current.head.revision, current.healthy.revision
+        if shown != self._shown:
+            self._shown = shown
+            topics = {JOINTS: f"/{JOINTS}", EDGES: f"/{EDGES}"}
+            self._event(configuration(self.session, topics), None)
+
+    def _event(self, command: Command, outcome: Outcome | None) -> None:
+        self._sequence += 1
+        message = {
+            "stamp": _time(command.stamp_ns or 0),
+            "sequence": self._sequence,
+            "command": command.name,
+            "arguments": arguments_text(command),
+            "outcome": "{}" if outcome is None else outcome_text(outcome),
+        }
+        self._write(EVENTS, "robocal_msgs/msg/SessionEvent", message)
+
+    def _write_sample(self, sample: Sample) -> None:
+        header = {"stamp": _time(sample.stamp_ns), "frame_id": ""}
+        if isinstance(sample, JointSample):
+            message: Mapping[str, Any] = {
+                "header": header,
+                "name": list(sample.names),
+                "position": sample.position,
+            }
+            self._write(f"/{JOINTS}", "sensor_msgs/msg/JointState", message)
+            return
+        edge = {
+            "header": header | {"frame_id": sample.station},
+            "beam": sample.beam,
+            "edge": BREAK if sample.blocked else RESTORE,
+            "stamp_sigma_s": sample.sigma_s,
+        }
+        self._write(f"/{EDGES}", "robocal_msgs/msg/BeamEvent", edge)
+
+    def _write(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
+        self._bag.write(topic, kind, message, self._now_ns)
+
+
+def _time(stamp_ns: int) -> dict[str, int]:
+    return {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}
+
+
+def record(path: Path) -> None:
+    """Make the bag."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        CalibrationHistory.open("SIM-UR10-1", state_dir=Path(folder)) as history,
+        BagWriter(path, latched=[EVENTS]) as bag,
+    ):
+        cell = Recorder(bag, history)
+        cell.truth(TAUGHT)
+        cell.run("reference", "commissioning")
+        cell.run("quick", "gap-1")
+        cell.truth(BENT)
+        cell.run("quick", "gap-2")
+        cell.program.edit = lose_an_edge
+        cell.run("full", "gap-3")
+        cell.program.edit = lambda step, edges: edges
+        measured = cell.run("full", "gap-4")
+        why = "its verdict"
+        cell.command(events.ACCEPT, id=measured.calibration_id, by=BY, reason=why)
+        cell.run("quick", "gap-5")
+
+
+def main() -> None:
+    """Write the bag beside this script."""
+    record(BAG)
+    print(f"{BAG.name}: {BAG.stat().st_size / 1e6:.2f} MB, simulated")
+
+
+if __name__ == "__main__":
+    main()
