@@ -214,7 +214,7 @@ def test_a_dead_beam_and_a_missed_one_are_refused():
 
 def test_a_speed_that_is_not_constant_is_refused():
     edges = passed((0.002, -0.003), 0.002, ripple=0.2, ripples=1)
-    with pytest.raises(ResidualError, match="record joint_states so that the speed need not"):
+    with pytest.raises(ResidualError, match="speed not constant: record joints"):
         fit_circle(motion(), edges)
 
 
