@@ -19,6 +19,17 @@ def write_made(path: Path, document: dict[str, Any], keys: Sequence[str], comman
     write_text(path, f"# Written by robocal {command}.\n{text}")
 
 
+def read_fields(path: Path, what: str) -> Fields:
+    """Read a YAML (or JSON) file of keys and values.
+
+    Raises
+    ------
+    InputError
+        When there is no such file, or it is not YAML.
+    """
+    return Fields(load_yaml(read_text(path, what), str(path)), str(path), "")
+
+
 def read_made(path: Path, arm: SerialArm, keys: Sequence[str], what: str, remedy: str) -> Fields:
     """Read the keys of such a file, made for ``arm``.
 
@@ -29,11 +40,22 @@ def read_made(path: Path, arm: SerialArm, keys: Sequence[str], what: str, remedy
     WrongRobotError
         When it was made for another nominal model.
     """
-    top = Fields(load_yaml(read_text(path, what), str(path)), str(path), "")
+    top = read_fields(path, what)
     top.only(*keys)
-    if top.text("model_hash") != arm.model_hash:
+    require_made_for(arm, path, top.text("robot"), top.text("model_hash"), remedy)
+    return top
+
+
+def require_made_for(arm: SerialArm, path: Path, robot: str, model_hash: str, remedy: str) -> None:
+    """Refuse a file that was made for another nominal model than ``arm``.
+
+    Raises
+    ------
+    WrongRobotError
+        With what to do: ``remedy``.
+    """
+    if model_hash != arm.model_hash:
         raise WrongRobotError(
-            f"{path} was made for {top.text('robot')} with the model {top.text('model_hash')}, "
+            f"{path} was made for {robot} with the model {model_hash}, "
             f"not for {arm.name} ({arm.model_hash}): {remedy} with this robot file"
         )
-    return top
