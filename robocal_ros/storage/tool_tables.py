@@ -11,6 +11,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.beam_edges import BEAMS, Beam, BeamEdge
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.named_steps import STEP_NAMES, step_kind
+from robocal_ros.core.tool.parallel_sweeps import HEIGHTS, SWEEPS, Height
 from robocal_ros.storage.cells import Cells, read_cells
 from robocal_ros.storage.files import quoted
 from robocal_ros.storage.table_columns import (
@@ -144,16 +145,43 @@ def read_flange_poses(path: Path) -> Array:
     InputError
         As `read_beam_points`; without an orientation.
     """
+    return _poses(path)[1]
+
+
+def read_sweeps(path: Path) -> dict[tuple[str, Height], Array]:
+    """T_base_flange (m, 4, 4) at the edges of parallel beams, by sweep and beam.
+
+    Raises
+    ------
+    InputError
+        As `read_flange_poses`; when a sweep or a beam has another name than docs/tool.md says.
+    """
+    table, T = _poses(path, ("sweep", "beam"))
+    sweeps, beams = table.words("sweep"), table.words("beam")
+    found: dict[tuple[str, Height], list[int]] = {}
+    heights: dict[str, Height] = {name: name for name in HEIGHTS}
+    for index, (sweep, beam) in enumerate(zip(sweeps, beams, strict=True)):
+        for column, name, known in (("sweep", sweep, SWEEPS), ("beam", beam, HEIGHTS)):
+            if name not in known:
+                table.fail(f"{quoted(name)} is not one of {', '.join(known)}", index, column)
+        found.setdefault((sweep, heights[beam]), []).append(index)
+    return {key: T[rows] for key, rows in found.items()}
+
+
+def _poses(path: Path, words: tuple[str, ...] = ()) -> tuple[Cells, Array]:
+    """A table of flange poses with further columns of words, and T_base_flange (m, 4, 4)."""
     every = [name for names in ORIENTATIONS for name in names]
+    required = (*words, *POSITION)
 
     def check(header: list[str], file: str) -> None:
-        check_plain(header, file, POSITION, every)
+        check_plain(header, file, required, every)
         if orientation_columns([name.strip() for name in header], file) is None:
-            check_plain(header, file, (*POSITION, *ORIENTATIONS[-1]), every)
+            check_plain(header, file, (*required, *ORIENTATIONS[-1]), every)
 
     table = read_cells(path, check)
     kind = orientation_columns(list(table.columns), table.file)
-    return frames.transform(read_rotations(table, kind or ORIENTATIONS[-1]), _positions(table))
+    R = read_rotations(table, kind or ORIENTATIONS[-1])
+    return table, frames.transform(R, _positions(table))
 
 
 def _positions(table: Cells) -> Array:
