@@ -49,7 +49,7 @@ def laser(tables, tmp_path_factory) -> Path:
     beams = write(folder / "beams.csv", POINT_COLUMNS, tables.beams)
     found = robocal_json(
         "tool.beams.json", "tool", "beams", "--data", beams, "--radius-mm", CYLINDER_MM,
-        "--robot", "ur10", "--station", "cell_1", "--sigma-mm", tables.sigma_mm,
+        "--robot", "ur10", "--station", "cell_1", "--sigma-mm", 1e3 * tables.laser.sigma_m,
         "--output", folder / "laser.yaml",
     )  # fmt: skip
     assert found["output"] == str(folder / "laser.yaml")

@@ -8,7 +8,7 @@ from tool_tables import write
 
 from robocal_ros.core import frames
 from robocal_ros.core.tool.crossed_model import BeamStep, RobotNoise
-from robocal_ros.core.tool.laser_frame import calibrate_laser
+from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
 from robocal_ros.sim.beam_moves import Sweep
 from robocal_ros.sim.beams import (
@@ -22,6 +22,7 @@ from robocal_ros.sim.beams import (
     crossings,
 )
 from robocal_ros.sim.tool_cell import MeasuredRun, ToolCell
+from robocal_ros.storage.laser_files import LaserFile, write_laser
 from robocal_ros.storage.robots import load_robot
 
 Q_NEAR = np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618])
@@ -38,12 +39,13 @@ JOINT_COLUMNS = "stamp_s,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 
 @dataclass(frozen=True)
 class RunTables:
-    """Rows of a run: ``events``, ``joints``, and ``beams`` of the calibration before it."""
+    """Rows of a run: ``events``, ``joints``, ``beams`` of the calibration before it, and the
+    ``laser`` frame that follows from them."""
 
     beams: list
     events: list
     joints: list
-    sigma_mm: float
+    laser: LaserFrame
 
     def written(self, folder: Path, events: list | None = None, joints: list | None = None) -> list:
         """The options that name the written tables."""
@@ -61,13 +63,23 @@ def simulated_run(seed: int = 11) -> RunTables:
     source = TrueInput(latency_s=LATENCY_S, sample_period_s=SAMPLE_S)
     station = BeamStation(beams_of(T_BASE_LASER, np.radians(92.2), 5.8e-5), source, TrueNoise())
     places = laser_points(station, T_BASE_LASER, rng)
-    sigma = point_sigma(station)
-    laser = calibrate_laser(places, sigma, CYLINDER_M)
+    laser = calibrate_laser(places, point_sigma(station), CYLINDER_M)
     noise = RobotNoise(station.noise.step_m, station.noise.edge_m)
     cell = ToolCell(load_robot("ur10"), station, laser, Q_NEAR, robot=noise)
     run = cell.full_run(RoundTool.cylinder(TRUTH, 1e-3 * RADIUS_MM), TAUGHT, rng)
     beams = [(name, *(1e3 * place)) for name, place in places.items()]
-    return RunTables(beams, event_rows(run.steps), joint_rows(run), 1e3 * sigma)
+    return RunTables(beams, event_rows(run.steps), joint_rows(run), laser)
+
+
+def run_tables(folder: Path) -> None:
+    """A run with its laser file, and sweeps through parallel beams."""
+    tables = simulated_run()
+    arm = load_robot("ur10")
+    write_laser(folder / "laser.yaml", LaserFile(tables.laser, "cell_1", arm.name, arm.model_hash))
+    write(folder / "run.csv", EVENT_COLUMNS, tables.events)
+    write(folder / "joints.csv", JOINT_COLUMNS, tables.joints)
+    write(folder / "sweeps.csv", SWEEP_COLUMNS, sweep_rows())
+    write(folder / "half_sweeps.csv", SWEEP_COLUMNS, swept("straight", R_STRAIGHT))
 
 
 def stamp(time_s: float) -> str:
