@@ -16,7 +16,8 @@ QUATERNION_TOLERANCE = 1e-3
 def read_tool(path: Path, rotation: Array | None = None) -> Array:
     """T_flange_tool (4, 4) from ``tcp_mm`` and ``quat_xyzw``.
 
-    ``rotation``: R_flange_tool (3, 3) for a document of touches, which tell the tip alone.
+    ``rotation``: R_flange_tool (3, 3) for a document of touches, which tell the tip alone; another
+    one takes none.
 
     Raises
     ------
@@ -33,6 +34,8 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
             top.fail(f"is {verdict.text('code')}: this tool was not accepted", "verdict")
     xyz = np.array(top.numbers("tcp_mm", 3)) * 1e-3
     if top.values.get("quat_xyzw") is not None:
+        if rotation is not None:
+            top.fail("is in the file: leave out roll, pitch and yaw", "quat_xyzw")
         quat = np.array(top.numbers("quat_xyzw", 4))
         length = float(np.linalg.norm(quat))
         if abs(length - 1.0) > QUATERNION_TOLERANCE:

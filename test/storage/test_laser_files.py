@@ -86,3 +86,11 @@ def test_a_tool_that_is_none_is_refused(tmp_path, document, words):
     path.write_text(json.dumps(document))
     with pytest.raises(InputError, match=words):
         read_tool(path)
+
+
+def test_an_orientation_is_given_once(tmp_path):
+    path = tmp_path / "tool.json"
+    path.write_text(json.dumps({"tcp_mm": [1, 2, 3], "quat_xyzw": [0, 0, 0, 1]}))
+    assert read_tool(path)[:3, 3] == pytest.approx([1e-3, 2e-3, 3e-3])
+    with pytest.raises(InputError, match="quat_xyzw is in the file: leave out roll"):
+        read_tool(path, np.eye(3))
