@@ -216,6 +216,30 @@ def test_joints_that_stop_are_refused(crossed, tables, keep, words):
     assert words in refused["message"]
 
 
+def test_a_robot_moved_by_hand_in_between_is_refused(crossed, tables):
+    """By 1.6 mm at the station, which its encoders show and its beams do not."""
+    late = Decimal(tables.events[of_step(tables.events, "upright", "x")[0]][0]) - Decimal("0.5")
+    moved = [(t, q1 + np.degrees(0.002 * (Decimal(t) > late)), *rest)
+             for t, q1, *rest in tables.joints]  # fmt: skip
+    refused = crossed(joints=moved, status=3)["error"]
+    assert refused["code"] == "RESIDUAL_TOO_LARGE"
+    assert "moved by hand in between" in refused["message"]
+
+
+def test_people_get_a_run_in_words(tables, laser, tmp_path, capsys):
+    words = ["tool", "crossed", *tables.written(tmp_path), "--robot", "ur10", "--laser", laser]
+    for method, tip in (
+        ("best", r"Tip .*mm: 3\.\d{3} ± 0\.0\d\d, -[12]\.\d{3} ± 0\.0"),
+        ("classic", r"Tip .*mm: [23]\.\d{3}, -[12]\.\d{3}, 15[01]\.\d{3}\n"),
+    ):
+        assert main([*map(str, [*words, *INPUT, *TAUGHT]), "--method", method]) == 0
+        printed = capsys.readouterr().out
+        assert printed.startswith("ACCEPT: ")
+        assert re.search(tip, printed)
+    assert main(["tool", "export", "--xyz-mm", "1,2,3", "--format", "ur"]) == 0
+    assert capsys.readouterr().out.startswith("set_tcp(p[0.0010000,0.0020000,0.0030000,0.0000000")
+
+
 def test_an_axis_nearly_in_the_beam_plane_is_refused(crossed):
     refused = crossed("--taught-rpy-deg", "70,0,0", status=3)
     assert refused["error"]["code"] == "RANK_DEFICIENT"

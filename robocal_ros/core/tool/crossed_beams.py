@@ -67,12 +67,18 @@ class CircleProblem:
         period = state.period_s + (rest.pop(0) if self.period_free else 0.0)
         return CircleState(state.d + step[:2], state.rho + step[2:4], latency, period)
 
+    def sine(self, state: CircleState) -> Array:
+        """Of psi (m,) at each edge: the axis passes the beam at speed times the cosine."""
+        e = self.edges
+        w = (e.side * state.rho[e.beam] - state.d[e.beam]) / self.motion.radius_m
+        return np.clip(w, -DEEPEST, DEEPEST)
+
     def linearise(self, state: CircleState) -> tuple[Array, Array]:
         """Residual (m, 1) and Jacobian (m, 1, k)."""
         e, R = self.edges, self.motion.radius_m
         motion = replace(self.motion, period_s=state.period_s)
         beam_rate = np.array([motion.psi_rate(b) for b in (0, 1)])[e.beam]
-        w = np.clip((e.side * state.rho[e.beam] - state.d[e.beam]) / R, -DEEPEST, DEEPEST)
+        w = self.sine(state)
         turn = e.rising * beam_rate  # +1: psi = asin w, -1: psi = pi - asin w
         psi = np.where(turn > 0.0, np.arcsin(w), np.pi - np.arcsin(w))
         theta = np.where(e.beam == 0, psi, motion.beam_angle_rad - psi)
@@ -158,19 +164,18 @@ def fit_circle(
     problem = CircleProblem(motion, labelled, latency_s is None, period_free)
     start = CircleState(d, rho, latency if latency_s is None else latency_s, motion.period_s)
     found = solve(problem, start, robust=False)
-    return _checked(motion, labelled, found, edge_m)
+    return _checked(problem, found, edge_m)
 
 
-def _checked(
-    motion: CircleMotion, edges: CircleEdges, found: Estimate[CircleState], edge_m: float
-) -> CircleFit:
-    state = found.state
+def _checked(problem: CircleProblem, found: Estimate[CircleState], edge_m: float) -> CircleFit:
+    motion, edges, state = problem.motion, problem.edges, found.state
     speed = 2.0 * np.pi * motion.radius_m / state.period_s
     late = found.residual[:, 0] * edges.sigma_s
     misfit = float(speed * np.sqrt(np.mean(late**2)))
     free = len(late) - len(found.names)
     bound = chi2_quantile(SOUND_FIT, free)
-    variance = edges.sigma_s**2 + (edge_m / speed) ** 2
+    passing = speed * np.sqrt(1.0 - problem.sine(state) ** 2)
+    variance = edges.sigma_s**2 + (edge_m / passing) ** 2
     unexplained = float(np.sum(late**2 / variance)) > bound
     if unexplained or misfit > LARGEST_MISFIT_M or not found.converged:
         explained = speed * float(np.sqrt(bound / len(late) * variance.mean()))
