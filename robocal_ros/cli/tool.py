@@ -1,9 +1,17 @@
-"""``robocal tool``: place crossed light beams and measure a tool, from tables."""
+"""``robocal tool``: place light beams, measure a tool, hand it to a controller; from tables."""
 
 from robocal_ros.cli.actions import Actions
 
 NAME = "tool"
-HELP = "place crossed light beams, measure a tool with them or by touching a point"
+HELP = "place light beams, measure a tool with them or by touching a point, hand it to a controller"
 
-_actions = Actions({"beams": "tool_beams", "crossed": "tool_crossed", "points": "tool_points"})
+_actions = Actions(
+    {
+        "beams": "tool_beams",
+        "crossed": "tool_crossed",
+        "points": "tool_points",
+        "parallel": "tool_parallel",
+        "export": "tool_export",
+    }
+)
 add_arguments, run = _actions.add_arguments, _actions.run

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+GIMBAL_LOCK = 1e-8  # cosine of the pitch below which roll and yaw are one
+
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
     """Assemble (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
@@ -61,6 +63,27 @@ def log_rotation(rotation: Array) -> Array:
 
     R = np.array(rotation, dtype=np.float64)  # a copy: SciPy 1.11 takes none that is read-only
     return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
+
+
+def rotation_from_rpy(rpy: ArrayLike) -> Array:
+    """Rotation (3, 3) of roll, pitch, yaw (3,), rad: about x, then y, then z of the fixed frame."""
+    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
+    turns = ((0.0, 0.0, yaw), (0.0, pitch, 0.0), (roll, 0.0, 0.0))
+    Rz, Ry, Rx = (exp_rotation(turn) for turn in turns)
+    return Rz @ Ry @ Rx
+
+
+def rpy(rotation: Array) -> Array:
+    """Roll, pitch, yaw (3,), rad, of a rotation (3, 3): the inverse of `rotation_from_rpy`.
+
+    With pitch at +-90 deg roll and yaw turn about one axis: yaw is 0 then.
+    """
+    R = rotation
+    level = float(np.hypot(R[0, 0], R[1, 0]))
+    pitch = np.arctan2(-R[2, 0], level)
+    if level < GIMBAL_LOCK:
+        return np.array([np.arctan2(-R[1, 2], R[1, 1]), pitch, 0.0])
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
 
 
 def skew(v: ArrayLike) -> Array:

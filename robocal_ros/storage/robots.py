@@ -200,10 +200,8 @@ def _pose(top: Fields, key: str) -> Array:
         if abs(length - 1.0) > 1e-3:
             fields.fail(f"has length {length:.6g}, not 1", "quat_xyzw")
         return frames.transform_from_quat(xyz, quat)
-    roll, pitch, yaw = np.array(fields.numbers("rpy_deg", 3, (0.0, 0.0, 0.0))) * RAD
-    turns = ((0.0, 0.0, yaw), (0.0, pitch, 0.0), (roll, 0.0, 0.0))
-    Rz, Ry, Rx = (frames.exp_rotation(turn) for turn in turns)
-    return frames.transform(Rz @ Ry @ Rx, xyz)
+    rpy = np.array(fields.numbers("rpy_deg", 3, (0.0, 0.0, 0.0))) * RAD
+    return frames.transform(frames.rotation_from_rpy(rpy), xyz)
 
 
 def _open_limits(arm: SerialArm) -> tuple[str, ...]:

@@ -80,6 +80,25 @@ def read_layout(header: Sequence[str], arm: SerialArm, file: str) -> Layout:
     return Layout(place, joints, factors, position, factor, orientation_columns(place, file))
 
 
+def read_joint_columns(
+    header: Sequence[str], arm: SerialArm, file: str
+) -> tuple[tuple[str, ...], Array]:
+    """Understand a header of stamps and joint readings: the joints' columns, their factors to SI.
+
+    Raises
+    ------
+    InputError
+        As `read_layout`.
+    """
+    names = [name.strip() for name in header]
+    _check_separator(names, file)
+    joints = [f"q{i + 1}_{unit}" for i in range(arm.n) for unit in joint_units(arm, i)]
+    _check_known(names, ("stamp_s", *joints), file, arm)
+    if "stamp_s" not in names:
+        _fail("column stamp_s is missing", file)
+    return _joint_columns({name: i for i, name in enumerate(names)}, arm, file)
+
+
 def check_plain(
     header: Sequence[str], file: str, required: Sequence[str], optional: Sequence[str] = ()
 ) -> None:

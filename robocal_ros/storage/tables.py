@@ -82,7 +82,7 @@ def _measurements(table: Cells, layout: Layout, arm: SerialArm) -> Measurements:
         sample=_samples(table),
         rotation=None if layout.orientation is None else read_rotations(table, layout.orientation),
         sigma=_sigma(table, rest[:, -1]) if "sigma_mm" in layout.place else None,
-        stamp_ns=_stamps(table) if "stamp_s" in layout.place else None,
+        stamp_ns=read_stamps(table) if "stamp_s" in layout.place else None,
     )
 
 
@@ -140,24 +140,6 @@ def _read(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
     return table, found[0]
 
 
-def _stamps(table: Cells) -> NDArray[np.int64]:
-    """Nanoseconds, without the rounding that seconds since 1970 suffer in binary."""
-    stamps = []
-    try:
-        seconds = [Decimal(cell.strip()) for cell in table.columns["stamp_s"]]
-    except InvalidOperation:
-        table.fail_at_text("stamp_s", Decimal)
-    for index, value in enumerate(seconds):
-        if not value.is_finite():
-            table.fail(f"{quoted(value)} is not a finite number", index, "stamp_s")
-        if abs(value) > LARGEST_STAMP_S:
-            table.fail(
-                f"{quoted(value)} is beyond any date; the unit is the second", index, "stamp_s"
-            )
-        stamps.append(int(value.scaleb(9).to_integral_value()))
-    return np.array(stamps, dtype=np.int64)
-
-
 def _samples(table: Cells) -> tuple[str, ...]:
     samples = table.words("sample") or tuple(map(str, table.rows))
     if len(set(samples)) != len(samples):
@@ -199,3 +181,27 @@ def read_rotations(table: Cells, kind: tuple[str, ...]) -> Array:
             table.fail(f"the quaternion has length {length[index]:.6g}, not 1", index, "qw")
         rotations = Rotation.from_quat(values)
     return np.asarray(rotations.as_matrix())
+
+
+def read_stamps(table: Cells) -> NDArray[np.int64]:
+    """Nanoseconds (m,) of ``stamp_s``, without the rounding that seconds since 1970 suffer.
+
+    Raises
+    ------
+    InputError
+        At the first cell that is no time.
+    """
+    stamps = []
+    try:
+        seconds = [Decimal(cell.strip()) for cell in table.columns["stamp_s"]]
+    except InvalidOperation:
+        table.fail_at_text("stamp_s", Decimal)
+    for index, value in enumerate(seconds):
+        if not value.is_finite():
+            table.fail(f"{quoted(value)} is not a finite number", index, "stamp_s")
+        if abs(value) > LARGEST_STAMP_S:
+            table.fail(
+                f"{quoted(value)} is beyond any date; the unit is the second", index, "stamp_s"
+            )
+        stamps.append(int(value.scaleb(9).to_integral_value()))
+    return np.array(stamps, dtype=np.int64)

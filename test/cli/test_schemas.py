@@ -7,6 +7,7 @@ from campaign import ROBOT, measured, table
 from command import SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
 from recordings import plain_bag, recorded_bag, shift
+from tool_runs import run_tables
 from tool_tables import tool_tables
 
 from robocal_ros.cli.main import COMMANDS
@@ -30,6 +31,9 @@ SCREEN = ["thermal", "screen", *DRIFT[2:]]
 PLAN = ["thermal", "plan-poses", "--robot", ROBOT, "--sensor", "s.yaml"]
 PRIOR = ["thermal", "learn-prior", *DRIFT[2:]]
 CROSSED = ["tool", "crossed", "--radius-mm", "12", "--period-s", "2", "--start-deg", "45"]
+RUN = ["tool", "crossed", "--robot", "ur10", "--laser", "laser.yaml", "--taught-mm", "0,0,150",
+       "--sample-period-s", "0.002", "--joints", "joints.csv"]  # fmt: skip
+PARALLEL = ["tool", "parallel", "--up-mm", "400", "--down-mm", "360", "--x-mm", "800"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -122,6 +126,24 @@ CASES = {
         [*CROSSED, "--events", "lost_edge.csv"],
         (3, "BEAM_EDGES_WRONG"),
     ),
+    "tool crossed, whole run": (
+        "tool.crossed.json",
+        [*RUN, "--events", "run.csv"],
+        [*RUN, "--events", "run.csv", "--taught-rpy-deg", "70,0,0"],
+        (3, "RANK_DEFICIENT"),
+    ),
+    "tool parallel": (
+        "tool.parallel.json",
+        [*PARALLEL, "--data", "sweeps.csv"],
+        [*PARALLEL, "--data", "half_sweeps.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "tool export": (
+        "tool.export.json",
+        ["tool", "export", "--xyz-mm", "1,2,3", "--format", "urdf"],
+        ["tool", "export", "--rpy-deg", "1,2,3", "--format", "urdf"],
+        (2, "BAD_INPUT"),
+    ),
     "tool points": (
         "tool.points.json",
         ["tool", "points", "--data", "touches.csv"],
@@ -147,6 +169,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     recorded_bag(folder / "live.mcap", folder / "state", visits)
     fixed_tables(folder)
     tool_tables(folder)
+    run_tables(folder)
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)

@@ -76,6 +76,30 @@ def test_a_first_edge_that_restores_and_several_turns(tmp_path):
     assert crossed(path)["center_mm"] == pytest.approx(CENTRE_MM, abs=1e-6)
 
 
+def test_a_speed_that_is_not_constant_is_refused_by_what_sigma_explains(tmp_path):
+    """Twice a turn 0.6 % faster and slower: 0.04 mm at an edge, four times the robot's scatter."""
+    path = write(tmp_path / "events.csv", EVENTS, circle_rows(ripple=0.006, ripples=2))
+    refused = crossed(path, status=3)["error"]
+    assert refused["code"] == "RESIDUAL_TOO_LARGE"
+    assert "speed not constant: record joints" in refused["message"]
+    sampled = crossed(path, "--sample-period-s", 0.01)  # edges to 2.9 ms, 0.1 mm: explained
+    assert max(sampled["sigma_mm"]) > 0.05
+
+
+def test_a_ninth_edge_that_fits_no_turn_is_refused(tmp_path):
+    stamp, beam, blocked = circle_rows()[-1]
+    rows = [*circle_rows(), (f"{float(stamp) + 0.05:.9f}", beam, 1 - blocked)]
+    refused = crossed(write(tmp_path / "events.csv", EVENTS, rows), status=3)["error"]
+    assert refused["code"] == "RESIDUAL_TOO_LARGE"
+
+
+def test_a_tool_beside_the_beam_is_refused(tmp_path):
+    """Its axis never nearer than its radius to the x-beam."""
+    rows = circle_rows(centre_mm=(0.0, RADIUS_MM + 2.0 * RHO_MM))
+    refused = crossed(write(tmp_path / "events.csv", EVENTS, rows), status=3)["error"]
+    assert "beam x was never broken" in refused["message"]
+
+
 def test_a_known_latency_is_taken(tmp_path):
     path = write(tmp_path / "events.csv", EVENTS, circle_rows(0.013))
     assert crossed(path, "--latency-s", "0.013")["latency_s"] == 0.013

@@ -23,6 +23,7 @@ PUBLISHED_MM = {  # thesis table 5-3
 RADIUS_MM, PERIOD_S, START_DEG = 12.0, 2.0, 45.0
 CENTRE_MM = (3.0, -4.0)
 RHO_MM = 2.5
+POINT_COLUMNS = "point,x_mm,y_mm,z_mm"
 TIP_MM = np.array([12.0, -34.0, 210.0])
 
 
@@ -34,15 +35,22 @@ def write(path: Path, header: str, rows: Iterable[Sequence[object]]) -> Path:
     return path
 
 
-def circle_rows(latency_s: float = 0.0, window: tuple[float, float] = (0.0, PERIOD_S)) -> list:
+def circle_rows(
+    latency_s: float = 0.0,
+    centre_mm: tuple[float, float] = CENTRE_MM,
+    ripple: float = 0.0,
+    ripples: int = 1,
+) -> list:
     """Stamps, beams and states of a thick tool on one circle, by the simulated station."""
     station = BeamStation(beams_of(np.eye(4), np.pi / 2.0), PERFECT, NO_NOISE)
     upright = np.diag([1.0, -1.0, -1.0])
-    T = frames.transform(upright, [*(1e-3 * np.array(CENTRE_MM)), 0.13])
+    T = frames.transform(upright, [*(1e-3 * np.array(centre_mm)), 0.13])
     start = np.radians(START_DEG)
-    move = Circle(T, np.eye(3), 1e-3 * RADIUS_MM, PERIOD_S, start_rad=start, direction=1)
+    move = Circle(
+        T, np.eye(3), 1e-3 * RADIUS_MM, PERIOD_S, start_rad=start, ripple=ripple, ripples=ripples
+    )
     tool = RoundTool.cylinder(frames.transform(np.eye(3), [0.0, 0.0, 0.15]), 1e-3 * RHO_MM)
-    edges = station.edges(tool, move, window, np.random.default_rng(0))
+    edges = station.edges(tool, move, move.window, np.random.default_rng(0))
     return [(f"{e.time_s + latency_s:.9f}", e.beam, int(e.blocked)) for e in edges]
 
 
@@ -59,8 +67,8 @@ def touch_rows(count: int, noise_mm: float = 0.0) -> list:
 
 def tool_tables(folder: Path) -> None:
     points = [(name, *place) for name, place in PUBLISHED_MM.items()]
-    write(folder / "beams.csv", "point,x_mm,y_mm,z_mm", points)
-    write(folder / "some_beams.csv", "point,x_mm,y_mm,z_mm", points[:-1])
+    write(folder / "beams.csv", POINT_COLUMNS, points)
+    write(folder / "some_beams.csv", POINT_COLUMNS, points[:-1])
     write(folder / "edges.csv", "stamp_s,beam,blocked", circle_rows())
     write(folder / "lost_edge.csv", "stamp_s,beam,blocked", circle_rows()[1:-2])
     header = "x_mm,y_mm,z_mm,qx,qy,qz,qw"

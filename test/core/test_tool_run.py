@@ -88,7 +88,7 @@ def test_a_rippling_speed_does_no_harm():
     cell = make_cell(plan=RunPlan(ripple=0.4))
     run = cell.full_run(RoundTool.cylinder(TRUTH, 0.0025), TAUGHT, rng())
     assert solved(run).tip == pytest.approx(TRUTH[:3, 3], abs=1e-7)
-    with pytest.raises(ResidualError, match="record joint_states"):
+    with pytest.raises(ResidualError, match="speed not constant: record joints"):
         fit_circle(run.commanded(0).motion, run.steps[0].edges)
 
 

@@ -14,10 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.core.errors import ResidualError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.tool.beam_edges import BEAMS, BeamEdge, BeamError
 from robocal_ros.core.tool.circle_edges import CircleEdges, CircleMotion, label_edges
+from robocal_ros.core.tool.crossed_model import RobotNoise
 
 Array = NDArray[np.float64]
 CircleMethod = Literal["best", "classic"]
@@ -25,6 +27,7 @@ CircleMethod = Literal["best", "classic"]
 LARGEST_MISFIT_M = 2e-4  # rms along the circle: speed not constant, or an edge that belongs not
 THICKEST = 0.7  # tool's radius on the circle's
 DEEPEST = 0.999  # of R: an edge where the circle hardly crosses the beam
+EDGE_SCATTER_M = RobotNoise().edge_m  # of a robot that repeats well
 
 
 @dataclass(frozen=True)
@@ -64,12 +67,18 @@ class CircleProblem:
         period = state.period_s + (rest.pop(0) if self.period_free else 0.0)
         return CircleState(state.d + step[:2], state.rho + step[2:4], latency, period)
 
+    def sine(self, state: CircleState) -> Array:
+        """Of psi (m,) at each edge: the axis passes the beam at speed times the cosine."""
+        e = self.edges
+        w = (e.side * state.rho[e.beam] - state.d[e.beam]) / self.motion.radius_m
+        return np.clip(w, -DEEPEST, DEEPEST)
+
     def linearise(self, state: CircleState) -> tuple[Array, Array]:
         """Residual (m, 1) and Jacobian (m, 1, k)."""
         e, R = self.edges, self.motion.radius_m
         motion = replace(self.motion, period_s=state.period_s)
         beam_rate = np.array([motion.psi_rate(b) for b in (0, 1)])[e.beam]
-        w = np.clip((e.side * state.rho[e.beam] - state.d[e.beam]) / R, -DEEPEST, DEEPEST)
+        w = self.sine(state)
         turn = e.rising * beam_rate  # +1: psi = asin w, -1: psi = pi - asin w
         psi = np.where(turn > 0.0, np.arcsin(w), np.pi - np.arcsin(w))
         theta = np.where(e.beam == 0, psi, motion.beam_angle_rad - psi)
@@ -122,12 +131,15 @@ def fit_circle(
     *,
     latency_s: float | None = None,
     period_free: bool = False,
+    edge_m: float = EDGE_SCATTER_M,
 ) -> CircleFit:
     """Find the tool's axis from one circle at constant speed.
 
     ``best``: closed form from all edges, then maximum likelihood over the centre, the radii, the
     phase (latency) and, where free, the period. ``classic``: mid-times (thesis eq. 4-8, 4-9).
-    ``latency_s`` fixes the latency.
+    ``latency_s`` fixes the latency; ``edge_m`` is the robot's scatter at an edge, m, beside which
+    a misfit is judged (chi-square). The covariance is that of the stamps alone, and wider where
+    they do not explain the misfit.
 
     Raises
     ------
@@ -152,24 +164,34 @@ def fit_circle(
     problem = CircleProblem(motion, labelled, latency_s is None, period_free)
     start = CircleState(d, rho, latency if latency_s is None else latency_s, motion.period_s)
     found = solve(problem, start, robust=False)
-    return _checked(motion, labelled, found)
+    return _checked(problem, found, edge_m)
 
 
-def _checked(motion: CircleMotion, edges: CircleEdges, found: Estimate[CircleState]) -> CircleFit:
-    state = found.state
+def _checked(problem: CircleProblem, found: Estimate[CircleState], edge_m: float) -> CircleFit:
+    motion, edges, state = problem.motion, problem.edges, found.state
     speed = 2.0 * np.pi * motion.radius_m / state.period_s
-    misfit = float(speed * np.sqrt(np.mean((found.residual[:, 0] * edges.sigma_s) ** 2)))
-    if misfit > LARGEST_MISFIT_M or not found.converged:
+    late = found.residual[:, 0] * edges.sigma_s
+    misfit = float(speed * np.sqrt(np.mean(late**2)))
+    free = len(late) - len(found.names)
+    bound = chi2_quantile(SOUND_FIT, free)
+    passing = speed * np.sqrt(1.0 - problem.sine(state) ** 2)
+    variance = edges.sigma_s**2 + (edge_m / passing) ** 2
+    unexplained = float(np.sum(late**2 / variance)) > bound
+    if unexplained or misfit > LARGEST_MISFIT_M or not found.converged:
+        explained = speed * float(np.sqrt(bound / len(late) * variance.mean()))
         raise ResidualError(
-            f"the edges miss a circle at constant speed by {misfit * 1e3:.3f} mm rms (allowed "
-            f"{LARGEST_MISFIT_M * 1e3:.1f} mm): check radius, period and start, or record "
-            "joint_states so that the speed need not be constant"
+            f"the edges miss a circle at constant speed by {misfit * 1e3:.4f} mm rms (stamps and "
+            f"the robot's scatter explain {min(explained, LARGEST_MISFIT_M) * 1e3:.4f} mm): speed "
+            "not constant: record joints and give them; or else check radius, period, start, beam "
+            "angle and the stamps' sigma"
         )
+    chi2 = float(np.sum(found.residual**2))
+    wide = chi2 / free if chi2 > bound else 1.0
     J = motion.centre_jacobian
-    free = "latency" in found.names
-    sigma = float(np.sqrt(found.covariance[4, 4])) if free else None
+    spread = wide * found.covariance
+    sigma = float(np.sqrt(spread[4, 4])) if "latency" in found.names else None
     return CircleFit(
-        "best", motion.centre(state.d), J @ found.covariance[:2, :2] @ J.T, state.d, state.rho,
+        "best", motion.centre(state.d), J @ spread[:2, :2] @ J.T, state.d, state.rho,
         state.latency_s, sigma, state.period_s, misfit, found,
     )  # fmt: skip
 

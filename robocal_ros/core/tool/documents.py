@@ -1,5 +1,6 @@
 """Measured tools and beams as plain documents (JSON), in the units people read."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,16 @@ from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import verdict_document
 from robocal_ros.core.tool.crossed_beams import CircleFit
+from robocal_ros.core.tool.crossed_run import ToolEstimate
 from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.core.tool.tool_axis import first_rotation
 from robocal_ros.core.tool.touch_points import TouchFit
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
+
+LARGEST_SIGMA_M = 2e-4  # of a tip, in any direction: as much as edges may miss a tool
+COVARIANCE_UNITS = ("m", "m", "m", "rad", "rad")
 
 
 def laser_document(laser: LaserFrame) -> Document:
@@ -44,6 +50,79 @@ def circle_document(fit: CircleFit) -> Document:
         "misfit_mm": fit.misfit_m * 1e3,
         "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
     }
+
+
+def run_document(estimate: ToolEstimate, circles: Sequence[str]) -> Document:
+    """A tool measured by a whole run; ``circles``: names in the order of their radii.
+
+    ``covariance`` (5, 5), SI: of the tip along the flange's x, y, z and of the axis' tilt along the
+    tool's x and y; ``sigma_mm`` and ``sigma_deg`` are the roots of its diagonal.
+    """
+    sigma = np.sqrt(np.diag(estimate.covariance))
+    radii = zip(circles, (estimate.radius * 1e3).tolist(), strict=True)
+    return {
+        "method": "best",
+        **_tool_part(estimate.T_flange_tool),
+        "covariance": estimate.covariance.tolist(),
+        "covariance_units": list(COVARIANCE_UNITS),
+        "sigma_mm": (sigma[:3] * 1e3).tolist(),
+        "sigma_deg": np.degrees(sigma[3:]).tolist(),
+        "tool_radius_mm": [{"circle": name, "x": x, "y": y} for name, (x, y) in radii],
+        "latency_s": estimate.latency_s,
+        "latency_sigma_s": estimate.latency_sigma_s,
+        "misfit_mm": estimate.misfit_m * 1e3,
+        "shift_mm": estimate.shift_m * 1e3,
+        "verdict": verdict_document(_run_verdict(estimate)),
+    }
+
+
+def classic_run_document(T_flange_tool: Array) -> Document:
+    """A tool by the classic method; what it does not tell is null."""
+    words = "mid-times: no covariance, and biased for a thick tool; compare with method best"
+    unknown = (
+        *("covariance", "covariance_units", "sigma_mm", "sigma_deg", "tool_radius_mm"),
+        *("latency_s", "latency_sigma_s", "misfit_mm", "shift_mm"),
+    )
+    return {
+        "method": "classic",
+        **_tool_part(T_flange_tool),
+        **dict.fromkeys(unknown),
+        "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
+    }
+
+
+def parallel_document(axis: Array, tip: Array | None) -> Document:
+    """A tool by parallel beams: turned from the flange's by the smallest angle; SI in, mm out."""
+    words = "the straightened tool stands upright" if tip is not None else "the axis alone"
+    T = frames.transform(first_rotation(axis), np.zeros(3) if tip is None else tip)
+    return _tool_part(T) | {
+        "tcp_mm": None if tip is None else (tip * 1e3).tolist(),
+        "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
+    }
+
+
+def _tool_part(T_flange_tool: Array) -> Document:
+    return {
+        "tcp_mm": (T_flange_tool[:3, 3] * 1e3).tolist(),
+        "quat_xyzw": frames.quat_xyzw(T_flange_tool).tolist(),
+        "axis": T_flange_tool[:3, 2].tolist(),
+    }
+
+
+def _run_verdict(estimate: ToolEstimate) -> Verdict:
+    """Accepted where the tip is known well enough; edges that fit no tool never come so far."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1]))
+    words = (
+        f"the tip is known to {sigma * 1e3:.3f} mm; edges within {estimate.misfit_m * 1e3:.3f} mm, "
+        f"steps within {estimate.shift_m * 1e3:.3f} mm"
+    )
+    if not sigma <= LARGEST_SIGMA_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words} (allowed sigma {LARGEST_SIGMA_M * 1e3:.1f} mm): read the beams faster, or "
+            "place them more exactly",
+        )
+    return Verdict(Code.ACCEPT, words)
 
 
 def touch_document(fit: TouchFit) -> Document:
