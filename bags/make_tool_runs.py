@@ -23,6 +23,7 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge, InputRule
 from robocal_ros.core.tool.edge_samples import BREAK, RESTORE
 from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
@@ -60,7 +61,8 @@ class Recorder:
     def __init__(self, bag: BagWriter, history: CalibrationHistory) -> None:
         arm = load_robot("ur10")
         station = BeamStation(beams_of(T_BASE_LASER, BETA_RAD, GAP_M), INPUT, NOISE)
-        laser = laser_of(station)
+        # To the bits that come back from a laser file, which is in millimetres.
+        laser = LaserFrame(1e-3 * (laser_of(station).points * 1e3))
         cell = ToolCell(arm, station, laser, Q_NEAR)
         config = ToolConfig(
             points_m=rows_of(laser.points),

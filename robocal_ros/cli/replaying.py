@@ -78,6 +78,10 @@ def replay_bag(request: Request, watch: Watch) -> Document:
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
             if is_tool_session(recording.configured):
+                if request.auto or request.cold or request.warm:
+                    raise InputError(
+                        "the bag is of a tool node: --auto, --cold and --warm are for thermal ones"
+                    )
                 return replay_tool(recording, arm, history, watch("replaying", recording))
             kept = _GOES_ON.format(history.path) if history.list(1) else ""
             session = _session(recording, arm, history)

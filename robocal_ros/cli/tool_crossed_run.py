@@ -38,6 +38,7 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> Outcome:
     from robocal_ros.core.tool.crossed_run import estimate_tool
     from robocal_ros.core.tool.documents import classic_run_document, run_document
     from robocal_ros.core.tool.driven_circle import classic_from_path
+    from robocal_ros.core.tool.judging import KnownTool, ToolLimits, judge_run
     from robocal_ros.core.tool.named_steps import named_steps
     from robocal_ros.storage.laser_files import read_laser_for
     from robocal_ros.storage.tool_tables import read_joint_path, read_step_edges
@@ -59,7 +60,9 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> Outcome:
         document = classic_run_document(classic_from_path(laser, path, steps, taught))
     else:
         circles = [step.name for step in steps if step.kind == "circle"]
-        document = run_document(estimate_tool(laser, path, steps, taught), circles)
+        found = estimate_tool(laser, path, steps, taught)
+        known = KnownTool(found.T_flange_tool, found.covariance)
+        document = run_document(known, found, circles, judge_run(found, ToolLimits()))
     document["warnings"] = warnings
     warn(warnings)
     return Outcome(document, partial(_show, document=document))

@@ -11,10 +11,11 @@ from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, TOOL, Proposal
+from robocal_ros.core.tool.change_documents import change_document, check_document
 from robocal_ros.core.tool.crossed_model import Held
+from robocal_ros.core.tool.documents import run_document
 from robocal_ros.core.tool.judging import KnownTool, change_between, changed_tool, judge_tool
 from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
-from robocal_ros.core.tool.run_documents import change_document, check_document, tool_document
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig
@@ -94,7 +95,7 @@ class ToolResults:
             found = changed_tool(taught, healthy, found)
         in_force = self._current.tool
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits)
-        document = tool_document(found, estimate, verdict) | {
+        document = run_document(found, estimate, run.circles, verdict) | {
             "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
             "absolute": absolute,
         }
@@ -111,7 +112,9 @@ class ToolResults:
             f"{np.degrees(change.axis_rad):.3f} deg off: later runs give the change against this"
         )
         verdict = Verdict(Code.ACCEPT, words)
-        document = tool_document(found, estimate, verdict) | {"change": change_document(change)}
+        document = run_document(found, estimate, run.circles, verdict) | {
+            "change": change_document(change)
+        }
         kept = self._keep(HEALTHY_TOOL, run, command, wall_ns, verdict, document, found)
         by = str(command.arguments.get("by", ""))
         self._history.accept(kept, by=by, reason=words, expected_head=None, wall_ns=wall_ns)

@@ -56,6 +56,11 @@ class ToolRun:
         return len(self.steps) == len(self.plan.names)
 
     @property
+    def circles(self) -> list[str]:
+        """Names of the circles so far."""
+        return [step.name for step in self.steps if step.kind == "circle"]
+
+    @property
     def awaited(self) -> PlannedStep:
         """The step to be driven now."""
         return self.plan.step(len(self.steps) + 1, self.seen)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from beam_cell import TAUGHT, make_cell
+from beam_cell import make_cell
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, RankDeficientError, ResidualError
@@ -14,6 +14,7 @@ from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.named_steps import named_steps, step_kind
 from robocal_ros.sim.beams import RoundTool, bent
 from robocal_ros.sim.tool_cell import joints_at
+from robocal_ros.sim.ur10_station import TAUGHT
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.001], [0.03, -0.02, 0.0])
 SPLINE_M = (

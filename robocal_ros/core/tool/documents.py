@@ -12,6 +12,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import verdict_document
 from robocal_ros.core.tool.crossed_beams import CircleFit
 from robocal_ros.core.tool.crossed_run import ToolEstimate
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.tool_axis import first_rotation
 from robocal_ros.core.tool.touch_points import TouchFit
@@ -19,7 +20,6 @@ from robocal_ros.core.tool.touch_points import TouchFit
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
-LARGEST_SIGMA_M = 2e-4  # of a tip, in any direction: as much as edges may miss a tool
 COVARIANCE_UNITS = ("m", "m", "m", "rad", "rad")
 
 
@@ -52,18 +52,21 @@ def circle_document(fit: CircleFit) -> Document:
     }
 
 
-def run_document(estimate: ToolEstimate, circles: Sequence[str]) -> Document:
-    """A tool measured by a whole run; ``circles``: names in the order of their radii.
+def run_document(
+    found: KnownTool, estimate: ToolEstimate, circles: Sequence[str], verdict: Verdict
+) -> Document:
+    """A tool ``found`` by a whole run; ``circles``: names in the order of their radii.
 
     ``covariance`` (5, 5), SI: of the tip along the flange's x, y, z and of the axis' tilt along the
     tool's x and y; ``sigma_mm`` and ``sigma_deg`` are the roots of its diagonal.
     """
-    sigma = np.sqrt(np.diag(estimate.covariance))
+    covariance = estimate.covariance if found.covariance is None else found.covariance
+    sigma = np.sqrt(np.diag(covariance))
     radii = zip(circles, (estimate.radius * 1e3).tolist(), strict=True)
     return {
         "method": "best",
-        **_tool_part(estimate.T_flange_tool),
-        "covariance": estimate.covariance.tolist(),
+        **_tool_part(found.T_flange_tool),
+        "covariance": covariance.tolist(),
         "covariance_units": list(COVARIANCE_UNITS),
         "sigma_mm": (sigma[:3] * 1e3).tolist(),
         "sigma_deg": np.degrees(sigma[3:]).tolist(),
@@ -72,7 +75,7 @@ def run_document(estimate: ToolEstimate, circles: Sequence[str]) -> Document:
         "latency_sigma_s": estimate.latency_sigma_s,
         "misfit_mm": estimate.misfit_m * 1e3,
         "shift_mm": estimate.shift_m * 1e3,
-        "verdict": verdict_document(_run_verdict(estimate)),
+        "verdict": verdict_document(verdict),
     }
 
 
@@ -107,22 +110,6 @@ def _tool_part(T_flange_tool: Array) -> Document:
         "quat_xyzw": frames.quat_xyzw(T_flange_tool).tolist(),
         "axis": T_flange_tool[:3, 2].tolist(),
     }
-
-
-def _run_verdict(estimate: ToolEstimate) -> Verdict:
-    """Accepted where the tip is known well enough; edges that fit no tool never come so far."""
-    sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1]))
-    words = (
-        f"the tip is known to {sigma * 1e3:.3f} mm; edges within {estimate.misfit_m * 1e3:.3f} mm, "
-        f"steps within {estimate.shift_m * 1e3:.3f} mm"
-    )
-    if not sigma <= LARGEST_SIGMA_M:
-        return Verdict(
-            Code.RESIDUAL_TOO_LARGE,
-            f"{words} (allowed sigma {LARGEST_SIGMA_M * 1e3:.1f} mm): read the beams faster, or "
-            "place them more exactly",
-        )
-    return Verdict(Code.ACCEPT, words)
 
 
 def touch_document(fit: TouchFit) -> Document:

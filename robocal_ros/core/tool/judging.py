@@ -86,25 +86,38 @@ def changed_tool(taught: Array, healthy: KnownTool, measured: KnownTool) -> Know
     return KnownTool(frames.transform(turn @ taught[:3, :3], tip), covariance)
 
 
+def judge_run(estimate: ToolEstimate, limits: ToolLimits) -> Verdict:
+    """Accepted where the tip is known well enough; edges that fit no tool never come so far."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:3, :3])[-1]))
+    words = (
+        f"the tip is known to {sigma * 1e3:.3f} mm; edges within {estimate.misfit_m * 1e3:.3f} mm, "
+        f"steps within {estimate.shift_m * 1e3:.3f} mm"
+    )
+    if not sigma <= limits.sigma_m:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words} (allowed sigma {limits.sigma_m * 1e3:.1f} mm): read the beams faster, or "
+            "place them more exactly",
+        )
+    return Verdict(Code.ACCEPT, words)
+
+
 def judge_tool(
     found: KnownTool, estimate: ToolEstimate, taught: Array, in_force: KnownTool, limits: ToolLimits
 ) -> Verdict:
     """Decide whether a measured tool may replace the one in force.
 
-    Refused: a tip not known well enough, a change from the taught tool beyond what may be, and
-    a tool that is the one in force as far as its noise tells.
+    Refused: what `judge_run` refuses, a change from the taught tool beyond what may be, and a tool
+    that is the one in force as far as its noise tells.
     """
-    covariance = estimate.covariance
-    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    run = judge_run(estimate, limits)
     moved = change_between(in_force.T_flange_tool, found.T_flange_tool)
     what = (
         f"tip {moved.tip_m * 1e3:.3f} mm and axis {np.degrees(moved.axis_rad):.3f} deg from the "
-        f"tool in force; known to {sigma * 1e3:.3f} mm; edges within "
-        f"{estimate.misfit_m * 1e3:.3f} mm"
+        f"tool in force; {run.reason}"
     )
-    if not sigma <= limits.sigma_m:
-        words = f"{what}: allowed {limits.sigma_m * 1e3:.3f} mm; measure with a faster input"
-        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    if not run.accept:
+        return Verdict(run.code, what)
     total = change_between(taught, found.T_flange_tool)
     if total.tip_m > limits.change_m or total.axis_rad > limits.tilt_rad:
         return Verdict(

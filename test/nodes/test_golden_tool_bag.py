@@ -1,0 +1,112 @@
+"""The golden tool bag: replayed, and played through the live node, with the same results."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from robocal_msgs.msg import SessionEvent
+from tool_cell_live import STREAM
+
+from robocal_ros.core.codes import Code
+from robocal_ros.nodes.tcf_node import TcfNode
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.sessions.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
+from robocal_ros.sessions.tool_config import ToolConfig
+from robocal_ros.storage.bags import BagReader
+from robocal_ros.storage.laser_files import LaserFile, write_laser
+from robocal_ros.storage.robots import load_robot
+
+BAGS = Path(__file__).parents[2] / "bags"
+INPUTS = ("/joint_states", "/beam_events")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: Any) -> Path:
+    """The bag made anew: only on the machine that made it are results equal to the last bit."""
+    sys.path.insert(0, str(BAGS))
+    from make_tool_runs import record
+
+    path = tmp_path_factory.mktemp("bag") / "made.mcap"
+    record(path)
+    return path
+
+
+def recorded(bag: Path) -> list[SessionEvent]:
+    with BagReader(bag) as reader:
+        return [m.message for m in reader.messages(["/tcf_node/session_events"])]
+
+
+@pytest.fixture
+def node(graph: Any, tmp_path: Path, bag: Path) -> TcfNode:
+    """The live node with the recorded settings."""
+    document = json.loads(recorded(bag)[0].arguments)["arguments"]["config"]
+    config, arm = ToolConfig.of_document(document), load_robot("ur10")
+    path = tmp_path / "laser.yaml"
+    write_laser(path, LaserFile(config.laser, config.station, arm.name, arm.model_hash))
+    taught_mm = (config.T_flange_taught[:3, 3] * 1e3).tolist()
+    settings = {"laser": str(path), "input_period_ms": 2.0, "taught_xyz_mm": taught_mm}
+    return graph.add(TcfNode, settings | {"joint_silence_s": 10.0})
+
+
+def test_live_equals_the_recording_bit_for_bit(graph: Any, node: TcfNode, bag: Path) -> None:
+    """Every sample over DDS; the calls where they were made; every outcome as it was recorded."""
+    live = graph.collect(SessionEvent, "/tcf_node/session_events", EVENTS)
+    kinds = {topic: sub.msg_type for topic, sub in _subscriptions(node).items()}
+    publishers = {topic: graph.publisher(kinds[topic], topic, STREAM) for topic in INPUTS}
+    calls = [e for e in recorded(bag) if e.command in (MEASURE_TOOL, ACCEPT)]
+    sent = 0
+    with BagReader(bag) as reader:
+        for m in reader.messages([*INPUTS, "/tcf_node/session_events"]):
+            if m.topic not in INPUTS:
+                if m.message.command in (MEASURE_TOOL, ACCEPT):
+                    _wait(graph, node, sent, 0)
+                    arguments = json.loads(m.message.arguments)["arguments"]
+                    graph.executor.spin_once(timeout_sec=0.0)
+                    node._desk.ask(Command(m.message.command, arguments))
+                continue
+            publishers[m.topic].publish(_copy(kinds[m.topic], m.message))
+            sent += 1
+            _wait(graph, node, sent, 4)
+    wanted = [_told(e) for e in recorded(bag)]
+    graph.spin_until(lambda: len(live) >= len(wanted), "all events")
+    assert [_told(e) for e in live] == wanted
+    assert len(calls) == 7
+
+
+def _told(event: SessionEvent) -> Any:
+    """What a recording says of a command; ids and marks with it."""
+    arguments = json.loads(event.arguments)
+    if event.command == CONFIGURE:
+        arguments = arguments["arguments"]["tool"], arguments["arguments"]["healthy"]
+    return event.command, event.stamp.sec, event.stamp.nanosec, arguments, event.outcome
+
+
+def _subscriptions(node: TcfNode) -> dict[str, Any]:
+    return {s.topic_name: s for s in node.subscriptions if s.topic_name in INPUTS}
+
+
+def _wait(graph: Any, node: TcfNode, sent: int, behind: int) -> None:
+    """Topics stay in step: an edge must not overtake the readings around it by much."""
+    inputs = [node.inputs[topic.lstrip("/")] for topic in INPUTS]
+    graph.spin_until(lambda: sum(i.received for i in inputs) >= sent - behind, "the samples")
+
+
+def _copy(kind: Any, message: Any) -> Any:
+    """The bag's message as one of rclpy."""
+    made = kind()
+    made.header.stamp.sec = message.header.stamp.sec
+    made.header.stamp.nanosec = message.header.stamp.nanosec
+    made.header.frame_id = message.header.frame_id
+    for field in ("name", "position", "beam", "edge", "stamp_sigma_s"):
+        if hasattr(message, field):
+            value = getattr(message, field)
+            setattr(made, field, value.tolist() if hasattr(value, "tolist") else value)
+    return made
+
+
+def test_the_recording_holds_each_ending(bag: Path) -> None:
+    ends = [json.loads(e.outcome) for e in recorded(bag) if e.command == TOOL_STEP]
+    codes = {Code(end["status"]) for end in ends}
+    assert codes == {Code.ACCEPT, Code.LIMIT_EXCEEDED, Code.BEAM_EDGES_WRONG}
