@@ -122,7 +122,7 @@ def _hull_distance(a: Array, b: Array, radius_a: float, radius_b: float) -> Arra
     along = b - a
     length = np.linalg.norm(along, axis=1)
     e = along / length[:, None]
-    slope = (radius_a - radius_b) / length
+    slope = np.clip((radius_a - radius_b) / length, -1.0, 1.0)  # one may hold the other
     cosine = np.sqrt(1.0 - slope**2)
     y = -np.sum(a * e, axis=1)
     x = np.abs(-a[:, 0] * e[:, 1] + a[:, 1] * e[:, 0])

@@ -81,13 +81,12 @@ class SimulatedCell:
     Attributes
     ----------
     motion : of the joints.
-    tool : the tool as it is; put another one to bend it.
-    fault : takes effect with the next motion; "none" ends one at once.
-    now_s : everything up to here has happened.
+    next_tool : mounted when the next motion begins: how a tool gets bent.
     """
 
     def __init__(self, plan: CellPlan) -> None:
-        self.plan, self.tool = plan, plan.tool
+        self.plan = plan
+        self._tool = self.next_tool = plan.tool
         self.motion = JointMotion(plan.q_start)
         self._rng = np.random.default_rng(plan.seed)
         self._fault: Fault = "none"
@@ -115,8 +114,13 @@ class SimulatedCell:
         return self.now_s < self.motion.end_s
 
     @property
+    def tool(self) -> RoundTool:
+        """The tool as it is."""
+        return self._tool
+
+    @property
     def fault(self) -> Fault:
-        """The fault in force."""
+        """The fault in force; one that is set takes effect with the next motion, "none" at once."""
         return self._fault
 
     @fault.setter
@@ -166,7 +170,7 @@ class SimulatedCell:
         while self.now_s + TICK_S <= to_s:
             begin, end = self.now_s, (self._ticks + 1) * TICK_S
             if begin < max(self.motion.end_s, self._shift_s + SETTLE_S):
-                found = self._station.edges(self.tool, self.flange, (begin, end), self._rng)
+                found = self._station.edges(self._tool, self.flange, (begin, end), self._rng)
                 for edge in self._input.passed(found):
                     insort(self._pending, edge, key=lambda e: e.time_s)
             self._ticks += 1
@@ -190,8 +194,8 @@ class SimulatedCell:
         return np.asarray(before + smooth * (after - before))
 
     def _begin(self) -> None:
-        """A motion begins: another scatter, and the fault that was set takes effect."""
-        self._fault = self._next_fault
+        """A motion begins: another scatter, the tool and the fault that wait for it."""
+        self._tool, self._fault = self.next_tool, self._next_fault
         self._input.begin(self._fault)
         hand = HAND if self._fault == "moved_by_hand" else np.zeros(3)
         scatter = self.plan.station.noise.step_m * self._rng.standard_normal(3)
