@@ -40,6 +40,7 @@ setup(
             "robocal = robocal_ros.cli.main:main",
             "thermal_node = robocal_ros.nodes.thermal_node:main",
             "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
+            "cell_sim_node = robocal_ros.nodes.cell_sim_node:main",
             "replay_node = robocal_ros.nodes.replay_node:main",
         ]
     },
