@@ -7,6 +7,7 @@ used, so that a mistake there cannot hide.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,16 +87,25 @@ class TrueBeam:
 
     def clearance(self, tool: RoundTool, T_base_flange: Array) -> Array:
         """Distance (m,) of the tool's surface from the beam's middle, negative inside."""
-        u = (self.end - self.start) / np.linalg.norm(self.end - self.start)
-        plane = np.linalg.svd(u[None])[2][1:]  # two directions across the beam
         T = T_base_flange @ tool.T_flange_tool
         centres = T[:, None, :3, 3] - tool.height[None, :, None] * T[:, None, :3, 2]
-        outline = (centres - self.start) @ plane.T
+        outline = (centres - self.start) @ self._across.T
         parts = [
             _hull_distance(outline[:, i], outline[:, i + 1], tool.radius[i], tool.radius[i + 1])
             for i in range(len(tool.height) - 1)
         ]
         return np.asarray(np.min(parts, axis=0))
+
+    @cached_property
+    def levels(self) -> tuple[float, float]:
+        """Clearances at which the input goes dark, and light again."""
+        return self.threshold(self.dark_at), self.threshold(self.light_at)
+
+    @cached_property
+    def _across(self) -> Array:
+        """Two directions across the beam (2, 3)."""
+        u = (self.end - self.start) / np.linalg.norm(self.end - self.start)
+        return np.asarray(np.linalg.svd(u[None])[2][1:])
 
     def threshold(self, light: float) -> float:
         """Clearance at which a straight edge leaves this share of the light."""
@@ -112,7 +122,7 @@ def _hull_distance(a: Array, b: Array, radius_a: float, radius_b: float) -> Arra
     along = b - a
     length = np.linalg.norm(along, axis=1)
     e = along / length[:, None]
-    slope = (radius_a - radius_b) / length
+    slope = np.clip((radius_a - radius_b) / length, -1.0, 1.0)  # one may hold the other
     cosine = np.sqrt(1.0 - slope**2)
     y = -np.sum(a * e, axis=1)
     x = np.abs(-a[:, 0] * e[:, 1] + a[:, 1] * e[:, 0])
@@ -132,6 +142,7 @@ class TrueInput:
     ----------
     latency_s, jitter_s : constant and random delay.
     sample_period_s : period of the input; an edge is seen at the next sample. 0: by interrupt.
+    first_sample_s : time of one of its samples; None: another one for each motion.
     bounce_s : largest time for which a contact bounces; 0: none does.
     lost_share : chance that an edge is never reported.
     """
@@ -139,6 +150,7 @@ class TrueInput:
     latency_s: float = 0.0
     jitter_s: float = 20e-6
     sample_period_s: float = 0.0
+    first_sample_s: float | None = None
     bounce_s: float = 0.0
     lost_share: float = 0.0
 
@@ -196,7 +208,7 @@ def crossings(
     """True times (k,) of the edges in a window, and whether each one is a break."""
     grid = np.arange(window[0], window[1] + 0.5 * GRID_S, GRID_S)
     clear = beam.clearance(tool, poses(grid))
-    dark, light = beam.threshold(beam.dark_at), beam.threshold(beam.light_at)
+    dark, light = beam.levels
     breaks = np.flatnonzero((clear[:-1] > dark) & (clear[1:] <= dark))
     restores = np.flatnonzero((clear[:-1] <= light) & (clear[1:] > light))
     first = np.concatenate([breaks, restores])
@@ -217,7 +229,8 @@ def reported(time: ArrayLike, source: TrueInput, rng: np.random.Generator) -> Ar
     late = late + source.jitter_s * rng.standard_normal(late.shape)
     period = source.sample_period_s
     if period > 0.0:
-        phase = period * rng.random()
+        first = source.first_sample_s
+        phase = period * rng.random() if first is None else first
         late = np.ceil((late - phase) / period) * period + phase
     return np.asarray(late)
 

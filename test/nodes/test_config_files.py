@@ -8,11 +8,12 @@ from lifecycle_msgs.srv import GetState
 from rclpy.qos import ReliabilityPolicy
 
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
+from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.replay_node import ReplayNode
 from robocal_ros.nodes.thermal_node import INPUTS, ThermalNode
 
 CONFIG = Path(__file__).parents[2] / "config"
-NODES = (ThermalNode, ReplayNode)
+NODES = (ThermalNode, ReplayNode, CellSimNode)
 
 
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)

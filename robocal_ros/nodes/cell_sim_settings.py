@@ -1,0 +1,175 @@
+"""Parameters of the simulated cell."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.nodes.parameters import Setting
+from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
+from robocal_ros.sim.cell import CellPlan, rigid_robot
+from robocal_ros.sim.cell_faults import FAULTS
+from robocal_ros.storage.robots import load_robot
+
+Array = NDArray[np.float64]
+
+MM, MS = 1e-3, 1e-3
+PIN_M = 0.15  # tip of the straight tool along the flange's z, where the robot file has no tool
+TAPER = 0.1  # of the cone
+NOZZLE_M = 3.5e-3  # by so much the torch's nozzle is wider than its wire
+TOOLS = ("cylinder", "cone", "torch")
+
+
+def _numbers(count: int) -> Callable[[Any], str | None]:
+    return lambda values: None if len(values) == count else f"not {count} numbers"
+
+
+def _mm(name: str, default: float, what: str, high: float, low: float = 0.0) -> Setting:
+    return Setting(name, default, what, unit="mm", low=low, high=high)
+
+
+def _ms(name: str, default: float, what: str, high: float) -> Setting:
+    return Setting(name, default, what, unit="ms", low=0.0, high=high)
+
+
+SETTINGS = (
+    Setting(
+        "robot",
+        "ur10",
+        "Robot type (config/robots) or path of a robot file; its tool is the straight one, 150 mm "
+        "along the flange's z where it has none",
+    ),
+    Setting(
+        "q_start_deg",
+        [2.3, -124.4, -70.9, 107.7, -91.1, 91.8],
+        "Where the robot stands first, tool above the station (sliding joint: mm)",
+        unit="deg",
+        low=-1e5,
+        high=1e5,
+    ),
+    Setting("rate_hz", 125.0, "Rate of joint_states", unit="Hz", low=1.0, high=1000.0),
+    _mm("arm_error_mm", 0.0, "Scatter of the true arm's lengths; angles err as much at 1 m", 5.0),
+    _mm("repeatability_mm", 0.03, "Scatter of a motion in each axis", 2.0),
+    _mm("edge_noise_mm", 0.01, "Further scatter at each edge", 2.0),
+    Setting("ripple", 0.02, "Relative ripple of the program's speed", low=0.0, high=0.5),
+    Setting("station", "station", "Name of the beam station: frame_id of its edges"),
+    Setting(
+        "laser_xyz_mm",
+        [799.4, -126.3, 194.5],
+        "True crossing of the beams in base",
+        unit="mm",
+        low=-1e5,
+        high=1e5,
+        check=_numbers(3),
+    ),
+    Setting(
+        "laser_rotation_deg",
+        [1.2, -2.3, 0.6],
+        "True rotation vector of the laser frame in base",
+        unit="deg",
+        low=-180.0,
+        high=180.0,
+        check=_numbers(3),
+    ),
+    Setting("beam_angle_deg", 92.2, "True angle of the beams", unit="deg", low=40.0, high=140.0),
+    _mm("beam_gap_mm", 0.058, "By so much the y-beam passes above the x-beam", 2.0, -2.0),
+    Setting(
+        "laser_csv",
+        "",
+        "File to which the robot's calibration of the station is written (robocal tool beams); "
+        "empty: none",
+    ),
+    Setting("tool", "cylinder", "Shape of the tool", choices=TOOLS),
+    _mm("tool_radius_mm", 2.5, "Of cylinder, cone's tip, or torch's wire", 20.0, 0.1),
+    Setting(
+        "tool_bend_mm",
+        [0.0, 0.0, 0.0],
+        "Shift of the true tip from the straight tool's, flange axes",
+        unit="mm",
+        low=-50.0,
+        high=50.0,
+        check=_numbers(3),
+        live=True,
+    ),
+    Setting(
+        "tool_tilt_deg",
+        [0.0, 0.0],
+        "Tilt of the true tool about the flange's x and y",
+        unit="deg",
+        low=-45.0,
+        high=45.0,
+        check=_numbers(2),
+        live=True,
+    ),
+    _ms("input_latency_ms", 4.0, "Constant delay of an edge's stamp", 1000.0),
+    _ms("input_jitter_ms", 0.02, "Scatter of an edge's stamp", 10.0),
+    _ms("input_period_ms", 0.0, "How often the input is read; 0: by interrupt", 100.0),
+    _ms("input_bounce_ms", 0.0, "For how long a contact may bounce", 20.0),
+    Setting("run_program", False, "Drive each step that is announced on next_step"),
+    Setting("flange_frame", "tool0", "Parent frame of ~/truth"),
+    Setting("tool_frame", "true_tool", "Child frame of ~/truth"),
+    Setting("fault", "none", "What goes wrong from the next motion on", choices=FAULTS, live=True),
+    Setting("seed", 1, "Of everything that is random", low=0, high=2**31 - 1),
+)
+
+
+def straight_arm(name: str) -> SerialArm:
+    """The nominal robot with its straight tool."""
+    arm = load_robot(name)
+    if not np.array_equal(arm.T_flange_tool, np.eye(4)):
+        return arm
+    return replace(arm, T_flange_tool=frames.transform(np.eye(3), [0.0, 0.0, PIN_M]))
+
+
+def bent_tool(settings: Mapping[str, Any], arm: SerialArm) -> RoundTool:
+    """The tool as it is mounted."""
+    shift = np.array(settings["tool_bend_mm"]) * MM
+    tilt = np.radians([*settings["tool_tilt_deg"], 0.0])
+    T, radius = bent(arm.T_flange_tool, shift, tilt), settings["tool_radius_mm"] * MM
+    if settings["tool"] == "cone":
+        return RoundTool.cone(T, radius, TAPER)
+    if settings["tool"] == "torch":
+        return RoundTool.torch(T, radius, radius + NOZZLE_M)
+    return RoundTool.cylinder(T, radius)
+
+
+def laser_pose(settings: Mapping[str, Any]) -> Array:
+    """T_base_laser (4, 4), true."""
+    R = frames.exp_rotation(np.radians(settings["laser_rotation_deg"]))
+    return frames.transform(R, np.array(settings["laser_xyz_mm"]) * MM)
+
+
+def cell_plan(settings: Mapping[str, Any], arm: SerialArm) -> CellPlan:
+    """The cell that the parameters describe.
+
+    Raises
+    ------
+    InputError
+        When ``q_start_deg`` has not a number for each joint.
+    """
+    given = np.array(settings["q_start_deg"], dtype=np.float64)
+    if given.shape != (arm.n,):
+        raise InputError(f"q_start_deg has {given.size} numbers, {arm.name} has {arm.n} joints")
+    gap_m, angle = settings["beam_gap_mm"] * MM, float(np.radians(settings["beam_angle_deg"]))
+    source = TrueInput(
+        latency_s=settings["input_latency_ms"] * MS,
+        jitter_s=settings["input_jitter_ms"] * MS,
+        sample_period_s=settings["input_period_ms"] * MS,
+        bounce_s=settings["input_bounce_ms"] * MS,
+    )
+    noise = TrueNoise(settings["repeatability_mm"] * MM, settings["edge_noise_mm"] * MM)
+    rng = np.random.default_rng([settings["seed"], 1])
+    return CellPlan(
+        robot=rigid_robot(arm, settings["arm_error_mm"] * MM, rng),
+        station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), source, noise),
+        tool=bent_tool(settings, arm),
+        q_start=np.where(arm.prismatic, given * MM, np.radians(given)),
+        rate_hz=settings["rate_hz"],
+        ripple=settings["ripple"],
+        seed=settings["seed"],
+    )

@@ -1,0 +1,91 @@
+"""Joints that follow trajectories as a joint trajectory controller makes them."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robocal_ros.core.errors import InputError
+
+Array = NDArray[np.float64]
+
+EARLIER_S = 5e-3  # a motion may be asked for where it was so long before its begin
+
+
+class JointMotion:
+    """What the joints do: one trajectory at a time, before and after it they stand still.
+
+    Between points lie lines, cubics or quintics, as the points carry positions alone, velocities
+    too, or accelerations too: as joint_trajectory_controller interpolates.
+
+    Parameters
+    ----------
+    q : (n,) where the joints stand at time 0, rad (prismatic: m).
+
+    Attributes
+    ----------
+    end_s : when the last trajectory ends.
+    """
+
+    def __init__(self, q: ArrayLike) -> None:
+        self._stand(0.0, np.asarray(q, dtype=np.float64))
+
+    def follow(
+        self,
+        now_s: float,
+        time_s: ArrayLike,
+        q: ArrayLike,
+        qd: ArrayLike | None = None,
+        qdd: ArrayLike | None = None,
+    ) -> None:
+        """Follow another trajectory from ``now_s`` on, wherever the joints are and move by then.
+
+        ``time_s`` (k,) on the motion's own clock; ``q``, ``qd``, ``qdd`` (k, n). Points that lie
+        at ``now_s`` or before give way to where the joints really are; from there it goes to the
+        first point that is left.
+
+        Raises
+        ------
+        InputError
+            When shapes differ, numbers are not finite, times do not increase, or no point is left.
+        """
+        from scipy.interpolate import BPoly
+
+        here, moving = self.at([now_s])
+        begin = [here[0], moving[0], np.zeros_like(here[0])]
+        given = [np.asarray(rows, dtype=np.float64) for rows in (q, qd, qdd) if rows is not None]
+        time = np.asarray(time_s, dtype=np.float64)
+        for rows in given:
+            if rows.shape != (len(time), len(here[0])):
+                wanted = (len(time), len(here[0]))
+                raise InputError(f"the trajectory's rows have shape {rows.shape}, not {wanted}")
+        if not all(np.all(np.isfinite(rows)) for rows in (time, *given)):
+            raise InputError("the trajectory holds a number that is not finite")
+        if np.any(np.diff(time) <= 0.0):
+            raise InputError("the times of the trajectory do not increase")
+        left = time > now_s
+        if not np.any(left):
+            raise InputError("all points of the trajectory lie in the past: there is no way left")
+        rows = np.stack([*(part[left] for part in given)], axis=1)
+        first = np.stack(begin[: len(given)])[None]
+        self._path = BPoly.from_derivatives(
+            np.concatenate([[now_s], time[left]]), np.concatenate([first, rows])
+        )
+        self._rate = self._path.derivative()
+        self._begin_s, self.end_s = now_s, float(time[-1])
+
+    def hold(self, now_s: float) -> None:
+        """Stand still where the joints are at ``now_s``, at once: no deceleration is simulated."""
+        self._stand(now_s, self.at([now_s])[0][0])
+
+    def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
+        """Joints (k, n) and their velocities at times (k,) from the last trajectory's begin on."""
+        t = np.asarray(time_s, dtype=np.float64)
+        inside = np.clip(t, self._begin_s - EARLIER_S, self.end_s)
+        moving = (t < self.end_s)[:, None]
+        return np.asarray(self._path(inside)), np.where(moving, self._rate(inside), 0.0)
+
+    def _stand(self, now_s: float, q: Array) -> None:
+        from scipy.interpolate import BPoly
+
+        self._begin_s = self.end_s = now_s
+        self._path = BPoly(np.tile(q, (1, 1, 1)), [now_s, now_s + 1.0])
+        self._rate = BPoly(np.zeros((1, 1, len(q))), [now_s, now_s + 1.0])

@@ -1,0 +1,284 @@
+"""The simulated cell over DDS, in its own time."""
+
+from array import array
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from rclpy.parameter import Parameter
+from robocal_msgs.msg import BeamEvent, ToolStep
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.core import frames
+from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.core.tool.measuring_plan import MeasuringMotion, MeasuringPlan
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.cell_sim_node import CellSimNode
+from robocal_ros.nodes.cell_sim_settings import SETTINGS, laser_pose, straight_arm
+from robocal_ros.nodes.conversions import header, transform_message
+from robocal_ros.sim.beams import beams_of
+from robocal_ros.storage.tool_tables import read_beam_points
+
+DEFAULTS = {setting.name: setting.default for setting in SETTINGS}
+ARM = straight_arm("ur10")
+HOME = np.radians(DEFAULTS["q_start_deg"])
+T_BASE_LASER = laser_pose(DEFAULTS)
+EXACT = {"repeatability_mm": 0.0, "edge_noise_mm": 0.0, "input_jitter_ms": 0.0, "ripple": 0.0}
+
+
+def ns(stamp: Any) -> int:
+    return stamp.sec * 10**9 + stamp.nanosec
+
+
+class Cell:
+    """The node, and everything it says."""
+
+    def __init__(self, graph: Any, **parameters: Any) -> None:
+        self.graph = graph
+        self.node = graph.add(CellSimNode, EXACT | parameters)
+        self.states = graph.collect(JointState, "joint_states")
+        self.events = graph.collect(BeamEvent, "beam_events")
+        self.to_path = graph.publisher(JointTrajectory, "joint_trajectory")
+        graph.spin_until(lambda: self.states, "joint states")
+
+    def set(self, **values: Any) -> None:
+        found = self.node.set_parameters([Parameter(k, value=v) for k, v in values.items()])
+        assert all(result.successful for result in found), found
+
+    def path(self, q: Any, times: Any, qd: Any = None, stamp_ns: int = 0) -> None:
+        """Publish a trajectory, its joints in the opposite order."""
+        qd = np.zeros(np.shape(q)) if qd is None else qd
+        points = [
+            JointTrajectoryPoint(
+                positions=array("d", row[::-1]),
+                velocities=array("d", speed[::-1]),
+                time_from_start=Duration(sec=int(t), nanosec=round(t % 1 * 1e9)),
+            )
+            for row, speed, t in zip(np.array(q), np.array(qd), times, strict=True)
+        ]
+        self.to_path.publish(
+            JointTrajectory(
+                header=header(stamp_ns, ""), joint_names=list(ARM.joint_names)[::-1], points=points
+            )
+        )
+
+    def readings(self) -> tuple[np.ndarray, np.ndarray]:
+        stamps = np.array([ns(m.header.stamp) for m in self.states])
+        return stamps, np.array([m.position for m in self.states])
+
+    def steps(self) -> Any:
+        return self.graph.publisher(ToolStep, "next_step", qos.LATCHED)
+
+    def rest(self) -> None:
+        """Wait until a motion has begun and is over."""
+        cell = self.node._cell
+        self.graph.spin_until(lambda: cell.moving, "it moves")
+        self.graph.spin_until(lambda: not cell.moving, "it stands")
+        self.graph.spin_for(0.1)
+
+
+def step_message(number: int = 1, run: int = 1, **changes: Any) -> ToolStep:
+    """The first circle of a run, twice as fast as usual."""
+    beams = beams_of(T_BASE_LASER, np.radians(DEFAULTS["beam_angle_deg"]))
+    laser = LaserFrame(np.array([p for beam in beams for p in (beam.start, beam.end)]))
+    plan = MeasuringPlan("full", laser, ARM.T_flange_tool, MeasuringMotion(speed_m_s=0.1))
+    step = plan.step(1)
+    message = ToolStep(
+        run=run, number=number, of=step.of, kind=ToolStep.CIRCLE, name=step.name,
+        radius=step.radius_m, speed=step.speed_m_s, direction=1, start_angle=step.start_rad,
+    )  # fmt: skip
+    flange = transform_message(step.T_base_flange)
+    message.flange.orientation = flange.rotation
+    message.laser = transform_message(frames.transform(step.R_base_laser, np.zeros(3))).rotation
+    place = message.flange.position
+    place.x, place.y, place.z = step.T_base_flange[:3, 3].tolist()
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def test_joint_states_come_at_their_rate_with_exact_stamps(graph):
+    cell = Cell(graph, rate_hz=250.0)
+    graph.spin_until(lambda: len(cell.states) > 100, "joint states")
+    stamps, q = cell.readings()
+    assert np.max(np.abs(np.diff(stamps) - 4_000_000)) <= 1
+    assert 0 <= cell.node.now_ns() - stamps[-1] < 500_000_000
+    assert q == pytest.approx(np.tile(HOME, (len(q), 1)), abs=1e-12)
+    assert list(cell.states[0].name) == list(ARM.joint_names)
+
+
+def test_a_trajectory_is_followed_by_name_and_in_time(graph):
+    cell = Cell(graph)
+    start_ns = cell.node.now_ns() + 300_000_000
+    far = HOME + np.array([0.1, -0.05, 0.02, 0.0, 0.03, -0.2])
+    cell.path([HOME, far], [0.0, 0.5], stamp_ns=start_ns)
+    graph.spin_until(lambda: cell.readings()[0][-1] > start_ns + 700_000_000, "it is there")
+    stamps, q = cell.readings()
+    s = np.clip((stamps - start_ns) * 1e-9 / 0.5, 0.0, 1.0)[:, None]
+    wanted = HOME + s**2 * (3.0 - 2.0 * s) * (far - HOME)  # the cubic from rest to rest
+    assert q == pytest.approx(wanted, abs=1e-7)  # stamps are whole ns
+    moving = (s[:, 0] > 0.1) & (s[:, 0] < 0.9)
+    speed = np.array([m.velocity for m in cell.states])
+    assert moving.sum() > 20
+    assert speed[moving] == pytest.approx(
+        (6.0 * s * (1.0 - s) / 0.5 * (far - HOME))[moving], abs=1e-6
+    )
+
+
+def test_a_trajectory_without_points_stops_it_at_once(graph):
+    cell = Cell(graph)
+    cell.path([HOME + 0.5], [2.0])
+    graph.spin_until(lambda: abs(cell.states[-1].position[0] - HOME[0]) > 0.02, "it moves")
+    cell.path([], [])
+    graph.spin_until(lambda: not cell.node._cell.moving, "it stands")
+    graph.spin_for(0.1)
+    count = len(cell.states)
+    graph.spin_for(0.2)
+    _, q = cell.readings()
+    assert 0.02 < q[-1, 0] - HOME[0] < 0.4
+    assert np.ptp(q[count:], axis=0).max() == 0.0
+    assert np.max(np.abs(np.diff(q, axis=0))) < 0.4 * 0.008 * 1.1  # peak speed: 0.375 rad/s
+
+
+def test_what_it_cannot_follow_is_counted_and_changes_nothing(graph):
+    cell = Cell(graph)
+    cell.path([HOME * np.nan], [1.0])
+    cell.to_path.publish(JointTrajectory(joint_names=["a"], points=[JointTrajectoryPoint()]))
+    cell.path([HOME + 0.1], [1.0], stamp_ns=1)
+    graph.spin_until(lambda: cell.node.inputs["joint_trajectory"].invalid == 3, "three are counted")
+    assert cell.node.is_active
+    assert not cell.node._cell.moving
+
+
+def test_an_announced_step_is_driven_once(graph):
+    cell = Cell(graph, run_program=True, tool_bend_mm=[1.0, -0.5, 0.0])
+    steps = cell.steps()
+    begin_ns = cell.node.now_ns()
+    steps.publish(step_message())
+    cell.rest()
+    assert [sum(e.beam == beam for e in cell.events) for beam in "xy"] == [4, 4]
+    for beam in "xy":
+        kinds = [e.edge for e in cell.events if e.beam == beam]
+        assert kinds == [BeamEvent.BREAK, BeamEvent.RESTORE] * 2
+    stamps = [ns(e.header.stamp) for e in cell.events]
+    assert stamps == sorted(stamps)
+    assert begin_ns < stamps[0] < stamps[-1] < cell.node.now_ns()
+    assert {e.header.frame_id for e in cell.events} == {DEFAULTS["station"]}
+    steps.publish(step_message())  # again: it was driven already
+    graph.spin_for(0.3)
+    assert not cell.node._cell.moving
+    steps.publish(ToolStep())
+    graph.spin_until(lambda: cell.node.inputs["next_step"].received == 3, "nothing is awaited")
+    steps.publish(step_message())  # a run of a node that began anew
+    graph.spin_until(lambda: cell.node._cell.moving, "it moves")
+
+
+def test_without_run_program_steps_are_left_to_others(graph):
+    cell = Cell(graph)
+    assert cell.node.count_subscribers("next_step") == 0
+
+
+def test_a_step_out_of_reach_is_told(graph):
+    cell = Cell(graph, run_program=True)
+    diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
+    message = step_message()
+    message.flange.position.x += 3.0
+    cell.steps().publish(message)
+    graph.spin_until(
+        lambda: any("does not reach" in s.message for a in diagnostics for s in a.status), "told"
+    )
+    assert cell.node.is_active
+
+
+@pytest.mark.parametrize(
+    "changes", [{"speed": 0.0}, {"kind": 7}, {"radius": float("nan")}, {"direction": 0}]
+)
+def test_a_step_that_is_no_motion_is_counted(graph, changes):
+    cell = Cell(graph, run_program=True)
+    cell.steps().publish(step_message(**changes))
+    graph.spin_until(lambda: cell.node.inputs["next_step"].invalid == 1, "it is counted")
+    assert not cell.node._cell.moving
+
+
+@pytest.mark.parametrize(("fault", "edges"), [("lost_edge", 7), ("wrong_station", 8)])
+def test_faults_begin_with_the_next_motion(graph, fault, edges):
+    cell = Cell(graph, run_program=True)
+    cell.set(fault=fault)
+    cell.steps().publish(step_message())
+    cell.rest()
+    assert len(cell.events) == edges
+    own = {e.header.frame_id == DEFAULTS["station"] for e in cell.events}
+    assert own == {fault != "wrong_station"}
+
+
+def test_joints_fall_silent_and_their_clock_stands(graph):
+    cell = Cell(graph)
+    cell.set(fault="joints_silent")
+    count = len(cell.states)
+    graph.spin_until(lambda: len(cell.states) > count + 10, "still there")
+    cell.path([HOME + 0.01], [0.2])
+    graph.spin_until(lambda: cell.node._cell.fault == "joints_silent", "it moves")
+    graph.spin_for(0.1)
+    count = len(cell.states)
+    graph.spin_for(0.2)
+    assert len(cell.states) == count
+    cell.set(fault="frozen_clock")
+    cell.path([HOME], [0.2])
+    graph.spin_until(lambda: len(cell.states) > count + 20, "back again")
+    stamps, q = cell.readings()
+    assert len(set(stamps[count:])) == 1
+    assert np.ptp(q[count:], axis=0).max() > 1e-3  # it moves all the same
+    cell.set(fault="none")
+    graph.spin_until(lambda: cell.readings()[0][-1] > stamps[-1], "the clock goes on")
+
+
+def test_the_truth_is_latched_and_follows_the_bend(graph):
+    cell = Cell(graph, tool_bend_mm=[2.0, -1.0, 0.5])
+    truths = graph.collect(TransformStamped, "/cell_sim_node/truth", qos.LATCHED)
+    graph.spin_until(lambda: truths, "the truth")
+    place = truths[0].transform.translation
+    assert [place.x, place.y, place.z] == pytest.approx([0.002, -0.001, 0.1505], abs=1e-12)
+    assert (truths[0].header.frame_id, truths[0].child_frame_id) == ("tool0", "true_tool")
+    cell.set(tool_bend_mm=[0.0, 0.0, 0.0], tool_tilt_deg=[2.0, 0.0])
+    graph.spin_for(0.1)
+    assert len(truths) == 1
+    cell.path([HOME], [0.1])
+    graph.spin_until(lambda: len(truths) == 2, "the bent tool")
+    turn = truths[1].transform.rotation
+    assert turn.x == pytest.approx(np.sin(np.radians(1.0)), abs=1e-12)
+
+
+def test_the_robot_places_the_beams(graph, tmp_path):
+    file = tmp_path / "beams.csv"
+    Cell(graph, laser_csv=str(file))
+    laser = calibrate_laser(read_beam_points(file))
+    # Without scatter only what the tilted beams add to cylinder and coordinates remains.
+    off = frames.invert(T_BASE_LASER) @ laser.T_base_laser
+    assert np.linalg.norm(off[:3, 3]) < 5e-5
+    assert np.degrees(np.linalg.norm(frames.log_rotation(off[:3, :3]))) < 0.1
+    assert np.degrees(laser.beam_angle_rad) == pytest.approx(DEFAULTS["beam_angle_deg"], abs=0.1)
+
+
+def test_the_cell_goes_on_after_a_pause(graph):
+    cell = Cell(graph)
+    cell.path([HOME + 0.5], [2.0])
+    graph.spin_until(lambda: abs(cell.states[-1].position[0] - HOME[0]) > 0.02, "it moves")
+    assert cell.node.trigger_deactivate().name == "SUCCESS"
+    count = len(cell.states)
+    graph.spin_for(0.3)
+    assert len(cell.states) <= count + 5
+    assert cell.node.trigger_activate().name == "SUCCESS"
+    seen = len(cell.states)
+    graph.spin_until(lambda: len(cell.states) > seen + 20, "joint states")
+    stamps, q = cell.readings()
+    assert np.all(np.diff(stamps) > 0)
+    assert np.ptp(q[seen + 1 :], axis=0).max() == 0.0  # it stopped
+
+
+def test_joints_that_do_not_fit_the_robot_are_refused(graph):
+    node = graph.add(CellSimNode, {"q_start_deg": [0.0, 1.0]})
+    assert node.state == "unconfigured"
