@@ -22,8 +22,8 @@ from robocal_ros import __version__
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge, InputRule
 from robocal_ros.core.tool.edge_samples import BREAK, RESTORE
-from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text

@@ -9,7 +9,7 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.sim.beam_moves import Circle, Plunge
+from robocal_ros.sim.beam_program import step_move
 from robocal_ros.sim.beams import RoundTool
 from robocal_ros.sim.tool_cell import ToolCell, joints_at
 
@@ -19,23 +19,7 @@ Edit = Callable[[PlannedStep, list[BeamEdge]], list[BeamEdge]]
 
 TRANSFER_S = 0.384  # from step to step
 REST_S = 0.25  # after a step
-
-
-def move_of(step: PlannedStep, start_s: float, ripple: float = 0.02) -> Circle | Plunge:
-    """A step as a motion of the flange, with a speed that ripples."""
-    if step.kind == "plunge":
-        down = -step.R_base_laser[:, 2]
-        return Plunge(step.T_base_flange, down, step.depth_m, step.speed_m_s, start_s)
-    circle = Circle(
-        T_base_centre=step.T_base_flange,
-        R_base_laser=step.R_base_laser,
-        radius=step.radius_m,
-        period_s=2.0 * np.pi * step.radius_m / step.speed_m_s,
-        start_rad=step.start_rad,
-        direction=step.direction,
-        ripple=ripple,
-    )
-    return circle.starting(start_s + circle.ramp_s)
+RIPPLE = 0.02  # of the speed on a circle
 
 
 class RobotProgram:
@@ -68,7 +52,7 @@ class RobotProgram:
 
     def drive(self, step: PlannedStep) -> list[Sample]:
         """Go to a step's start, drive it, and rest."""
-        move = move_of(step, self.now_s + TRANSFER_S + 1.0 / self.cell.plan.rate_hz)
+        move = step_move(step, self.now_s + TRANSFER_S + 1.0 / self.cell.plan.rate_hz, RIPPLE, 0.0)
         count = int(np.ceil((move.span[1] - move.span[0]) * self.cell.plan.rate_hz)) + 1
         time = move.span[0] + np.arange(count) / self.cell.plan.rate_hz
         q = joints_at(self.cell.arm, move(time), self.q)

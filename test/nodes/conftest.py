@@ -25,7 +25,11 @@ from robocal_ros.nodes import qos
 
 ROOT = Path(__file__).parent.parent.parent
 # For the helper modules beside the tests.
-sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "test" / "sessions")]
+sys.path[:0] = [
+    str(Path(__file__).parent),
+    str(ROOT / "test" / "sessions"),
+    str(ROOT / "test" / "cli"),
+]
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 # Domains whose ports lie below those that Linux hands out to any program.

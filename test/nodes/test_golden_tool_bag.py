@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command import robocal_json
 from robocal_msgs.msg import SessionEvent
 from tool_cell_live import STREAM
 
@@ -14,11 +15,12 @@ from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.sessions.tool_config import ToolConfig
-from robocal_ros.storage.bags import BagReader
+from robocal_ros.storage.bags import BagReader, BagWriter
 from robocal_ros.storage.laser_files import LaserFile, write_laser
 from robocal_ros.storage.robots import load_robot
 
 BAGS = Path(__file__).parents[2] / "bags"
+EVENT_TOPIC = "/tcf_node/session_events"
 INPUTS = ("/joint_states", "/beam_events")
 
 
@@ -35,7 +37,7 @@ def bag(tmp_path_factory: Any) -> Path:
 
 def recorded(bag: Path) -> list[SessionEvent]:
     with BagReader(bag) as reader:
-        return [m.message for m in reader.messages(["/tcf_node/session_events"])]
+        return [m.message for m in reader.messages([EVENT_TOPIC])]
 
 
 @pytest.fixture
@@ -50,15 +52,16 @@ def node(graph: Any, tmp_path: Path, bag: Path) -> TcfNode:
     return graph.add(TcfNode, settings | {"joint_silence_s": 10.0})
 
 
-def test_live_equals_the_recording_bit_for_bit(graph: Any, node: TcfNode, bag: Path) -> None:
+def test_live_equals_replay_bit_for_bit(
+    graph: Any, node: TcfNode, bag: Path, tmp_path: Path
+) -> None:
     """Every sample over DDS; the calls where they were made; every outcome as it was recorded."""
-    live = graph.collect(SessionEvent, "/tcf_node/session_events", EVENTS)
+    live = graph.collect(SessionEvent, EVENT_TOPIC, EVENTS)
     kinds = {topic: sub.msg_type for topic, sub in _subscriptions(node).items()}
     publishers = {topic: graph.publisher(kinds[topic], topic, STREAM) for topic in INPUTS}
-    calls = [e for e in recorded(bag) if e.command in (MEASURE_TOOL, ACCEPT)]
     sent = 0
     with BagReader(bag) as reader:
-        for m in reader.messages([*INPUTS, "/tcf_node/session_events"]):
+        for m in reader.messages([*INPUTS, EVENT_TOPIC]):
             if m.topic not in INPUTS:
                 if m.message.command in (MEASURE_TOOL, ACCEPT):
                     _wait(graph, node, sent, 0)
@@ -72,15 +75,32 @@ def test_live_equals_the_recording_bit_for_bit(graph: Any, node: TcfNode, bag: P
     wanted = [_told(e) for e in recorded(bag)]
     graph.spin_until(lambda: len(live) >= len(wanted), "all events")
     assert [_told(e) for e in live] == wanted
-    assert len(calls) == 7
+    again = tmp_path / "live.mcap"
+    _write(bag, live, again)
+    document = robocal_json("replay.tool.json", "replay", again)
+    assert document["differs"] == []
+    steps = [c for c in document["commands"] if c["command"] == TOOL_STEP]
+    assert len(steps) == 17
 
 
 def _told(event: SessionEvent) -> Any:
-    """What a recording says of a command; ids and marks with it."""
+    """A command with the bounds of its samples, and its status."""
     arguments = json.loads(event.arguments)
     if event.command == CONFIGURE:
-        arguments = arguments["arguments"]["tool"], arguments["arguments"]["healthy"]
-    return event.command, event.stamp.sec, event.stamp.nanosec, arguments, event.outcome
+        arguments = {}
+    status = json.loads(event.outcome).get("status")
+    return event.command, event.stamp.sec, event.stamp.nanosec, arguments, status
+
+
+def _write(bag: Path, events: list[SessionEvent], path: Path) -> None:
+    """The samples, with what the live node recorded of its session."""
+    with BagReader(bag) as reader, BagWriter(path, latched=[EVENT_TOPIC]) as writer:
+        for m in reader.messages(INPUTS):
+            kind = reader.info.topics[m.topic].msgtype
+            writer.write(m.topic, kind, m.message, m.log_time_ns)
+            last_ns = m.log_time_ns
+        for event in events:
+            writer.write(EVENT_TOPIC, "robocal_msgs/msg/SessionEvent", event, last_ns)
 
 
 def _subscriptions(node: TcfNode) -> dict[str, Any]:
