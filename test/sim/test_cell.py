@@ -22,7 +22,9 @@ LASER = laser_of(make_cell().station)
 
 
 def circle(**changes) -> PlannedStep:
-    return replace(MeasuringPlan("full", LASER, TAUGHT).step(1), **changes)
+    """The first circle of a run, twice as fast as usual."""
+    step = MeasuringPlan("full", LASER, TAUGHT).step(1)
+    return replace(step, **({"speed_m_s": 0.1} | changes))
 
 
 def rng() -> np.random.Generator:
@@ -50,9 +52,9 @@ def test_readings_are_the_commanded_joints_at_their_rate():
 def test_a_programmed_circle_has_the_edges_of_the_same_circle_as_geometry():
     """Two ways to the same edges: along joints over time, and along the circle itself."""
     reference = make_cell().full_run(RoundTool.cylinder(TRUTH, 0.0025), TAUGHT, rng())
-    move, wanted = reference.moves[0], reference.steps[0].edges
+    plan, move, wanted = reference.cell.plan, reference.moves[0], reference.steps[0].edges
     cell = SimulatedCell(plan_of())
-    step = circle(T_base_flange=move.T_base_centre, direction=move.direction)
+    step = circle(T_base_flange=move.T_base_centre, direction=move.direction, speed_m_s=plan.speed)
     start_s = cell.drive(step).start_s
     edges = cell.advance(cell.motion.end_s + 0.2).edges
     assert keys(edges) == keys(wanted)
@@ -78,7 +80,7 @@ def test_scatter_moves_edges_no_more_than_it_is():
     exact = driven(SimulatedCell(plan_of()), circle()).edges
     noisy = driven(SimulatedCell(plan_of(noise=NOISE)), circle()).edges
     assert keys(noisy) == keys(exact)
-    off_m = 0.05 * np.array([a.time_s - b.time_s for a, b in zip(noisy, exact, strict=True)])
+    off_m = 0.1 * np.array([a.time_s - b.time_s for a, b in zip(noisy, exact, strict=True)])
     # Beams are crossed at 30 deg and more: at half of the speed or faster.
     assert np.all(np.abs(off_m) < 2.0 * 5.0 * np.hypot(NOISE.step_m, NOISE.edge_m))
     assert np.all(off_m != 0.0)
@@ -146,7 +148,7 @@ def test_the_seed_tells_everything_whenever_the_cell_is_asked():
     def run(seed, pieces):
         cell = SimulatedCell(plan_of(source=SAMPLED, noise=NOISE, ripple=0.02, seed=seed))
         cell.drive(circle())
-        parts = [cell.advance(t) for t in np.linspace(0.0, 3.0, pieces)[1:]]
+        parts = [cell.advance(t) for t in np.linspace(0.0, 2.2, pieces)[1:]]
         return np.concatenate([p.q for p in parts]), [e for p in parts for e in p.edges]
 
     one, other, new = run(1, 2), run(1, 211), run(2, 2)
@@ -193,11 +195,11 @@ def test_a_hand_moves_the_flange_and_no_joint():
 def test_a_replaced_or_ended_motion_goes_on_where_it_is():
     cell = SimulatedCell(plan_of(noise=NOISE))
     cell.drive(circle())
-    cell.advance(1.5)
+    cell.advance(1.2)
     before = cell.flange(np.array([cell.now_s]))
     cell.drive(circle(direction=-1))
     assert cell.flange(np.array([cell.now_s])) == pytest.approx(before, abs=1e-12)
-    cell.advance(2.0)
+    cell.advance(1.5)
     before = cell.flange(np.array([cell.now_s]))
     cell.hold()
     assert not cell.moving
