@@ -11,6 +11,7 @@ from sensor_msgs.msg import JointState
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.motion.loading import load_motion
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import qos, tcf_motion
 from robocal_ros.nodes.base import HouseNode
@@ -32,6 +33,7 @@ from robocal_ros.sessions.events import (
     Outcome,
 )
 from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.silence import Silence
 from robocal_ros.sessions.tool import EDGES, ToolSession
 from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import configuration
@@ -65,6 +67,7 @@ class TcfNode(HouseNode):
             raise InputError("laser is empty: name the file that 'robocal tool beams' wrote")
         placed = read_laser_for(Path(settings["laser"]), self._nominal)
         taught = taught_tool(settings, self._nominal)
+        load_motion(self._nominal)
         self._config = session_config(settings, placed.laser, placed.station, taught)
         self._serial_in_use = settings["serial"] or NO_SERIAL
         folder = settings["state_dir"]
@@ -103,7 +106,7 @@ class TcfNode(HouseNode):
         self._last: Outcome | None = None
         self._run_end: Future = Future()
         self._shown: tuple[int, int, int] | None = None
-        self._joints_s = time.monotonic()
+        self._silence, self._newest_ns = Silence(), 0
         if self._motion is not None:
             self._motion.activate(self._session)
         self._show_in_force()
@@ -141,10 +144,12 @@ class TcfNode(HouseNode):
                 if self._guard.fault:
                     session.ignored.add(JOINTS, self._guard.fault)
                     return
-                self._joints_s = time.monotonic()
                 if self._motion is not None:
                     self._motion.take(message)
             take_tool_message(session, kind, message)
+            if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
+                self._newest_ns = session.newest_joints_ns
+                self._silence.heard(time.monotonic())
             if (command := session.recognised()) is not None:
                 self._desk.ask(command)
             elif session.waiting:
@@ -162,10 +167,10 @@ class TcfNode(HouseNode):
 
     def _watch(self) -> None:
         session = self._session
-        if session is None or session.run is None:
+        if session is None:
             return
-        silent_s = time.monotonic() - self._joints_s
-        if silent_s > self.settings["joint_silence_s"]:
+        silent_s = self._silence.look(time.monotonic())
+        if session.run is not None and silent_s > self.settings["joint_silence_s"]:
             words = f"joint states are silent for {silent_s:.2f} s: check the robot's driver"
             self._break_off(Code.TOO_FEW_SAMPLES, words)
 

@@ -143,10 +143,12 @@ class ToolSession:
 
     def _add_edge(self, sample: EdgeSample) -> None:
         if self.config.station and sample.station != self.config.station:
-            raise InputError(
+            words = (
                 f"edge of station '{sample.station}', the laser frame is of "
                 f"'{self.config.station}': connect the right station, or calibrate its beams"
             )
+            self._end_early(words)
+            raise InputError(words)
         topic = f"{EDGES}/{sample.beam}"
         if sample.stamp_ns <= self.newest_ns.get(topic, -1):
             raise InputError(

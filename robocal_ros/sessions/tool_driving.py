@@ -21,6 +21,7 @@ from robocal_ros.core.motion.measuring import approach, measuring
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import stop
 from robocal_ros.sessions.events import BREAK_OFF, STEP_BEGINS, Command
+from robocal_ros.sessions.silence import Silence
 from robocal_ros.sessions.tool import EDGES, ToolSession
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ Array = NDArray[np.float64]
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 REST_RAD = 1e-4  # within that span a robot that rests moves less
 REST_WITHIN_S = 2.0  # after a motion's end
+BACK_S = 1.0  # stamps that go back by more began anew
 LATE_S = 0.15  # a controller lags at most so far behind its trajectory
 
 
@@ -87,6 +89,7 @@ class ToolDriver:
         self._send, self._ask = send, ask
         self.phase, self.armed, self.told = Phase.IDLE, False, ""
         self._armed_at_s = self._sent_s = self._heard_s = 0.0
+        self._silence = Silence()
         self._plan: JointPlan | None = None
         self._cell: MotionCell | None = None
         self._edges = 0
@@ -103,7 +106,7 @@ class ToolDriver:
         ConflictError
             While joint states are missing.
         """
-        if self._silent_s(now_s) > self._config.silence_s:
+        if self._silent_s > self._config.silence_s:
             raise ConflictError("joint states are missing: nothing can be armed without them")
         self.armed, self._armed_at_s, self.told = True, now_s, ""
 
@@ -123,12 +126,18 @@ class ToolDriver:
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,), in the arm's order, as they arrive; ``stamp_s`` on their own clock."""
+        if self._readings and stamp_s <= self._readings[-1][0]:
+            if stamp_s > self._readings[-1][0] - BACK_S:
+                return  # a clock that stands still is heard as silence
+            self._readings.clear()
         self._readings.append((stamp_s, q))
         self._heard_s = now_s
+        self._silence.heard(now_s)
         self.tick(now_s)
 
     def tick(self, now_s: float) -> None:
         """Look at everything; call it often, also when nothing arrives."""
+        self._silence.look(now_s)
         try:
             self._tick(now_s)
         except RobocalError as error:
@@ -207,7 +216,7 @@ class ToolDriver:
 
     def _supervise(self, now_s: float) -> None:
         """Raise what must stop the robot."""
-        silent_s = self._silent_s(now_s)
+        silent_s = self._silent_s
         if silent_s > self._config.silence_s:
             raise StopError(Code.TOO_FEW_SAMPLES, f"joint states are silent for {silent_s:.2f} s")
         if self.phase is Phase.APPROACH and self._session.received[EDGES] != self._edges:
@@ -248,8 +257,9 @@ class ToolDriver:
         near = np.max(np.abs(self._plan.q[-1] - self._readings[-1][1]))
         return now_s - self._sent_s >= self._plan.duration_s and bool(near < 10.0 * REST_RAD)
 
-    def _silent_s(self, now_s: float) -> float:
-        return now_s - self._heard_s if self._readings else np.inf
+    @property
+    def _silent_s(self) -> float:
+        return self._silence.lasts_s if self._readings else np.inf
 
     def _recent(self) -> tuple[float, Array] | None:
         """Span of the last readings and the joints' way in it; None before there are enough."""
@@ -264,7 +274,7 @@ class ToolDriver:
     def _resting(self, now_s: float) -> Array | None:
         """The joints where the robot rests; None while it moves."""
         recent = self._recent()
-        if recent is None or self._silent_s(now_s) > self._config.silence_s:
+        if recent is None or self._silent_s > self._config.silence_s:
             return None
         return self._readings[-1][1] if np.max(np.abs(recent[1])) < REST_RAD else None
 
@@ -275,7 +285,7 @@ class ToolDriver:
         if moving and self._readings:
             recent = self._recent()
             qd = np.zeros_like(self._readings[-1][1]) if recent is None else recent[1] / recent[0]
-            q = self._readings[-1][1] + qd * min(self._silent_s(now_s), self._config.silence_s)
+            q = self._readings[-1][1] + qd * min(self._silent_s, self._config.silence_s)
             self._send(stop(self._session.nominal, self._config.limits, q, qd))
         if self._session.run is not None:
             self._ask(Command(BREAK_OFF, {"code": int(code), "reason": reason}))

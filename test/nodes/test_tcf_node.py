@@ -135,7 +135,7 @@ def test_edges_of_another_station_are_not_used(graph: Any, tmp_path: Any) -> Non
     cell.station = "south"
     result = cell.measure()
     assert result.status == Code.BEAM_EDGES_WRONG
-    assert "no edge within 2 s" in result.message
+    assert "edge of station 'south', the laser frame is of 'north'" in result.message
     ignored = [key for key in cell.node.health().values if "station 'south'" in key]
     assert len(ignored) == 1
 

@@ -12,37 +12,15 @@ from robocal_msgs.msg import BeamEvent, ToolStep
 from sensor_msgs.msg import JointState
 from tool_driver import TAUGHT, Driver, noisy_cell
 
-from robocal_ros.core import frames
 from robocal_ros.core.samples import JointSample
-from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import qos
+from robocal_ros.nodes.cell_sim_messages import planned_step
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.sim.beams import RoundTool
 from robocal_ros.storage.laser_files import LaserFile, write_laser
 
 STATION = "north"
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
-
-
-def planned(message: ToolStep) -> PlannedStep:
-    """What the robot's program makes of an announced step."""
-    p, o, laser = message.flange.position, message.flange.orientation, message.laser
-    turn = frames.transform_from_quat(np.zeros(3), np.array([laser.x, laser.y, laser.z, laser.w]))
-    return PlannedStep(
-        name=message.name,
-        kind="circle" if message.kind == ToolStep.CIRCLE else "plunge",
-        number=message.number,
-        of=message.of,
-        T_base_flange=frames.transform_from_quat(
-            np.array([p.x, p.y, p.z]), np.array([o.x, o.y, o.z, o.w])
-        ),
-        R_base_laser=turn[:3, :3],
-        speed_m_s=message.speed,
-        radius_m=message.radius,
-        direction=message.direction,
-        start_rad=message.start_angle,
-        depth_m=message.depth,
-    )
 
 
 class LiveCell(Driver):
@@ -127,7 +105,7 @@ class LiveCell(Driver):
                 return
             if step.kind != ToolStep.NONE and (step.run, step.number) > driven:
                 driven = (step.run, step.number)
-                self.play(self.program.drive(planned(step)))
+                self.play(self.program.drive(planned_step(step)))
             elif not self.silent:
                 self.rest(0.25)
         raise AssertionError("the run never ends")

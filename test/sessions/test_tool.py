@@ -8,6 +8,7 @@ import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.judging import KnownTool
@@ -196,8 +197,12 @@ def test_a_robot_moved_by_hand_in_between_is_refused(history):
 
 def test_edges_of_another_station_are_not_used(history):
     driver = driver_of(history, station="south", step_timeout_s=2.0)
-    with pytest.raises(Exception, match="station ''"):
+    with pytest.raises(InputError, match="station ''"):
         driver.measure()
+    driver.command(driver.session.recognised())
+    assert driver.outcomes[-1].status is Code.BEAM_EDGES_WRONG
+    assert "connect the right station" in driver.outcomes[-1].message
+    assert driver.session.run is None
 
 
 def test_joint_states_that_pause_are_refused(history):

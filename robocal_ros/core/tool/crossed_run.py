@@ -257,7 +257,12 @@ def _require_fit(
 ) -> None:
     """Refuse edges that miss any tool, and a step that lies apart from the others."""
     misfit = _misfit(problem, found)
-    if misfit > LARGEST_MISFIT_M or not found.converged:
+    if not found.converged:
+        raise ResidualError(
+            f"no tool is found: the search still moves with the edges {misfit * 1e3:.3f} mm rms "
+            "apart; check the robot's model, the laser frame and the taught tool"
+        )
+    if misfit > LARGEST_MISFIT_M:
         raise ResidualError(
             f"the edges miss any one tool by {misfit * 1e3:.3f} mm rms (allowed "
             f"{LARGEST_MISFIT_M * 1e3:.1f} mm): check robot, laser frame and joint readings"

@@ -1,0 +1,157 @@
+"""tcf_node and cell_sim_node as processes: the simulated robot moves, in real time."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import robocal_json
+from geometry_msgs.msg import TransformStamped
+from rclpy.action import ActionClient
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.msg import ToolStep
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.motion.limits import MotionLimits
+from robocal_ros.nodes import qos
+
+RUN_S = 60.0
+BEND_MM = [2.0, -1.0, 0.5]
+
+
+def tip(transform: Any) -> np.ndarray:
+    t = transform.translation
+    return np.array([t.x, t.y, t.z])
+
+
+class Cell:
+    """Both nodes; the laser file is made of the cell's own calibration."""
+
+    def __init__(self, graph: Any, folder: Path, motion: str, **faults: Any) -> None:
+        self.graph, csv = graph, folder / "beams.csv"
+        bend = ", ".join(map(str, BEND_MM))
+        simulated = {"laser_csv": str(csv), "tool_bend_mm": f"[{bend}]", "seed": 7} | faults
+        simulated["run_program"] = str(motion == "program").lower()
+        remap = {
+            "next_step": "/tcf_node/next_step",
+            "joint_trajectory": "/tcf_node/joint_trajectory",
+        }
+        self.truth = graph.collect(TransformStamped, "/cell_sim_node/truth", qos.LATCHED)
+        self.joints = graph.collect(JointState, "joint_states")
+        self.sent = graph.collect(JointTrajectory, "/tcf_node/joint_trajectory")
+        self.steps = graph.collect(ToolStep, "/tcf_node/next_step", qos.LATCHED)
+        graph.start("cell_sim_node", simulated, remap)
+        graph.spin_until(lambda: self.truth and csv.exists(), "the cell")
+        laser = folder / "laser.yaml"
+        robocal_json(
+            "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
+            "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
+        )  # fmt: skip
+        settings = {"laser": str(laser), "taught_xyz_mm": "[0.0, 0.0, 150.0]", "motion": motion}
+        graph.start("tcf_node", settings)
+        self.client = ActionClient(graph.probe, MeasureTool, "/tcf_node/measure")
+        graph.spin_until(self.client.server_is_ready, "the action appears")
+        graph.spin_until(lambda: self.steps and self.joints, "both nodes are at work")
+        graph.spin_for(0.3)
+
+    def begin(self, mode: int) -> Any:
+        sent = self.client.send_goal_async(MeasureTool.Goal(mode=mode))
+        self.graph.spin_until(sent.done, "the goal is taken")
+        return sent.result()
+
+    def measure(self, mode: int = MeasureTool.Goal.FULL) -> Any:
+        ended = self.begin(mode).get_result_async()
+        self.graph.spin_until(ended.done, "the result", within_s=RUN_S)
+        return ended.result().result
+
+    def arm(self) -> None:
+        answer = self.graph.call(SetBool, "/tcf_node/arm", data=True)
+        assert answer.success, answer.message
+
+
+def found(cell: Cell, result: Any) -> None:
+    """The true tool was found, to what the run knows of itself."""
+    assert result.status == Code.ACCEPT, result.message
+    covariance = np.array(result.tool.covariance).reshape(5, 5)[:3, :3]
+    away = tip(result.tool.tool) - tip(cell.truth[-1].transform)
+    assert away @ np.linalg.solve(covariance, away) < 16.3  # chi-square of 3, 1e-3
+
+
+def test_the_robots_program_drives_what_is_announced(graph: Any, tmp_path: Path) -> None:
+    cell = Cell(graph, tmp_path, "program")
+    found(cell, cell.measure())
+    names = [s.name for s in cell.steps if s.kind]
+    assert names == ["low", "high", "upright", "plunge_1", "plunge_2"]
+    assert cell.sent == []
+
+
+def test_the_node_drives_a_whole_run_and_a_quick_check(graph: Any, tmp_path: Path) -> None:
+    cell = Cell(graph, tmp_path, "trajectory")
+    refused = cell.measure()
+    assert refused.status == Code.CONFLICT
+    assert "not armed" in refused.message
+    assert cell.sent == []
+    cell.arm()
+    result = cell.measure()
+    found(cell, result)
+    assert len(cell.sent) == 10
+    accepted = graph.call(Trigger, "/tcf_node/accept_trigger")
+    assert accepted.success, accepted.message
+    again = cell.measure(MeasureTool.Goal.QUICK)
+    assert "not armed (the run has ended)" in again.message
+    cell.arm()
+    quick = cell.measure(MeasureTool.Goal.QUICK)
+    assert quick.answer == MeasureTool.Result.PASS, quick.message
+
+
+def rest_after(cell: Cell, stop: JointTrajectory) -> float:
+    """Seconds of joint stamps from the stop's last motion back to its first."""
+    position = np.array([m.position for m in cell.joints])
+    stamp = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in cell.joints])
+    moving = np.flatnonzero(np.max(np.abs(np.diff(position, axis=0)), axis=1) > 1e-9)
+    return float(stamp[-1] - stamp[moving[-1] + 1])
+
+
+@pytest.mark.parametrize("how", ["cancel", "disarm", "silent", "deactivate"])
+def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: str) -> None:
+    cell = Cell(graph, tmp_path, "trajectory")
+    cell.arm()
+    handle = cell.begin(MeasureTool.Goal.FULL)
+    ended = handle.get_result_async()
+    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=RUN_S)
+    graph.spin_for(0.6)  # in the middle of it
+    before = len(cell.joints)
+    if how == "cancel":
+        handle.cancel_goal_async()
+    elif how == "disarm":
+        graph.call(SetBool, "/tcf_node/arm", data=False)
+    elif how == "silent":
+        from rcl_interfaces.msg import Parameter, ParameterValue
+        from rcl_interfaces.srv import SetParameters
+
+        value = ParameterValue(type=4, string_value="joints_silent")
+        told = Parameter(name="fault", value=value)
+        graph.call(SetParameters, "/cell_sim_node/set_parameters", parameters=[told])
+    else:
+        from lifecycle_msgs.msg import Transition
+        from lifecycle_msgs.srv import ChangeState
+
+        graph.call(ChangeState, "/tcf_node/change_state", transition=Transition(id=4))
+    graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=3.0)
+    stop = cell.sent[-1]
+    duration = stop.points[-1].time_from_start
+    assert duration.sec == 0
+    limits = MotionLimits()
+    assert duration.nanosec * 1e-9 <= limits.joint_velocity / limits.stop_deceleration
+    assert not any(stop.points[-1].velocities)
+    graph.spin_for(1.0)
+    graph.spin_until(ended.done, "the result")
+    assert not ended.result().result.success
+    if how != "silent":
+        # From the stop's arrival, a tick of the cell and the stop's own time later it stands.
+        assert rest_after(cell, stop) > 1.0 - duration.nanosec * 1e-9 - 0.1
+        assert len(cell.joints) > before
+    assert cell.steps[-1].kind == ToolStep.NONE or how == "deactivate"
