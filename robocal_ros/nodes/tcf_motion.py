@@ -17,9 +17,10 @@ from robocal_ros.core.samples import joint_sample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
 from robocal_ros.nodes.parameters import Setting
+from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import DrivingConfig, ToolDriver
+from robocal_ros.sessions.tool_driving import ToolDriver
 
 TICK_S = 0.01
 NS = 1_000_000_000

@@ -6,7 +6,6 @@ only when the one before has ended there.
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -15,11 +14,11 @@ from numpy.typing import NDArray
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, RobocalError
 from robocal_ros.core.motion.cell import MotionCell
-from robocal_ros.core.motion.housing import Housing, ToolBody
-from robocal_ros.core.motion.limits import MotionLimits
+from robocal_ros.core.motion.housing import ToolBody
 from robocal_ros.core.motion.measuring import approach, measuring
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import stop
+from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.events import BREAK_OFF, STEP_BEGINS, Command
 from robocal_ros.sessions.silence import Silence
 from robocal_ros.sessions.tool import EDGES, ToolSession
@@ -39,28 +38,6 @@ class Phase(Enum):
     IDLE = "idle"
     APPROACH = "on its way to a step"
     MEASURE = "driving a step"
-
-
-@dataclass(frozen=True, eq=False)
-class DrivingConfig:
-    """What a driven measurement may do.
-
-    Attributes
-    ----------
-    tool_length_m, tool_radius_m, flange_radius_m : see `ToolBody`.
-    deviation_rad : largest distance of a joint from the plan.
-    silence_s : joint states may pause for so long while the robot moves.
-    armed_s : without a run it disarms after so long.
-    """
-
-    housing: Housing
-    tool_length_m: float
-    tool_radius_m: float
-    flange_radius_m: float
-    limits: MotionLimits = field(default_factory=MotionLimits)
-    deviation_rad: float = float(np.radians(0.5))
-    silence_s: float = 0.1
-    armed_s: float = 60.0
 
 
 class ToolDriver:
@@ -104,8 +81,10 @@ class ToolDriver:
         Raises
         ------
         ConflictError
-            While joint states are missing.
+            While joint states are missing, or a motion is not over yet.
         """
+        if self.phase is not Phase.IDLE:
+            raise ConflictError(f"the robot is {self.phase.value}: arm it when it stands")
         if self._silent_s > self._config.silence_s:
             raise ConflictError("joint states are missing: nothing can be armed without them")
         self.armed, self._armed_at_s, self.told = True, now_s, ""
@@ -160,6 +139,7 @@ class ToolDriver:
     def _without_run(self, now_s: float) -> None:
         """Let the last motion end, or an arming that nobody used."""
         if self.phase is not Phase.IDLE:
+            self.armed, self.told = False, "the run has ended"
             self._supervise(now_s)
             if self._at_end(now_s):
                 self._settle("the run has ended")

@@ -7,6 +7,10 @@ import numpy as np
 import pytest
 from command import robocal_json
 from geometry_msgs.msg import TransformStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import ToolStep
@@ -68,8 +72,13 @@ class Cell:
         return ended.result().result
 
     def arm(self) -> None:
-        answer = self.graph.call(SetBool, "/tcf_node/arm", data=True)
-        assert answer.success, answer.message
+        """Arm, once the last motion is over."""
+        for _ in range(20):
+            answer = self.graph.call(SetBool, "/tcf_node/arm", data=True)
+            if answer.success:
+                return
+            self.graph.spin_for(0.2)
+        raise AssertionError(answer.message)
 
 
 def found(cell: Cell, result: Any) -> None:
@@ -107,6 +116,11 @@ def test_the_node_drives_a_whole_run_and_a_quick_check(graph: Any, tmp_path: Pat
     assert quick.answer == MeasureTool.Result.PASS, quick.message
 
 
+def set_fault(graph: Any, fault: str) -> None:
+    told = Parameter(name="fault", value=ParameterValue(type=4, string_value=fault))
+    graph.call(SetParameters, "/cell_sim_node/set_parameters", parameters=[told])
+
+
 def rest_after(cell: Cell, stop: JointTrajectory) -> float:
     """Seconds of joint stamps from the stop's last motion back to its first."""
     position = np.array([m.position for m in cell.joints])
@@ -121,24 +135,17 @@ def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: st
     cell.arm()
     handle = cell.begin(MeasureTool.Goal.FULL)
     ended = handle.get_result_async()
+    if how == "silent":  # with the next motion
+        graph.spin_until(lambda: len(cell.sent) == 1, "the way to it", within_s=RUN_S)
+        set_fault(graph, "joints_silent")
     graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=RUN_S)
-    graph.spin_for(0.6)  # in the middle of it
+    graph.spin_for(0.6 if how != "silent" else 0.0)  # in the middle of it
     before = len(cell.joints)
     if how == "cancel":
         handle.cancel_goal_async()
     elif how == "disarm":
         graph.call(SetBool, "/tcf_node/arm", data=False)
-    elif how == "silent":
-        from rcl_interfaces.msg import Parameter, ParameterValue
-        from rcl_interfaces.srv import SetParameters
-
-        value = ParameterValue(type=4, string_value="joints_silent")
-        told = Parameter(name="fault", value=value)
-        graph.call(SetParameters, "/cell_sim_node/set_parameters", parameters=[told])
-    else:
-        from lifecycle_msgs.msg import Transition
-        from lifecycle_msgs.srv import ChangeState
-
+    elif how == "deactivate":
         graph.call(ChangeState, "/tcf_node/change_state", transition=Transition(id=4))
     graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=3.0)
     stop = cell.sent[-1]
@@ -155,3 +162,26 @@ def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: st
         assert rest_after(cell, stop) > 1.0 - duration.nanosec * 1e-9 - 0.1
         assert len(cell.joints) > before
     assert cell.steps[-1].kind == ToolStep.NONE or how == "deactivate"
+
+
+FAULTS = {
+    "beam_y_dead": "beam y was never broken",
+    "lost_edge": "an edge between was lost",
+    "double_edge": "twice",
+    "chatter": "chatters",
+    "wrong_station": "connect the right station",
+    "frozen_clock": "joint states are silent",
+}
+
+
+def test_each_fault_of_the_moving_cell_is_refused_in_its_words(graph: Any, tmp_path: Path) -> None:
+    cell = Cell(graph, tmp_path, "program")
+    for fault, words in FAULTS.items():
+        set_fault(graph, fault)
+        result = cell.measure()
+        assert not result.success, fault
+        assert words in result.message, fault
+        assert cell.steps[-1].kind == ToolStep.NONE
+        graph.spin_for(2.5)  # the program drives its motion to the end
+    set_fault(graph, "none")
+    found(cell, cell.measure())

@@ -12,9 +12,10 @@ from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.events import MEASURE_TOOL, Command
 from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import DrivingConfig, Phase, ToolDriver
+from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 from robocal_ros.sim.beams import RoundTool, bent
 from robocal_ros.sim.tool_cell import joints_at
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -98,6 +99,10 @@ class Robot:
         if (command := self.session.recognised()) is not None:
             self.ask(command)
 
+    def at_rest(self) -> bool:
+        """Whether all is over."""
+        return not self.driver.armed and self.driver.phase is Phase.IDLE
+
     def stands_still(self, since_s: float) -> bool:
         count = round((self.now_s - since_s) / PERIOD_S)
         return bool(np.ptp(np.array(self.path[-count:]), axis=0).max() < 1e-9)
@@ -119,7 +124,7 @@ def robot(history) -> Robot:
 def test_a_whole_run_is_driven_and_then_disarmed(robot, history):
     robot.driver.arm(robot.now_s)
     robot.measure()
-    robot.run(60.0, until=lambda: not robot.driver.armed)
+    robot.run(60.0, until=robot.at_rest)
     last = robot.outcomes[-1]
     assert last.status is Code.ACCEPT, last.message
     found = KnownTool.of_document(history.model(last.calibration_id))
@@ -133,7 +138,7 @@ def test_a_whole_run_is_driven_and_then_disarmed(robot, history):
 def test_speeds_stay_within_the_limits(robot):
     robot.driver.arm(robot.now_s)
     robot.measure("quick")
-    robot.run(40.0, until=lambda: not robot.driver.armed)
+    robot.run(40.0, until=robot.at_rest)
     path = np.array(robot.path)
     rate = np.diff(path, axis=0) / PERIOD_S
     limits = MotionLimits()

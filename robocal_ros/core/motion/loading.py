@@ -17,8 +17,8 @@ def load_motion(arm: SerialArm) -> None:
     import scipy.special  # noqa: F401
 
     q = np.full(arm.n, 0.3)
-    time = np.arange(FEWEST_READINGS) * 0.01
-    JointPath(arm, time, np.tile(q, (len(time), 1))).at(time[1:-1])
+    time = np.linspace(0.0, 0.1, FEWEST_READINGS)
+    JointPath(arm, time, np.tile(q, (len(time), 1))).at(np.array([0.05]))
     stop(arm, MotionLimits(), q, np.full(arm.n, 0.01)).at(0.0)
     with suppress(LimitError):  # a posture that some arm does not have
         inverse(arm, arm.fk(q)[None], q)

@@ -1,0 +1,30 @@
+"""Settings of a driven tool measurement."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.limits import MotionLimits
+
+
+@dataclass(frozen=True, eq=False)
+class DrivingConfig:
+    """What a driven measurement may do.
+
+    Attributes
+    ----------
+    tool_length_m, tool_radius_m, flange_radius_m : see `ToolBody`.
+    deviation_rad : largest distance of a joint from the plan.
+    silence_s : joint states may pause for so long while the robot moves.
+    armed_s : without a run it disarms after so long.
+    """
+
+    housing: Housing
+    tool_length_m: float
+    tool_radius_m: float
+    flange_radius_m: float
+    limits: MotionLimits = field(default_factory=MotionLimits)
+    deviation_rad: float = float(np.radians(0.5))
+    silence_s: float = 0.1
+    armed_s: float = 60.0
