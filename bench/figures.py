@@ -2,6 +2,7 @@
 
 - ``ur10_campaigns.png``: real measurements (see ``ur10_campaigns``), mean error at poses that were
   held out;
+- ``beam_circle.png``: one simulated circle through two crossed beams;
 - ``demo_shift.png``: the simulated shift of the demo, from its report in ``out/``.
 """
 
@@ -16,6 +17,7 @@ from matplotlib.figure import Figure
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
+from bench.circle_figure import circle_figure
 from bench.real_data import carried_over, own_half
 from bench.ur10_campaigns import SERIES
 from robocal_ros.report.drift import read_report
@@ -100,6 +102,7 @@ def main() -> None:
     found = campaign_errors()
     print(json.dumps(found, indent=1))
     (IMAGES / "ur10_campaigns.png").write_bytes(png(campaign_figure(found)))
+    (IMAGES / "beam_circle.png").write_bytes(png(circle_figure()))
     report = read_report(ROOT / "out" / "report.json", ROOT / "out" / "errors.csv")
     (IMAGES / "demo_shift.png").write_bytes(png(drift_over_time(report)))
 

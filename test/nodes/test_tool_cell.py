@@ -181,7 +181,8 @@ def test_each_fault_of_the_moving_cell_is_refused_in_its_words(graph: Any, tmp_p
         result = cell.measure()
         assert not result.success, fault
         assert words in result.message, fault
-        assert cell.steps[-1].kind == ToolStep.NONE
+        graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
         graph.spin_for(2.5)  # the program drives its motion to the end
     set_fault(graph, "none")
+    graph.spin_for(1.0)
     found(cell, cell.measure())
