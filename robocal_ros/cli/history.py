@@ -13,7 +13,7 @@ from robocal_ros.cli.arguments import count, text
 from robocal_ros.cli.history_view import show_decision, show_entry, show_list
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.proposals import THERMAL, Decision, Entry
+from robocal_ros.core.proposals import BEFORE_ANY, HEALTHY_TOOL, THERMAL, TOOL, Decision, Entry
 from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ HELP = "list the calibrations of a robot; accept, reject or roll back"
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
-_KINDS = (THERMAL, "reference")
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -185,7 +185,8 @@ def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer
         wall_ns=time.time_ns(),
     )
     number = head.calibration_id
-    name = "the nominal model" if number is None else f"calibration {number}"
+    start = BEFORE_ANY.get(args.kind, "nothing")
+    name = start if number is None else f"calibration {number}"
     said = f"{name} is in force again, as {head.kind} revision {head.revision}"
     return _decided(args, head.kind, number, head.revision, said), show_decision
 

@@ -16,6 +16,8 @@ if TYPE_CHECKING:  # the history is listed without loading NumPy
 THERMAL = "thermal"
 TOOL = "tool"
 HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
+# What is in force before anything was accepted.
+BEFORE_ANY = {THERMAL: "the nominal model", TOOL: "the taught tool"}
 
 
 class Action(StrEnum):

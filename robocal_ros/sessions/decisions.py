@@ -4,12 +4,11 @@ from dataclasses import replace
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.proposals import THERMAL, TOOL
+from robocal_ros.core.proposals import BEFORE_ANY, THERMAL
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 
-START_OF = {THERMAL: "the nominal model", TOOL: "the taught tool"}
 ONLY, NEWEST = "only", "newest"  # which pending candidate a command without an id is about
 
 
@@ -55,7 +54,7 @@ def decide(
     except RobocalError as error:
         return Outcome(command, error.code, str(error))
     chosen = head.calibration_id or 0
-    what = f"calibration {chosen}" if chosen else START_OF[kind]
+    what = f"calibration {chosen}" if chosen else BEFORE_ANY[kind]
     message = f"revision {head.revision}: {what} in force"
     return Outcome(command, Code.ACCEPT, message, None, chosen)
 

@@ -1,4 +1,4 @@
-"""Files of measured tools: the JSON that the actions of ``robocal tool`` print."""
+"""Files of measured tools: the JSON that ``robocal tool`` and ``robocal history show`` print."""
 
 from pathlib import Path
 
@@ -26,6 +26,8 @@ def read_tool(path: Path, rotation: Array | None = None) -> Array:
         document's verdict does not accept the tool.
     """
     top = read_fields(path, "tool file")
+    if "document" in top.values:  # as the history shows it
+        top = top.below("document")
     if "error" in top.values:
         top.fail("tells why no tool was found: measure again", "error")
     if "verdict" in top.values:

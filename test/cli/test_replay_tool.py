@@ -1,6 +1,7 @@
 """``robocal replay`` of the golden tool bag."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -52,3 +53,18 @@ def test_replay_equals_the_recording_bit_for_bit(made):
 
 def test_windows_are_for_thermal_recordings(made):
     robocal_json("error.json", "replay", made, "--auto", status=2)
+
+
+def test_the_tool_in_force_is_exported_from_the_history(made, tmp_path):
+    state = tmp_path / "state"
+    final = robocal_json("replay.tool.json", "replay", made, "--state", state)["final_tool"]
+    shown = robocal("history", "show", 2, "--state", state, "--json").stdout
+    file = tmp_path / "shown.json"
+    file.write_text(shown)
+    text = robocal("tool", "export", "--tool", file, "--format", "ur").stdout
+    xyz = [float(n) for n in re.findall(r"-?\d+\.\d+", text)[:3]]
+    assert xyz == pytest.approx(1e-3 * np.array(final["xyz_mm"]), abs=1e-6)
+    done = robocal("history", "rollback", "--to", "nominal", "--kind", "tool", "--state", state,
+                   "--by", "me", "--reason", "the old torch is back")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "the taught tool is in force again, as tool revision 2" in done.stdout
