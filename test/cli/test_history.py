@@ -165,7 +165,7 @@ class TestDeciding:
             (("show", "9"), 2, "BAD_INPUT"),
             (("reject", "1"), 3, "CONFLICT"),
             (("rollback", "--to", "2"), 3, "CONFLICT"),
-            (("rollback", "--kind", "tool"), 2, "BAD_INPUT"),
+            (("rollback", "--kind", "camera"), 2, "BAD_INPUT"),
             (("rollback", "--expect-revision", "7"), 3, "CONFLICT"),
             (("accept", "2", "--by", os.fsdecode(b"\xff")), 2, "BAD_INPUT"),
         ],

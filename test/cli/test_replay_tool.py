@@ -67,4 +67,4 @@ def test_the_tool_in_force_is_exported_from_the_history(made, tmp_path):
     done = robocal("history", "rollback", "--to", "nominal", "--kind", "tool", "--state", state,
                    "--by", "me", "--reason", "the old torch is back")  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "the taught tool is in force again, as tool revision 2" in done.stdout
+    assert "The taught tool is in force again, as tool revision 2" in done.stdout

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from beam_cell import SILENT, T_BASE_LASER, TAUGHT, laser_of, make_cell
+from beam_cell import SILENT, make_cell
 from cell_plans import ARM, Q_START, TRUTH, driven, measured, plan_of
 
 from robocal_ros.core.errors import LimitError
@@ -15,6 +15,7 @@ from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
 from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise
 from robocal_ros.sim.cell import TICK_S, SimulatedCell, known_laser
+from robocal_ros.sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
 
 NOISE = TrueNoise(3e-5, 1e-5)
 SAMPLED = TrueInput(latency_s=0.004, sample_period_s=0.002)
