@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from beam_cell import TAUGHT, make_cell
+from beam_cell import make_cell
 
 from robocal_ros.core.tool.crossed_model import BeamStep, Held, RobotNoise
 from robocal_ros.core.tool.crossed_run import ToolEstimate, estimate_tool
@@ -12,6 +12,7 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
 from robocal_ros.sim.beams import NO_NOISE, PERFECT, RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.sim.cell import CellPlan, Happened, SimulatedCell, rigid_robot
+from robocal_ros.sim.ur10_station import TAUGHT
 from robocal_ros.storage.robots import load_robot
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
