@@ -25,9 +25,10 @@ from robocal_ros.core.tool.edge_samples import BREAK, RESTORE
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.sessions import events
+from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
-from robocal_ros.sessions.tool import EDGES, ToolSession
+from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sessions.tool_recorded import configuration
 from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent

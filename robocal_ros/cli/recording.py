@@ -7,10 +7,10 @@ from typing import Any
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import stamp_ns
+from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.observations import JOINTS, MEASURING
 from robocal_ros.sessions.replay import EVENTS, input_topics, read_events, topic_kind
-from robocal_ros.sessions.tool import EDGES
 from robocal_ros.storage.bags import BagMessage, BagReader
 
 INPUTS = (JOINTS, *MEASURING, EDGES)

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 
 from robocal_ros.core.errors import RobocalError
@@ -75,6 +76,8 @@ class HouseNode(EndpointNode):
 
     def close(self) -> None:
         """Release everything at the end of the process, without a transition."""
+        if self.is_active:
+            self._stop_acting()
         self._clean_up()
         self.destroy_node()
 
@@ -113,7 +116,9 @@ class HouseNode(EndpointNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release everything, for good."""
+        """Stop acting and release everything, for good."""
+        if state.state_id == State.PRIMARY_STATE_ACTIVE:
+            self._stop_acting()
         self._clean_up()
         return TransitionCallbackReturn.SUCCESS
 
@@ -134,6 +139,12 @@ class HouseNode(EndpointNode):
         self.get_logger().error(message)
         self._diagnostics.publish()
         return TransitionCallbackReturn.FAILURE
+
+    def _stop_acting(self) -> None:
+        try:
+            self.deactivate()
+        except Exception as error:
+            self.get_logger().error(f"deactivate: {error}\n{traceback.format_exc()}")
 
     def _clean_up(self) -> None:
         try:

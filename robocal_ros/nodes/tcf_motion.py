@@ -14,6 +14,7 @@ from robocal_ros.core.motion.housing import Housing
 from robocal_ros.core.motion.limits import MotionLimits
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import joint_sample
+from robocal_ros.core.tool.edge_samples import RESTORE
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
 from robocal_ros.nodes.parameters import Setting
@@ -56,10 +57,11 @@ SETTINGS = (
     _length("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
     _length("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
     _length("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
+    _length("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
     Setting(
         "deviation_deg",
         0.5,
-        "A joint so far from its plan stops the robot",
+        "A joint so far from its plan stops the robot; the tip, see deviation_mm",
         unit="deg",
         low=0.01,
         high=10.0,
@@ -94,6 +96,7 @@ def driving_config(settings: Mapping[str, Any]) -> DrivingConfig:
             plunge_speed_m_s=settings["plunge_speed_mm_s"] * 1e-3,
             plunge_depth_m=settings["plunge_limit_mm"] * 1e-3,
         ),
+        deviation_m=settings["deviation_mm"] * 1e-3,
         deviation_rad=float(np.radians(settings["deviation_deg"])),
     )
 
@@ -123,9 +126,12 @@ class TcfMotion:
         Raises
         ------
         InputError
-            When a limit is given for another number of joints.
+            When a limit is given for another number of joints, or the robot has none.
         """
-        self._config.limits.of_joints(session.nominal)
+        arm = session.nominal
+        self._config.limits.of_joints(arm)
+        if not np.all(np.isfinite([arm.lower, arm.upper])):
+            raise InputError(f"{arm.name} has joints without limits: add them to the robot file")
         self._names = session.nominal.joint_names
         self.driver = ToolDriver(session, self._config, self._send, self._ask)
 
@@ -146,11 +152,20 @@ class TcfMotion:
             return
         self.driver.reading(sample.stamp_ns / NS, q, time.monotonic())
 
-    def require_armed(self) -> None:
+    def beam(self, message: Any) -> None:
+        """Take a BeamEvent, usable or not: on its way the tool breaks no beam."""
+        if self.driver is not None:
+            self.driver.beam(message.edge != RESTORE)
+
+    def require_ready(self) -> None:
         """Refuse a run while nothing may move."""
         if self.driver is None:
             raise NotActiveError("no session: activate the node")
-        self.driver.require_armed()
+        self.driver.require_ready()
+
+    def words(self) -> str:
+        """What the diagnostics say."""
+        return "inactive" if self.driver is None else self.driver.words()
 
     def run_ended(self, outcome: Outcome) -> None:
         """A run without a result stops the robot."""

@@ -25,6 +25,7 @@ from robocal_ros.nodes.tcf_outputs import TcfOutputs
 from robocal_ros.nodes.tcf_services import Runner, TcfServices
 from robocal_ros.nodes.tcf_settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
+from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import (
     BREAK_OFF,
     MEASURE_TOOL,
@@ -34,7 +35,7 @@ from robocal_ros.sessions.events import (
 )
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.silence import Silence
-from robocal_ros.sessions.tool import EDGES, ToolSession
+from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import configuration
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -90,6 +91,7 @@ class TcfNode(HouseNode):
             last=lambda: self._last,
             frame=self._frame,
             step=lambda: self._step,
+            is_open=lambda: self._session is not None and self._session.run is not None,
         )
         self._calls = TcfServices(self, runner, self._desk.ask, self._history)
         if settings["motion"] == TRAJECTORY:
@@ -146,6 +148,8 @@ class TcfNode(HouseNode):
                     return
                 if self._motion is not None:
                     self._motion.take(message)
+            elif self._motion is not None:
+                self._motion.beam(message)
             take_tool_message(session, kind, message)
             if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
                 self._newest_ns = session.newest_joints_ns
@@ -158,8 +162,10 @@ class TcfNode(HouseNode):
         return take
 
     def _begin(self, mode: str, cycle_id: str, by: str) -> Any:
-        if self._motion is not None:
-            self._motion.require_armed()
+        session = self._session
+        known = session is not None and session.answered(mode, cycle_id)
+        if self._motion is not None and not known:
+            self._motion.require_ready()
         return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
 
     def _break_off(self, code: Code, reason: str) -> Any:
@@ -196,13 +202,13 @@ class TcfNode(HouseNode):
         try:
             self._outputs.event(outcome.command, outcome)
             if name == MEASURE_TOOL and outcome.done:
-                self._run_end = Future()
+                self._run_end, self._last = Future(), None
             if name in (MEASURE_TOOL, TOOL_STEP, BREAK_OFF):
                 self._show_step(words)
             self._show_in_force()
         except (RobocalError, ValueError) as error:  # what is done stays done
             self.get_logger().error(f"{name} was done but not published: {error}")
-        if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None:
+        if name in (TOOL_STEP, BREAK_OFF) and self._session.run is None and not self._last:
             self._end_run(outcome)
 
     def _end_run(self, outcome: Outcome) -> None:
@@ -256,6 +262,8 @@ class TcfNode(HouseNode):
         values: dict[str, object] = {"revision in force": session.in_force.revision}
         run = session.run
         values["run"] = "none" if run is None else f"{run.number}, {run.awaited.name} is awaited"
+        if self._motion is not None:
+            values["motion"] = self._motion.words()
         values["last run"] = "none" if self._last is None else self._last.message
         for topic, reasons in session.ignored.items():
             for reason, count in reasons.items():

@@ -43,6 +43,7 @@ class Runner:
     last : the outcome of the last run; None before any.
     frame : the measured tool of an outcome.
     step : the step that is awaited.
+    is_open : whether a run is.
     """
 
     def __init__(
@@ -53,9 +54,10 @@ class Runner:
         last: Callable[[], Outcome | None],
         frame: Callable[[Outcome], ToolFrame],
         step: Callable[[], ToolStep],
+        is_open: Callable[[], bool],
     ) -> None:
         self.begin, self.ended, self.cancel = begin, ended, cancel
-        self.last, self.frame, self.step = last, frame, step
+        self.last, self.frame, self.step, self.is_open = last, frame, step, is_open
 
 
 class TcfServices:
@@ -109,7 +111,8 @@ class TcfServices:
         except RobocalError as error:
             return self._end(goal, error.code, str(error))
         finally:
-            self._goal = None
+            if self._goal is goal:
+                self._goal = None
         return self._end(goal, outcome.status, outcome.message, outcome)
 
     def _end(
@@ -150,15 +153,17 @@ class TcfServices:
         return start
 
     async def _cancel_twin(self, request: Any, response: Any) -> Any:
+        response.success = self._runner.is_open()
         outcome = await self._runner.cancel("cancelled by a Trigger")
-        response.success = outcome.command.name != "" and outcome.status is not Code.NONE
         response.message = trigger_text(0, outcome.status, outcome.message)
         return response
 
     def _result(self, request: Any, response: Any) -> Any:
         outcome = self._runner.last()
         if outcome is None:
-            response.message = trigger_text(0, Code.CONFLICT, "no run has ended yet")
+            open_run = self._runner.is_open()
+            words = f"run {self._runner.step().run} is open" if open_run else "no run has ended yet"
+            response.message = trigger_text(0, Code.CONFLICT, words)
             return response
         return _trigger(response, outcome)
 

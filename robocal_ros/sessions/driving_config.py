@@ -15,7 +15,7 @@ class DrivingConfig:
     Attributes
     ----------
     tool_length_m, tool_radius_m, flange_radius_m : see `ToolBody`.
-    deviation_rad : largest distance of a joint from the plan.
+    deviation_m, deviation_rad : largest distance of the tip, and of a turning joint, from the plan.
     silence_s : joint states may pause for so long while the robot moves.
     armed_s : without a run it disarms after so long.
     """
@@ -25,6 +25,7 @@ class DrivingConfig:
     tool_radius_m: float
     flange_radius_m: float
     limits: MotionLimits = field(default_factory=MotionLimits)
+    deviation_m: float = 2e-3
     deviation_rad: float = float(np.radians(0.5))
     silence_s: float = 0.1
     armed_s: float = 60.0

@@ -12,13 +12,14 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import TOOL, Head
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.streams import JointStream
-from robocal_ros.core.tool.beam_edges import BEAMS, BeamError
+from robocal_ros.core.tool.beam_edges import BeamError
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.sessions import events
 from robocal_ros.sessions.bounds import reached
 from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.edge_log import EDGES, MOST_EDGES, EdgeLog
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.ignored import Ignored
@@ -29,10 +30,7 @@ from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_results import MODES, QUICK, ToolResults
 from robocal_ros.sessions.tool_run import ToolRun
 
-EDGES = "beam_events"
 GAP_NS = 250_000_000
-MOST_EDGES = 1000  # of one step: more is a beam that flickers
-SECOND_NS = 1_000_000_000
 
 
 class ToolSession:
@@ -58,7 +56,7 @@ class ToolSession:
         self._results = ToolResults(nominal, history, config, software, self._current)
         self._laser = config.laser
         self.stream = JointStream(nominal.joint_names)
-        self._edges: list[EdgeSample] = []
+        self._edges = EdgeLog()
         self._queue: list[Command] = []
         self._runs = self._jumps = 0
         self._over: Command | None = None
@@ -125,16 +123,19 @@ class ToolSession:
             self._end_early("the clock jumped back")
         elif run is not None and self._over is None and newest > run.from_ns:
             _, q = self.stream.window(newest, newest)
-            waited_s = (newest - run.from_ns) * 1e-9
+            waited_s, limit_s = run.waited_s(newest), self.config.step_timeout_s
             if run.step_over(newest, q[0]):
                 step = run.awaited
                 arguments = {"run": run.number, "number": step.number, "step": step.name}
                 self._over = Command(events.TOOL_STEP, arguments, newest)
-            elif not run.edges and waited_s > self.config.step_timeout_s:
-                self._end_early(
-                    f"{run.awaited.name}: no edge within {self.config.step_timeout_s:g} s: the "
-                    "robot did not move through the beams, or both are dead"
+            elif waited_s > limit_s:
+                why = (
+                    f"not over {limit_s:g} s after its first edge: rest after each step"
+                    if run.edges
+                    else f"no edge within {limit_s:g} s: the robot did not move through the beams, "
+                    "or both are dead"
                 )
+                self._end_early(f"{run.awaited.name}: {why}")
 
     def _end_early(self, reason: str) -> None:
         if self.run is not None:
@@ -149,15 +150,8 @@ class ToolSession:
             )
             self._end_early(words)
             raise InputError(words)
-        topic = f"{EDGES}/{sample.beam}"
-        if sample.stamp_ns <= self.newest_ns.get(topic, -1):
-            raise InputError(
-                f"edge at {sample.stamp_ns} ns is not after {self.newest_ns[topic]} ns"
-            )
-        self.newest_ns[topic] = sample.stamp_ns
+        self._edges.add(sample, self.newest_ns, self.newest_joints_ns)
         self.received[EDGES] += 1
-        if len(self._edges) < MOST_EDGES:
-            self._edges.append(sample)
         if self.run is not None:
             self.run.watch_edge(sample)
 
@@ -167,6 +161,10 @@ class ToolSession:
         """The command that follows from the samples: a step is over, or the run is broken off."""
         found, self._over = self._over, None
         return found
+
+    def answered(self, mode: str, cycle_id: str) -> bool:
+        """Whether a cycle has ended: its answer is given again, and nothing is driven."""
+        return self._results.of_cycle(mode, cycle_id) is not None
 
     def submit(self, command: Command, clock_ns: int | None = None) -> None:
         """Queue a command; ``step`` carries it out when its samples are complete.
@@ -226,7 +224,7 @@ class ToolSession:
         mode, cycle_id = str(command.arguments["mode"]), str(command.arguments.get("cycle_id", ""))
         if mode not in MODES:
             raise InputError(f"mode '{mode}' is none of {', '.join(MODES)}")
-        if (before := self._results.of_cycle(cycle_id)) is not None:
+        if (before := self._results.of_cycle(mode, cycle_id)) is not None:
             return replace(before, command=command, repeated=True)
         if self.run is not None:
             raise ConflictError(
@@ -259,12 +257,7 @@ class ToolSession:
     def _take_step(self, command: Command, wall_ns: int) -> Outcome:
         run = self._require_run()
         marks = command.marks or {}
-        edges = [
-            sample
-            for sample in self._edges
-            if run.from_ns < sample.stamp_ns <= marks.get(f"{EDGES}/{sample.beam}", -1)
-        ]
-        edges.sort(key=lambda sample: (sample.stamp_ns, BEAMS.index(sample.beam)))
+        edges = self._edges.take(run.from_ns, marks)
         stamps, q = self.stream.window(run.from_ns + 1, marks.get(JOINTS, 0))
         step, count = run.awaited, len(edges)
         try:
@@ -274,7 +267,6 @@ class ToolSession:
             early = None if run.complete else self._results.early(run, command)
             if not run.complete and early is None:
                 run.begin_step(marks.get(JOINTS, 0))
-                self._edges = [e for e in self._edges if e not in edges]
                 words = f"{step.name} ({step.number} of {step.of}) is measured: {count} edges"
                 return Outcome(command, Code.ACCEPT, words, samples=count)
             outcome = early or self._results.finish(run, command, wall_ns)

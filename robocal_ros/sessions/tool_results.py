@@ -53,17 +53,17 @@ class ToolResults:
     ) -> None:
         self._nominal, self._history, self._config = nominal, history, config
         self._software, self._current = software, current
-        self._answers: OrderedDict[str, Outcome] = OrderedDict()
+        self._answers: OrderedDict[tuple[str, str], Outcome] = OrderedDict()
 
-    def of_cycle(self, cycle_id: str) -> Outcome | None:
+    def of_cycle(self, mode: str, cycle_id: str) -> Outcome | None:
         """The answer of a cycle that has ended, None for a new one."""
         if not cycle_id:
             return None
-        if cycle_id in self._answers:
-            return self._answers[cycle_id]
-        kinds = (TOOL, HEALTHY_TOOL)
+        if (mode, cycle_id) in self._answers:
+            return self._answers[mode, cycle_id]
+        kind = {FULL: TOOL, REFERENCE: HEALTHY_TOOL}.get(mode)
         for entry in self._history.list(REMEMBERED):
-            if entry.kind in kinds and entry.cycle_id == cycle_id:
+            if entry.kind == kind and entry.cycle_id == cycle_id:
                 document = self._history.document(entry.id)
                 return Outcome(Command(""), entry.code, entry.reason, document, entry.id)
         return None
@@ -81,7 +81,7 @@ class ToolResults:
 
     def _remembered(self, run: ToolRun, outcome: Outcome) -> Outcome:
         if run.cycle_id:
-            self._answers[run.cycle_id] = outcome
+            self._answers[run.mode, run.cycle_id] = outcome
             if len(self._answers) > REMEMBERED:
                 self._answers.popitem(last=False)
         return outcome

@@ -70,6 +70,12 @@ class ToolRun:
         """How many edges the awaited step had so far."""
         return 0 if self._watch is None else self._watch.edges
 
+    def waited_s(self, stamp_ns: int) -> float:
+        """How long the step has been awaited, or since its first edge."""
+        first_s = None if self._watch is None else self._watch.first_edge_s
+        start_s = self._seconds(self.from_ns) if first_s is None else first_s
+        return self._seconds(stamp_ns) - start_s
+
     def begin_step(self, stamp_ns: int) -> None:
         """The awaited step counts from a stamp."""
         self.from_ns, self._watch = stamp_ns, None

@@ -157,7 +157,7 @@ def chatter(step, edges):
     ],
 )
 def test_wrong_edges_end_the_run_and_say_why(history, edit, words):
-    driver = driver_of(history, step_timeout_s=2.0)
+    driver = driver_of(history, step_timeout_s=4.0)
     driver.program.edit = edit
     outcome = driver.measure()
     assert outcome.status is Code.BEAM_EDGES_WRONG

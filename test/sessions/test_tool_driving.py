@@ -69,7 +69,7 @@ class Robot:
             self.driver.run_failed(outcome.message, self.now_s)
 
     def measure(self, mode="full") -> None:
-        self.driver.require_armed()
+        self.driver.require_ready()
         self.ask(Command(MEASURE_TOOL, {"mode": mode}))
 
     @staticmethod
@@ -89,6 +89,7 @@ class Robot:
             self.q = self.plan.at(self.now_s - self.start_s)[0]
         self.path.append(self.q.copy())
         while self.edges and self.edges[0].stamp_ns <= self.ns(self.now_s):
+            self.driver.beam(self.edges[0].blocked)
             self.session.add(self.edges.pop(0))
         if self.silent:
             self.driver.tick(self.now_s)
@@ -117,7 +118,7 @@ def history(tmp_path):
 @pytest.fixture
 def robot(history) -> Robot:
     made = Robot(history)
-    made.run(0.2)
+    made.run(0.4)
     return made
 
 
@@ -230,7 +231,7 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
     beside = robot.cell.pose(TAUGHT, 0.0)
     beside[:3, 3] += [0.1, 0.0, 0.0]
     robot.q = joints_at(robot.cell.arm, beside[None], robot.cell.q_near)[0]
-    robot.run(0.2)
+    robot.run(0.4)
     robot.driver.arm(robot.now_s)
     robot.measure()
     robot.run(0.5)
@@ -241,7 +242,7 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
 
 def test_a_tool_bent_beyond_the_circle_stops_the_run(history):
     robot = Robot(history, bent(TAUGHT, [0.012, 0.0, 0.0], [0.0, 0.0, 0.0]))
-    robot.run(0.2)
+    robot.run(0.4)
     robot.driver.arm(robot.now_s)
     robot.measure()
     robot.run(30.0, until=lambda: not robot.driver.armed)

@@ -28,7 +28,9 @@ def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:
     return T
 
 
-def approach(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPlan:
+def approach(
+    cell: MotionCell, step: PlannedStep, q_now: ArrayLike, *, after_circle: bool = False
+) -> JointPlan:
     """From measured joints (n,) to where a step begins.
 
     Up along the laser's z, over, where the tool is turned, and down: over the housing at its
@@ -44,7 +46,7 @@ def approach(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPlan
     q = _joints(cell, q_now)
     plans: list[JointPlan] = []
     here = cell.T_base_tip(q)
-    for number, there in enumerate(_corners(cell, here, step), start=1):
+    for number, there in enumerate(_corners(cell, here, step, after_circle), start=1):
         ride = Ride.within(
             _way(cell, here, there), cell.limits.tcp_speed_m_s, cell.limits.tcp_acceleration_m_s2
         )
@@ -98,12 +100,12 @@ def _joints(cell: MotionCell, q_now: ArrayLike) -> Array:
     return q
 
 
-def _corners(cell: MotionCell, here: Array, step: PlannedStep) -> list[Array]:
+def _corners(cell: MotionCell, here: Array, step: PlannedStep, after_circle: bool) -> list[Array]:
     """Where the tip goes in turn; the last is the step's start."""
     there = cell.tip_of(start_pose(step, cell.limits))
     first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
     inside = cell.housing.opening_holds(first) and cell.housing.opening_holds(last)
-    if inside and step.kind == "circle":  # both begin far from the beams, in one quadrant
+    if inside and after_circle and step.kind == "circle":  # both begin in one quadrant
         return [there]
     height = max(first[2], last[2], -np.inf if inside else cell.housing.retract_m)
     way = [_raised(cell, here, height - first[2]), _raised(cell, there, height - last[2])]

@@ -10,7 +10,8 @@ from robocal_ros.core.motion.plan import JointPlan
 
 Array = NDArray[np.float64]
 
-SHORTEST_STOP_S = 0.008  # a cycle of common controllers
+# A controller lags or leads its readings by some of its cycles: a shorter stop would throw it back.
+SHORTEST_STOP_S = 0.12
 
 
 def stop_time(arm: SerialArm, limits: MotionLimits, qd: Array) -> Array:

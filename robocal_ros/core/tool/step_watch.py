@@ -30,11 +30,13 @@ class StepWatch:
     Attributes
     ----------
     up : (3,) the laser's z, base.
+    first_edge_s : time of the first edge; None before.
     """
 
     kind: StepKind
     last: bool
     up: Array
+    first_edge_s: float | None = None
     _edges: Counter[Beam] = field(default_factory=Counter)
     _newest_edge_s: float = -np.inf
     _start: Array | None = None
@@ -44,6 +46,7 @@ class StepWatch:
     def edge(self, beam: Beam, time_s: float) -> None:
         """Take an edge."""
         self._edges[beam] += 1
+        self.first_edge_s = time_s if self.first_edge_s is None else self.first_edge_s
         self._newest_edge_s = max(self._newest_edge_s, time_s)
 
     @property

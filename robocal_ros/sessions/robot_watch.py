@@ -1,0 +1,120 @@
+"""Where the robot is, against the plan that it was sent."""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.motion.cell import MotionCell
+from robocal_ros.core.motion.measuring import START_NEAR_M, START_NEAR_RAD
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.sessions.silence import Silence
+
+Array = NDArray[np.float64]
+
+VELOCITY_S = 0.03  # span of the readings that give a velocity
+REST_RAD = 1e-4  # a robot that rests moves less
+BACK_S = 1.0  # stamps that go back by more began anew
+LATE_S = 0.15  # a controller lags at most so far behind its trajectory
+
+
+class RobotWatch:
+    """Readings of the joints as they arrive, and the plan in force; times of a steady clock.
+
+    Attributes
+    ----------
+    silence : how long no new reading came.
+    """
+
+    def __init__(self, arm: SerialArm) -> None:
+        self._arm = arm
+        self.silence = Silence()
+        self._heard_s = self._sent_s = 0.0
+        self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
+        self._plan: JointPlan | None = None
+        self._cell: MotionCell | None = None
+
+    def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
+        """Take joints (n,); ``stamp_s`` on their own clock."""
+        if self._readings and stamp_s <= self._readings[-1][0]:
+            if stamp_s > self._readings[-1][0] - BACK_S:
+                return  # a clock that stands still is heard as silence
+            self._readings.clear()
+        self._readings.append((stamp_s, q))
+        self._heard_s = now_s
+        self.silence.heard(now_s)
+
+    def follow(self, plan: JointPlan, cell: MotionCell, now_s: float) -> None:
+        """A plan was sent."""
+        self._plan, self._cell, self._sent_s = plan, cell, now_s
+
+    def forget(self) -> None:
+        """No plan is in force any more."""
+        self._plan = None
+
+    @property
+    def heard(self) -> bool:
+        """Whether there is any reading."""
+        return bool(self._readings)
+
+    @property
+    def silent_s(self) -> float:
+        """How long the joint states have been silent."""
+        return self.silence.lasts_s if self._readings else np.inf
+
+    def overdue_s(self, now_s: float) -> float:
+        """How long ago the plan ended; negative before."""
+        return -np.inf if self._plan is None else now_s - self._sent_s - self._plan.duration_s
+
+    def at_end(self, now_s: float) -> bool:
+        """Whether the plan has ended, with the robot where it ends."""
+        if self._plan is None or not self._readings:
+            return True
+        near = np.where(self._arm.prismatic, START_NEAR_M, START_NEAR_RAD)
+        there = np.all(np.abs(self._plan.q[-1] - self._readings[-1][1]) < near)
+        return self.overdue_s(now_s) >= 0.0 and bool(there)
+
+    def resting(self, span_s: float) -> Array | None:
+        """The joints where the robot has rested for so long; None while it moves."""
+        recent = self._since(span_s)
+        if recent is None:
+            return None
+        spread = np.ptp(np.array([q for _, q in recent]), axis=0)
+        return recent[-1][1] if np.max(spread) < REST_RAD else None
+
+    def away(self) -> tuple[float, float]:
+        """How far tip (m) and turning joints (rad) are from the plan, where it is nearest."""
+        if self._plan is None or self._cell is None or not self._readings:
+            return 0.0, 0.0
+        at_s, q = self._heard_s - self._sent_s, self._readings[-1][1]
+        times = np.clip(np.linspace(at_s - LATE_S, at_s, 41), 0.0, self._plan.duration_s)
+        planned, _ = self._plan.at(times)
+        joints = np.max(np.abs(planned - q) * ~self._arm.prismatic, axis=1)
+        T = self._cell.arm.fk(np.vstack([planned, q]))
+        tips = T[:, :3, :3] @ self._cell.tool.p_tip + T[:, :3, 3]
+        nearest = int(np.argmin(np.linalg.norm(tips[:-1] - tips[-1], axis=1)))
+        return float(np.linalg.norm(tips[nearest] - tips[-1])), float(joints[nearest])
+
+    def state(self, now_s: float, *, keeps: bool) -> tuple[Array, Array]:
+        """Joints and velocities (n,) to stop from: the plan's, where the robot keeps to it.
+
+        Readings lag behind what the controller commands; a stop from there would throw it back.
+        """
+        q = self._readings[-1][1]
+        if self._plan is not None and keeps:
+            return self._plan.at(now_s - self._sent_s)
+        recent = self._since(VELOCITY_S)
+        if recent is None:
+            return q, np.zeros_like(q)
+        (first_s, first), (last_s, last) = recent[0], recent[-1]
+        return q, (last - first) / (last_s - first_s)
+
+    def _since(self, span_s: float) -> list[tuple[float, Array]] | None:
+        """Readings of the last ``span_s``; None before there are enough."""
+        readings = list(self._readings)
+        if not readings or readings[-1][0] - readings[0][0] < span_s:
+            return None
+        first_s = readings[-1][0] - span_s
+        first = max(i for i, (at_s, _) in enumerate(readings) if at_s <= first_s)
+        return readings[first:]
