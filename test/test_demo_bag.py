@@ -12,6 +12,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import automatic_commands, feed, replay
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
@@ -121,10 +122,10 @@ def judge_shift(cell, script, tmp_path, bag: Path) -> list[Judged]:
     with history:
         look = ThermalSession(nominal, history, ThermalConfig(), "test")
         for message in messages:
-            feed(look, message, INPUTS)
+            feed(look, message, INPUTS, take_message)
         observed = look.desk.window(-1, 2**62, dict(look.desk.newest_ns))
         session = ThermalSession(nominal, history, ThermalConfig(), "test")
-        report = replay(session, messages, automatic_commands(observed), INPUTS)
+        report = replay(session, messages, automatic_commands(observed), INPUTS, take_message)
         models = [history.model(o.calibration_id) for o in report.outcomes[1:]]
     assert not session.desk.ignored
     assert [o.samples for o in report.outcomes] == [12] + [8] * 15

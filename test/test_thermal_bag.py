@@ -15,6 +15,7 @@ from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.point_clouds import cloud_points
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import replay
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
@@ -100,7 +101,7 @@ def outcomes(messages, tmp_path_factory) -> tuple[list[Outcome], list[dict[str, 
     with history:
         config = ThermalConfig(sigma_m=SIGMA_M, lateness_s=0.0)
         session = ThermalSession(nominal, history, config, "test")
-        found = replay(session, messages, commands, INPUTS).outcomes
+        found = replay(session, messages, commands, INPUTS, take_message).outcomes
         ids = [o.calibration_id for o in found]
         models = [history.model(i) if i else {} for i in ids]
     return found, models

@@ -14,7 +14,6 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.core.streams import JointStream
 from robocal_ros.core.tool.beam_edges import BeamError
 from robocal_ros.core.tool.edge_samples import EdgeSample
-from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.sessions import events
 from robocal_ros.sessions.bounds import reached
@@ -52,7 +51,7 @@ class ToolSession:
     ) -> None:
         self.nominal, self.config = nominal, config
         self._history = history
-        self._current = ToolInForce(history, nominal, KnownTool(config.T_flange_taught))
+        self._current = ToolInForce(history, nominal, config)
         self._results = ToolResults(nominal, history, config, software, self._current)
         self._laser = config.laser
         self.stream = JointStream(nominal.joint_names)

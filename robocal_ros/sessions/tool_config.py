@@ -1,5 +1,6 @@
 """Settings of the tool session."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -95,3 +96,9 @@ class ToolConfig:
 def rows_of(matrix: Array) -> Rows:
     """A matrix as plain rows."""
     return tuple(tuple(float(x) for x in row) for row in matrix)
+
+
+def made_with(config: ToolConfig) -> dict[str, Any]:
+    """What two measurements must share to be compared: taught tool, beams and station."""
+    document = {"taught": config.taught, "points_m": config.points_m, "station": config.station}
+    return {name: json.loads(json.dumps(value)) for name, value in document.items()}

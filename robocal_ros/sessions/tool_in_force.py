@@ -6,6 +6,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL, Decision, Head
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.history import History
+from robocal_ros.sessions.tool_config import ToolConfig, made_with
 
 
 class ToolInForce:
@@ -18,8 +19,9 @@ class ToolInForce:
     fault : why the history could not be read at the last look; empty when it could.
     """
 
-    def __init__(self, history: History, nominal: SerialArm, taught: KnownTool) -> None:
-        self._history, self._nominal, self._taught = history, nominal, taught
+    def __init__(self, history: History, nominal: SerialArm, config: ToolConfig) -> None:
+        self._history, self._nominal = history, nominal
+        self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
         self._version = history.data_version()
         decided = history.decisions()
         self._seen = decided[-1].seq if decided else 0
@@ -45,9 +47,11 @@ class ToolInForce:
 
     @property
     def measured_healthy(self) -> KnownTool | None:
-        """How the healthy tool was measured; None without."""
+        """How the healthy tool was measured; None without, or with another tool or station."""
         model = self.healthy.model
-        return None if model is None else KnownTool.of_document(model)
+        if model is None or model["made_with"] != self._made_with:
+            return None
+        return KnownTool.of_document(model)
 
     def look(self, own_wall_ns: int | None = None) -> list[Decision]:
         """Take over what was decided since the last look.

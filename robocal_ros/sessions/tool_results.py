@@ -14,11 +14,17 @@ from robocal_ros.core.proposals import HEALTHY_TOOL, TOOL, Proposal
 from robocal_ros.core.tool.change_documents import change_document, check_document
 from robocal_ros.core.tool.crossed_model import Held
 from robocal_ros.core.tool.documents import run_document
-from robocal_ros.core.tool.judging import KnownTool, change_between, changed_tool, judge_tool
+from robocal_ros.core.tool.judging import (
+    KnownTool,
+    change_between,
+    changed_tool,
+    judge_healthy,
+    judge_tool,
+)
 from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.tool_config import ToolConfig
+from robocal_ros.sessions.tool_config import ToolConfig, made_with
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_run import ToolRun
 
@@ -103,22 +109,20 @@ class ToolResults:
         return Outcome(command, verdict.code, verdict.reason, document, kept)
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
-        """Keep how the healthy tool measures; it moves nothing, and is in force at once."""
+        """Keep how the healthy tool measures; in force at once: by itself it moves nothing."""
         estimate = run.estimate(Held())
         found = KnownTool(estimate.T_flange_tool, estimate.covariance)
-        change = change_between(self._config.T_flange_taught, found.T_flange_tool)
-        words = (
-            f"the taught tool measures {change.tip_m * 1e3:.3f} mm and "
-            f"{np.degrees(change.axis_rad):.3f} deg off: later runs give the change against this"
-        )
-        verdict = Verdict(Code.ACCEPT, words)
-        document = run_document(found, estimate, run.circles, verdict) | {
-            "change": change_document(change)
-        }
+        taught = self._config.T_flange_taught
+        verdict = judge_healthy(found, estimate, taught)
+        document = run_document(found, estimate, run.circles, verdict)
+        document["change"] = change_document(change_between(taught, found.T_flange_tool))
         kept = self._keep(HEALTHY_TOOL, run, command, wall_ns, verdict, document, found)
-        by = str(command.arguments.get("by", ""))
-        self._history.accept(kept, by=by, reason=words, expected_head=None, wall_ns=wall_ns)
-        return Outcome(command, Code.ACCEPT, words, document, kept)
+        if verdict.accept:
+            by = str(command.arguments.get("by", ""))
+            self._history.accept(
+                kept, by=by, reason=verdict.reason, expected_head=None, wall_ns=wall_ns
+            )
+        return Outcome(command, verdict.code, verdict.reason, document, kept)
 
     def early(self, run: ToolRun, command: Command) -> Outcome | None:
         """The answer of a quick check whose circle says enough; None: go on."""
@@ -183,7 +187,8 @@ class ToolResults:
                 code=verdict.code,
                 reason=verdict.reason,
                 document=document,
-                model=found.document() | {"thermal_revision": run.thermal_revision},
+                model=found.document()
+                | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)},
                 inputs=run.arrays(),
             )
         )

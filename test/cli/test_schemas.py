@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 from campaign import ROBOT, measured, table
-from command import SCHEMAS, conforms, robocal, robocal_json
+from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
@@ -25,6 +25,7 @@ delta_a = [ 0.0001, 0.0003, -0.0001, 0.0002, 0, 0]
 delta_d = [ 0.0002, 0.0, 0.0, 0.0004, -0.0001, 0]
 delta_alpha = [ 0.0003, 0.0005, 0.0008, 0.0002, 0.0018, 0]
 """
+TOOL_BAG = str(ROOT / "bags" / "tool_runs.mcap")
 PLACE = ["thermal", "calibrate-sensor", "--robot", ROBOT]
 DRIFT = ["thermal", "identify", "--robot", ROBOT, "--sensor", "s.yaml", "--cold", "cold.csv"]
 SCREEN = ["thermal", "screen", *DRIFT[2:]]
@@ -64,6 +65,12 @@ CASES = {
         "replay.json",
         ["replay", "live.mcap"],
         ["replay", "live.mcap", "--robot", "ur10"],
+        (2, "WRONG_ROBOT"),
+    ),
+    "replay tool": (
+        "replay.tool.json",
+        ["replay", TOOL_BAG],
+        ["replay", TOOL_BAG, "--robot", "kr150_r3100"],
         (2, "WRONG_ROBOT"),
     ),
     "history list": (

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from beam_cell import make_cell
 
-from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.tool.beam_edges import (
     BeamEdge,
     BeamError,
     InputRule,
     debounced,
     edges_of,
-    latency_both_ways,
 )
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.sim.tool_cell import joints_at
@@ -65,27 +64,6 @@ def test_order_is_judged_within_a_beam():
         edges_of(edges(0.1, 0.2), "y", 2)
     with pytest.raises(BeamError, match="beam x has 2 edges, 4 are needed"):
         edges_of(edges(0.1, 0.2), "x", 4)
-
-
-def test_latency_cancels_between_both_ways():
-    velocity = np.array([0.05, -0.05, 0.05, -0.05])
-    rng, sigma = np.random.default_rng(1), 5e-4
-    found = []
-    for _ in range(500):
-        place = 0.7 + velocity * (0.013 + sigma * rng.standard_normal(4))
-        found.append(latency_both_ways(place, velocity, sigma))
-    latency, places = (np.array([getattr(f, k) for f in found]) for k in ("latency_s", "place_m"))
-    loose = 4.0 / np.sqrt(500.0)
-    assert latency.mean() == pytest.approx(0.013, abs=loose * found[0].sigma_s)
-    assert places.mean() == pytest.approx(0.7, abs=loose * found[0].place_sigma_m)
-    assert latency.std() == pytest.approx(found[0].sigma_s, rel=loose)
-    assert places.std() == pytest.approx(found[0].place_sigma_m, rel=loose)
-    assert found[0].sigma_s == pytest.approx(sigma / 2.0)
-
-
-def test_one_way_alone_does_not_tell_latency_from_place():
-    with pytest.raises(RankDeficientError, match="pass the beam in the other direction too"):
-        latency_both_ways([0.1, 0.1], [0.05, 0.05], 1e-4)
 
 
 def circle(rate_hz: float) -> tuple[JointPath, np.ndarray, np.ndarray]:

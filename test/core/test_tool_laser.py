@@ -87,7 +87,6 @@ def test_a_cylinder_of_known_radius_gives_the_beams_reach(light):
     beams = tuple(
         TrueBeam(b.start, b.end, 8e-4, light, light)
         for b in beams_of(T_BASE_LASER, BETA_RAD, GAP_M)
-        for b in beams_of(T_BASE_LASER, BETA_RAD, GAP_M)
     )
     station = BeamStation(beams, PERFECT, NO_NOISE)
     points = laser_points(station, T_BASE_LASER, np.random.default_rng(0))

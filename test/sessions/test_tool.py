@@ -11,10 +11,11 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge
+from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
 from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_config import ToolConfig
+from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sim.beams import RoundTool, bent
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -249,3 +250,44 @@ def test_a_clock_that_jumps_back_ends_the_run(history):
 def test_settings_survive_json():
     config = config_of(noisy_cell(), station="north")
     assert ToolConfig.of_document(json.loads(json.dumps(config.document()))) == config
+
+
+def test_a_reference_of_another_tool_counts_for_nothing(history):
+    """Two tools of one robot: the change against one says nothing about the other."""
+    first = driver_of(history, TAUGHT)
+    assert first.measure("reference").done
+    second = bent(TAUGHT, [0.004, 0.0, 0.006], [0.0, 0.0, 0.0])
+    driver = driver_of(history, second, taught=rows_of(second))
+    outcome = driver.measure()
+    assert outcome.document["absolute"] is True
+    found = KnownTool.of_document(history.model(outcome.calibration_id))
+    away = found.T_flange_tool[:3, 3] - second[:3, 3]
+    assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3
+
+
+def test_a_bent_tool_is_no_healthy_one(history):
+    driver = driver_of(history, bent(TAUGHT, [0.008, 0.0, 0.0], [0.0, 0.1, 0.0]))
+    outcome = driver.measure("reference")
+    assert outcome.status is Code.LIMIT_EXCEEDED
+    assert driver.session.current.measured_healthy is None
+
+
+def test_one_edge_from_the_future_blinds_no_beam(history):
+    driver = driver_of(history)
+    driver.rest(0.1)
+    late = driver.program.ns(3600.0)
+    with pytest.raises(InputError, match="ahead of the joint states"):
+        driver.session.add(EdgeSample(late, "", "x", True, 1e-4))
+    assert driver.measure().done
+
+
+def test_a_program_that_never_rests_ends_the_run(history):
+    driver = driver_of(history, step_timeout_s=4.0)
+    driver.rest(0.1)
+    driver.command(Command("measure_tool", {"mode": "full"}))
+    step = driver.session.awaited
+    while driver.session.run is not None:
+        circle = driver.program.drive(step)
+        driver.play([s for s in circle if s.stamp_ns < circle[-1].stamp_ns - 500_000_000])
+        assert driver.program.now_s < 60.0
+    assert "rest after each step" in driver.outcomes[-1].message

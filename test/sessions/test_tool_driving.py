@@ -17,6 +17,7 @@ from robocal_ros.sessions.events import MEASURE_TOOL, Command
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 from robocal_ros.sim.beams import RoundTool, bent
+from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.tool_cell import joints_at
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -40,7 +41,8 @@ class Robot:
         above[:3, 3] += 0.08 * self.cell.up
         self.q = joints_at(arm, above[None], self.cell.q_near)[0]
         self.now_s = 0.0
-        self.plan: JointPlan | None = None
+        self.motion = JointMotion(self.q)
+        self.coming: list[tuple[float, JointPlan]] = []
         self.sent: list[tuple[float, JointPlan]] = []
         self.outcomes = []
         self.edges: list[EdgeSample] = []
@@ -49,16 +51,18 @@ class Robot:
         self.offset = np.zeros(arm.n)
 
     def send(self, plan: JointPlan) -> None:
+        """The controller gets it with a lag, and goes on from where it is and moves by then."""
         self.sent.append((self.now_s, plan))
-        assert plan.q[0] == pytest.approx(self.q, abs=0.02)  # continuous: no jump is commanded
-        self.plan, self.start_s = plan, self.now_s + LAG_S
-        fk = self.cell.arm.fk
+        self.coming.append((self.now_s + LAG_S, plan))
+
+    def receive(self, at_s: float, plan: JointPlan) -> None:
+        self.motion.follow(at_s, plan.time_s + at_s, plan.q, plan.qd)
+        fk, end_s = self.cell.arm.fk, at_s + plan.duration_s
         moved = self.cell.station.edges(
-            self.tool, lambda t: fk(plan.at(t)[0]), (0.0, plan.duration_s), self.rng
+            self.tool, lambda t: fk(self.motion.at(t)[0]), (at_s, end_s), self.rng
         )
         self.edges = [
-            EdgeSample(self.ns(e.time_s + self.start_s), "", e.beam, e.blocked, e.sigma_s)
-            for e in moved
+            EdgeSample(self.ns(e.time_s), "", e.beam, e.blocked, e.sigma_s) for e in moved
         ]
 
     def ask(self, command: Command) -> None:
@@ -85,8 +89,9 @@ class Robot:
 
     def step(self) -> None:
         self.now_s += PERIOD_S
-        if self.plan is not None:
-            self.q = self.plan.at(self.now_s - self.start_s)[0]
+        while self.coming and self.coming[0][0] <= self.now_s:
+            self.receive(*self.coming.pop(0))
+        self.q = self.motion.at([self.now_s])[0][0]
         self.path.append(self.q.copy())
         while self.edges and self.edges[0].stamp_ns <= self.ns(self.now_s):
             self.driver.beam(self.edges[0].blocked)
@@ -166,16 +171,32 @@ def test_it_disarms_itself_after_a_while(robot):
     assert "no run within 60 s" in robot.driver.told
 
 
-def stopped(robot, words):
+def stopped(robot, words, *, follows=True):
     """The robot was sent a stop, stands still within its time, and the run has ended."""
     at_s, plan = robot.sent[-1]
-    assert plan.duration_s <= 0.2  # 1 rad/s by 10 rad/s^2 at the most
+    assert plan.duration_s <= 0.13  # 1 rad/s by 10 rad/s^2, or the shortest stop
+    if follows:
+        slows_down(robot, at_s, plan)
     assert np.all(plan.qd[-1] == 0.0)
     assert robot.now_s > at_s + plan.duration_s + LAG_S + 0.1
     assert robot.stands_still(at_s + plan.duration_s + LAG_S + PERIOD_S)
     assert not robot.driver.armed
     assert words in robot.driver.told
     assert robot.session.run is None
+
+
+def slows_down(robot, at_s, plan):
+    """No joint is thrown back, and none decelerates by more than three times an even stop.
+
+    A cubic's peak is 1.5 times its mean; the lag of the controller does the rest.
+    """
+    path = np.array(robot.path)
+    rate = np.diff(path, axis=0) / PERIOD_S
+    first = round(at_s / PERIOD_S)
+    before, after = rate[first - 2], rate[first : first + 25]
+    assert np.all(after * np.sign(before) > -0.05 * np.max(np.abs(before)))
+    hardest = np.max(np.abs(np.diff(rate[first - 2 : first + 25], axis=0))) / PERIOD_S
+    assert hardest < 3.0 * np.max(np.abs(before)) / plan.duration_s
 
 
 def driving(robot, phase, for_s=0.4):
@@ -209,7 +230,7 @@ def test_a_deviation_from_the_plan_stops_it(robot):
     driving(robot, Phase.MEASURE)
     robot.offset[4] = np.radians(1.0)
     robot.run(0.5)
-    stopped(robot, "deg away from its plan")
+    stopped(robot, "deg away from its plan", follows=False)  # its readings are not where it is
 
 
 def test_a_cancel_stops_it(robot):
@@ -230,7 +251,7 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
     robot = Robot(history)
     beside = robot.cell.pose(TAUGHT, 0.0)
     beside[:3, 3] += [0.1, 0.0, 0.0]
-    robot.q = joints_at(robot.cell.arm, beside[None], robot.cell.q_near)[0]
+    robot.motion = JointMotion(joints_at(robot.cell.arm, beside[None], robot.cell.q_near)[0])
     robot.run(0.4)
     robot.driver.arm(robot.now_s)
     robot.measure()
@@ -248,3 +269,39 @@ def test_a_tool_bent_beyond_the_circle_stops_the_run(history):
     robot.run(30.0, until=lambda: not robot.driver.armed)
     assert robot.outcomes[-1].status is Code.BEAM_EDGES_WRONG
     assert robot.session.run is None
+
+
+def test_a_disarmed_run_does_not_wait_to_be_armed_again(robot):
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.driver.disarm("disarmed by the operator", robot.now_s)
+    assert robot.session.run is None
+    robot.ask(Command(MEASURE_TOOL, {"mode": "full"}))
+    with pytest.raises(ConflictError, match="a run is open"):
+        robot.driver.arm(robot.now_s)
+
+
+def test_a_robot_that_somebody_jogs_is_not_taken_over(robot):
+    robot.driver.arm(robot.now_s)
+    q, until = robot.q, robot.now_s + 1.0
+    robot.motion.follow(robot.now_s, [until - 0.5, until], np.array([q + 0.02, q]))
+    robot.run(0.7)
+    with pytest.raises(ConflictError, match="the robot moves"):
+        robot.measure()
+
+
+def test_an_armed_robot_that_falls_silent_is_disarmed(robot):
+    robot.driver.arm(robot.now_s)
+    robot.silent = True
+    robot.run(1.5)
+    assert not robot.driver.armed
+
+
+def test_a_clock_that_jumps_back_still_ends_in_a_stop_that_slows_down(robot):
+    driving(robot, Phase.MEASURE)
+    q = robot.q + robot.offset
+    robot.driver.reading(robot.now_s - 3600.0, q, robot.now_s)
+    robot.driver.disarm("the clock jumped", robot.now_s)
+    at_s, plan = robot.sent[-1]
+    assert at_s == robot.now_s
+    assert np.max(np.abs(plan.qd[0])) > 0.01  # as it moves, not at rest

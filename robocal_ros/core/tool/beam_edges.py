@@ -10,10 +10,10 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, RankDeficientError, RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
 
 Array = NDArray[np.float64]
 Beam = Literal["x", "y"]
@@ -137,41 +137,3 @@ def edges_of(edges: Sequence[BeamEdge], beam: Beam, fewest: int) -> list[BeamEdg
             "circle or too thick for it, or the motion was cut short; enlarge the circle"
         )
     return own
-
-
-@dataclass(frozen=True)
-class Latency:
-    """Delay of an input behind the robot's readings, and the place where the edge really is."""
-
-    latency_s: float
-    sigma_s: float
-    place_m: float
-    place_sigma_m: float
-
-
-def latency_both_ways(place_m: ArrayLike, velocity_m_s: ArrayLike, sigma_s: float) -> Latency:
-    """Delay of an input from passages of one edge at different velocities, best back and forth.
-
-    ``place_m`` (m,): the robot's reading along its motion at the stamp; there it is late by
-    velocity times latency, ``place = true place + velocity * latency``. With equal speeds back and
-    forth the mean of the places is free of the latency, whatever it is.
-
-    Raises
-    ------
-    RankDeficientError
-        When all passages have the same velocity.
-    """
-    place = np.asarray(place_m, dtype=np.float64)
-    speed = np.asarray(velocity_m_s, dtype=np.float64)
-    if np.ptp(speed) <= 1e-3 * np.max(np.abs(speed), initial=0.0):
-        raise RankDeficientError(
-            "all passages have one velocity: place and latency cannot be told apart; pass the beam "
-            "in the other direction too",
-            ("latency",),
-        )
-    A = np.column_stack([speed, np.ones_like(speed)])
-    weight = 1.0 / (sigma_s * np.maximum(np.abs(speed), 1e-3 * np.max(np.abs(speed))))
-    C = np.linalg.inv((A * weight[:, None] ** 2).T @ A)
-    latency, middle = C @ (A.T @ (weight**2 * place))
-    sigma = np.sqrt(np.diag(C))
-    return Latency(float(latency), float(sigma[0]), float(middle), float(sigma[1]))

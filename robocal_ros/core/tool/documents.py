@@ -47,7 +47,7 @@ def circle_document(fit: CircleFit) -> Document:
         "sigma_mm": None if sigma is None else sigma.tolist(),
         "tool_radius_mm": rho,
         "latency_s": fit.latency_s,
-        "misfit_mm": fit.misfit_m * 1e3,
+        "misfit_mm": None if sigma is None else fit.misfit_m * 1e3,
         "verdict": verdict_document(Verdict(Code.ACCEPT, words)),
     }
 

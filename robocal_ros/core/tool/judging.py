@@ -16,6 +16,7 @@ from robocal_ros.core.tool.tool_axis import minimal_rotation
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
+HEALTHY_M, HEALTHY_RAD = 3e-3, float(np.radians(1.5))  # of a measured healthy tool from the taught
 UNCHANGED = 0.95  # a difference below this quantile of its noise is none
 
 
@@ -84,6 +85,28 @@ def changed_tool(taught: Array, healthy: KnownTool, measured: KnownTool) -> Know
     known = [c for c in both if c is not None]
     covariance = np.sum(known, axis=0) if len(known) == len(both) else None
     return KnownTool(frames.transform(turn @ taught[:3, :3], tip), covariance)
+
+
+def judge_healthy(found: KnownTool, estimate: ToolEstimate, taught: Array) -> Verdict:
+    """Whether a tool measures as a healthy one does: known well, and near the taught one.
+
+    Between them lie the robot's absolute error and the laser frame's, no bump.
+    """
+    run = judge_run(estimate, ToolLimits())
+    off = change_between(taught, found.T_flange_tool)
+    what = (
+        f"the taught tool measures {off.tip_m * 1e3:.3f} mm and {np.degrees(off.axis_rad):.3f} deg "
+        f"off; {run.reason}"
+    )
+    if not run.accept:
+        return Verdict(run.code, what)
+    if off.tip_m > HEALTHY_M or off.axis_rad > HEALTHY_RAD:
+        return Verdict(
+            Code.LIMIT_EXCEEDED,
+            f"{what}; allowed {HEALTHY_M * 1e3:.0f} mm and {np.degrees(HEALTHY_RAD):.0f} deg: is "
+            "the tool bent, or taught wrongly?",
+        )
+    return Verdict(Code.ACCEPT, f"{what}: later runs give the change against this")
 
 
 def judge_run(estimate: ToolEstimate, limits: ToolLimits) -> Verdict:

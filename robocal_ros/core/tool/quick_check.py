@@ -129,7 +129,10 @@ def _compared(
     size = float(np.linalg.norm(deviation))
     along = deviation / size if size > 0.0 else np.array([1.0, 0.0, 0.0])
     sigma = float(np.sqrt(along @ covariance @ along))
-    answer, reason = _answer(size, sigma, rule)
+    # Noise across the deviation makes it look longer.
+    across = max(float(np.trace(ways @ covariance @ ways)) - sigma**2, 0.0)
+    likely = float(np.sqrt(max(size**2 - across, 0.0)))
+    answer, reason = _answer(size, likely, sigma, rule)
     return QuickCheck(
         answer=answer,
         reason=reason,
@@ -142,10 +145,10 @@ def _compared(
     )
 
 
-def _answer(size: float, sigma: float, rule: CheckRule) -> tuple[Answer, str]:
+def _answer(size: float, likely: float, sigma: float, rule: CheckRule) -> tuple[Answer, str]:
     from scipy.special import ndtr
 
-    below = float(ndtr((size - rule.limit_m) / sigma))
+    below = float(ndtr((likely - rule.limit_m) / sigma))
     what = (
         f"the tip is {size * 1e3:.3f} mm from the stored one (sigma {sigma * 1e3:.3f} mm, allowed "
         f"{rule.limit_m * 1e3:.3f} mm)"
