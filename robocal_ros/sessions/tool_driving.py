@@ -89,7 +89,7 @@ class ToolDriver:
         Raises
         ------
         ConflictError
-            While joint states are missing, a run is open, or a motion is not over yet.
+            While joint states are missing, a run is open, or the robot moves.
         """
         if self._robot.silent_s > self._config.silence_s:
             raise ConflictError("joint states are missing: nothing can be armed without them")
@@ -97,6 +97,8 @@ class ToolDriver:
             raise ConflictError(f"the robot is {self.phase.value}: arm it when it stands")
         if self._session.run is not None:
             raise ConflictError("a run is open: cancel it, then arm, then measure")
+        if self._resting(STANDS_S) is None:
+            raise ConflictError("the robot moves: arm it when it stands")
         self.armed, self._armed_at_s, self.told = True, now_s, ""
 
     def disarm(self, reason: str, now_s: float) -> None:

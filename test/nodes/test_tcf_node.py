@@ -1,5 +1,6 @@
 """tcf_node over DDS: a simulated robot drives what the node announces."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,39 @@ def test_a_run_is_cancelled(graph: Any, cell: LiveCell) -> None:
     assert cell.measure().success
 
 
+def test_a_second_goal_takes_nothing_from_the_first(graph: Any, cell: LiveCell) -> None:
+    first = cell.begin()
+    ended = first.get_result_async()
+    graph.spin_until(lambda: cell.steps[-1].name == "low", "the first step")
+    second = cell.begin().get_result_async()
+    graph.spin_until(second.done, "the second is refused")
+    assert second.result().result.status == Code.CONFLICT
+    assert "run 1 is open" in second.result().result.message
+    cancelled = first.cancel_goal_async()
+    graph.spin_until(cancelled.done, "the cancel is answered")
+    assert len(cancelled.result().goals_canceling) == 1
+    graph.spin_until(ended.done, "the first one's result")
+
+
+def test_nothing_of_an_old_run_is_told_while_a_new_one_is_open(graph: Any, tmp_path: Any) -> None:
+    cell = LiveCell(graph, tmp_path, TRUTH, joint_silence_s=10.0)
+    first = cell.measure()
+    assert graph.call(Trigger, "/tcf_node/result_trigger").success
+    assert not graph.call(Trigger, "/tcf_node/cancel_trigger").success
+    kept = graph.call(Trigger, "/tcf_node/result_trigger")
+    assert kept.message == f"{first.candidate_id} ACCEPT {first.message}"
+    cell.begin()
+    told = graph.call(Trigger, "/tcf_node/result_trigger")
+    assert (told.success, told.message) == (False, "0 CONFLICT run 2 is open")
+
+
+def test_a_tool_too_thick_or_lying_in_the_beams_is_refused(graph: Any, cell: LiveCell) -> None:
+    cell.program.tool = RoundTool.cylinder(TRUTH, 0.013)
+    thick = cell.measure()
+    assert not thick.success
+    assert "too thick" in thick.message or "never broken" in thick.message
+
+
 def test_the_answer_of_a_cycle_is_given_again(graph: Any, cell: LiveCell) -> None:
     first = cell.measure(FULL, "gap-1")
     again = cell.measure(FULL, "gap-1")
@@ -110,8 +144,36 @@ def lost(step: Any, edges: list) -> list:
     return edges[:-1]
 
 
-def test_edges_that_are_lost_end_the_run(graph: Any, cell: LiveCell) -> None:
-    for edit, words in ((dead, "beam y was never broken"), (lost, "edges")):
+def ninth(step: Any, edges: list) -> list:
+    e = edges[3]
+    return [*edges, replace(e, blocked=not e.blocked, time_s=e.time_s + 0.02)]
+
+
+def chatter(step: Any, edges: list) -> list:
+    e = edges[3]
+    return edges + [
+        replace(e, blocked=e.blocked ^ (i % 2 == 0), time_s=e.time_s + 1e-4 * (i + 1))
+        for i in range(9)
+    ]
+
+
+def swapped(step: Any, edges: list) -> list:
+    """Break and restore of one passage in the wrong order."""
+    own = [e for e in edges if e.beam == "x"]
+    return [replace(e, blocked=not e.blocked) if e in own[:2] else e for e in edges]
+
+
+WRONG = {
+    dead: "beam y was never broken",
+    lost: "has 3 edges",
+    ninth: "twice",
+    chatter: "chatters",
+    swapped: "twice",
+}
+
+
+def test_wrong_edges_end_the_run_in_their_words(graph: Any, cell: LiveCell) -> None:
+    for edit, words in WRONG.items():
         cell.program.edit = edit
         result = cell.measure()
         assert result.status == Code.BEAM_EDGES_WRONG
