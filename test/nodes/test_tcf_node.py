@@ -14,7 +14,9 @@ from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
 from tool_driver import TAUGHT, TRUTH
 
+from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
+from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.sim.beams import RoundTool, bent
 
@@ -22,8 +24,6 @@ FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
 
 
 def matrix(transform: Any) -> np.ndarray:
-    from robocal_ros.core import frames
-
     t, r = transform.translation, transform.rotation
     return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
 
@@ -122,11 +122,44 @@ def test_nothing_of_an_old_run_is_told_while_a_new_one_is_open(graph: Any, tmp_p
     assert (told.success, told.message) == (False, "0 CONFLICT run 2 is open")
 
 
-def test_a_tool_too_thick_or_lying_in_the_beams_is_refused(graph: Any, cell: LiveCell) -> None:
+def test_a_tool_too_thick_for_the_circle_is_refused(graph: Any, cell: LiveCell) -> None:
+    """It reaches further than the circle: its shadows run into one another."""
     cell.program.tool = RoundTool.cylinder(TRUTH, 0.013)
     thick = cell.measure()
-    assert not thick.success
-    assert "too thick" in thick.message or "never broken" in thick.message
+    assert thick.status == Code.BEAM_EDGES_WRONG
+    assert "never broken" in thick.message or "too thick" in thick.message
+
+
+def test_an_axis_nearly_in_the_beam_plane_is_refused(graph: Any, cell: LiveCell) -> None:
+    """A program that does not turn the flange as announced, by 50 degrees about the crossing."""
+    drive, laser = cell.program.drive, cell.cell.laser.T_base_laser
+    lean = laser @ frames.transform(frames.exp_rotation([np.radians(50.0), 0, 0]), np.zeros(3))
+    lean = lean @ frames.invert(laser)
+    cell.program.drive = lambda step: drive(replace(step, T_base_flange=lean @ step.T_base_flange))
+    result = cell.measure()
+    assert result.status == Code.RANK_DEFICIENT
+    assert "turn the flange until the tool stands upright" in result.message
+
+
+def test_joint_readings_too_far_apart_are_refused(graph: Any, cell: LiveCell) -> None:
+    """Readings 64 ms apart do not tell where the flange was at an edge between them."""
+    cell.rest(0.5)
+    play, kept = cell.play, [0]
+
+    def sparse(samples: list) -> None:
+        chosen = []
+        for sample in samples:
+            if isinstance(sample, JointSample) and sample.stamp_ns < kept[0] + 60_000_000:
+                continue
+            if isinstance(sample, JointSample):
+                kept[0] = sample.stamp_ns
+            chosen.append(sample)
+        play(chosen)
+
+    cell.play = sparse
+    result = cell.measure()
+    assert result.status == Code.BAD_INPUT
+    assert "raise the rate of joint_states" in result.message
 
 
 def test_the_answer_of_a_cycle_is_given_again(graph: Any, cell: LiveCell) -> None:
