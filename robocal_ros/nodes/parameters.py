@@ -121,6 +121,11 @@ def _typed(value: object, like: Value) -> Value | None:
     return value if type(value) is type(like) else None
 
 
+def length(name: str, default: float, what: str, low: float, high: float) -> Setting:
+    """A length in mm."""
+    return Setting(name, default, what, unit="mm", low=low, high=high)
+
+
 class ParameterTable:
     """The declared parameters of one node.
 

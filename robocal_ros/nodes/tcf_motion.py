@@ -17,7 +17,7 @@ from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
-from robocal_ros.nodes.parameters import Setting
+from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.tool import ToolSession
@@ -25,10 +25,6 @@ from robocal_ros.sessions.tool_driving import ToolDriver
 
 TICK_S = 0.01
 NS = 1_000_000_000
-
-
-def _length(name: str, default: float, what: str, low: float, high: float) -> Setting:
-    return Setting(name, default, what, unit="mm", low=low, high=high)
 
 
 def _of_joints(name: str, default: float, what: str, unit: str) -> Setting:
@@ -49,15 +45,15 @@ SETTINGS = (
         low=1.0,
         high=10000.0,
     ),
-    _length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
-    _length("opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3),
-    _length("housing_top_mm", 30.0, "Height of the housing above the beams", 0.0, 1e3),
-    _length("housing_depth_mm", 120.0, "Depth of the opening below the beams", 1.0, 1e3),
-    _length("retract_mm", 50.0, "Height of the tip above the beams on its way", 1.0, 2e3),
-    _length("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
-    _length("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
-    _length("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
-    _length("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
+    length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
+    length("opening_radius_mm", 60.0, "Opening of the housing about the crossing", 5.0, 1e3),
+    length("housing_top_mm", 30.0, "Height of the housing above the beams", 0.0, 1e3),
+    length("housing_depth_mm", 120.0, "Depth of the opening below the beams", 1.0, 1e3),
+    length("retract_mm", 50.0, "Height of the tip above the beams on its way", 1.0, 2e3),
+    length("tool_length_mm", 100.0, "Length of the tool along its axis", 1.0, 2e3),
+    length("tool_radius_mm", 10.0, "Its radius, with the largest bend to be found", 0.5, 500.0),
+    length("flange_radius_mm", 60.0, "Of a ball about the flange", 1.0, 1e3),
+    length("deviation_mm", 2.0, "The tip so far from its plan stops the robot", 0.05, 50.0),
     Setting(
         "deviation_deg",
         0.5,

@@ -15,22 +15,18 @@ from robocal_ros.core.tool.judging import ToolLimits
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
-from robocal_ros.nodes.parameters import Setting
+from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 
 ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 PROGRAM, TRAJECTORY = "program", "trajectory"
 
 
-def _length(name: str, default: float, what: str, low: float, high: float) -> Setting:
-    return Setting(name, default, what, unit="mm", low=low, high=high)
-
-
 def _speed(name: str, default: float, what: str, high: float) -> Setting:
     return Setting(name, default, what, unit="mm/s", low=0.1, high=high)
 
 
-def _length_fault(length: int) -> Callable[[list[float]], str | None]:
+def _count_fault(length: int) -> Callable[[list[float]], str | None]:
     return lambda values: None if len(values) == length else f"{length} numbers are wanted"
 
 
@@ -44,7 +40,7 @@ SETTINGS = (
         unit="mm",
         low=-5000.0,
         high=5000.0,
-        check=_length_fault(3),
+        check=_count_fault(3),
     ),
     Setting(
         "taught_quat_xyzw",
@@ -52,7 +48,7 @@ SETTINGS = (
         "Its orientation: z from flange to tip",
         low=-1.0,
         high=1.0,
-        check=_length_fault(4),
+        check=_count_fault(4),
     ),
     Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
     Setting("base_frame", "base", "Name of the robot's base frame"),
@@ -82,21 +78,21 @@ SETTINGS = (
         low=0.0,
         high=20.0,
     ),
-    _length("repeatability_mm", 0.03, "Scatter of a motion in each axis", 0.0, 2.0),
-    _length("edge_noise_mm", 0.01, "Further scatter of the robot at each edge", 0.0, 2.0),
-    _length(
+    length("repeatability_mm", 0.03, "Scatter of a motion in each axis", 0.0, 2.0),
+    length("edge_noise_mm", 0.01, "Further scatter of the robot at each edge", 0.0, 2.0),
+    length(
         "circle_radius_mm", 12.0, "Radius of the circles; wider than the largest bend", 2.0, 100.0
     ),
     _speed("circle_speed_mm_s", 50.0, "Speed on the circles", 250.0),
-    _length("circle_height_mm", 50.0, "Between both circles that give the axis", 5.0, 300.0),
-    _length(
+    length("circle_height_mm", 50.0, "Between both circles that give the axis", 5.0, 300.0),
+    length(
         "above_tip_mm",
         5.0,
         "Height above the tip at which the lower circles are driven",
         0.5,
         100.0,
     ),
-    _length("plunge_depth_mm", 7.0, "Depth of a plunge, half of it below the beams", 1.0, 50.0),
+    length("plunge_depth_mm", 7.0, "Depth of a plunge, half of it below the beams", 1.0, 50.0),
     _speed("plunge_speed_mm_s", 10.0, "Speed of a plunge", 50.0),
     Setting(
         "spin_deg",
@@ -113,10 +109,10 @@ SETTINGS = (
         low=-2.0,
         high=2.0,
     ),
-    _length("quick_limit_mm", 0.2, "Deviation of the tip that a quick check passes", 0.01, 10.0),
-    _length("lever_mm", 150.0, "From where a bent tool bends to its tip", 1.0, 2000.0),
-    _length("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
-    _length("change_limit_mm", 15.0, "Largest change of the tip from the taught one", 0.1, 100.0),
+    length("quick_limit_mm", 0.2, "Deviation of the tip that a quick check passes", 0.01, 10.0),
+    length("lever_mm", 150.0, "From where a bent tool bends to its tip", 1.0, 2000.0),
+    length("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
+    length("change_limit_mm", 15.0, "Largest change of the tip from the taught one", 0.1, 100.0),
     Setting("tilt_limit_deg", 10.0, "Largest change of the axis", unit="deg", low=0.1, high=45.0),
     Setting(
         "step_timeout_s",

@@ -8,12 +8,15 @@ import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
+from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sim.beams import RoundTool, bent
@@ -291,3 +294,19 @@ def test_a_program_that_never_rests_ends_the_run(history):
         driver.play([s for s in circle if s.stamp_ns < circle[-1].stamp_ns - 500_000_000])
         assert driver.program.now_s < 60.0
     assert "rest after each step" in driver.outcomes[-1].message
+
+
+def test_flange_poses_come_from_the_thermal_model_in_force(history):
+    """A robot that has drifted by 0.5 mm: with its accepted model the tool is found."""
+    cell = noisy_cell()
+    nominal = cell.arm
+    drifted = nominal.with_mdh(nominal.mdh + np.array([5e-4, 0.0, 5e-4, 0.0, 0.0]))
+    bring_into_force(history, THERMAL, nominal, model_document(drifted), "test")
+    driver = driver_of(history, TRUTH, replace(cell, arm=drifted))
+    driver.session = ToolSession(nominal, history, config_of(cell), "test")
+    outcome = driver.measure()
+    model = history.model(outcome.calibration_id)
+    assert model["thermal_revision"] == 1
+    found = KnownTool.of_document(model)
+    away = found.T_flange_tool[:3, 3] - TRUTH[:3, 3]
+    assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3
