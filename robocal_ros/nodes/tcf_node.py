@@ -215,10 +215,13 @@ class TcfNode(HouseNode):
         self._last = outcome
         if self._motion is not None:
             self._motion.run_ended(outcome)
-        if outcome.calibration_id and self._history is not None:
-            model = self._history.model(outcome.calibration_id)
-            self._outputs.candidate(model, outcome.command.stamp_ns or 0)
-        self._outputs.quality(outcome)
+        try:
+            if outcome.calibration_id and self._history is not None:
+                model = self._history.model(outcome.calibration_id)
+                self._outputs.candidate(model, outcome.command.stamp_ns or 0)
+            self._outputs.quality(outcome)
+        except RobocalError as error:  # the caller is answered all the same
+            self.get_logger().error(f"the run has ended but was not published: {error}")
         if not self._run_end.done():
             self._run_end.set_result(outcome)
 
