@@ -1,10 +1,11 @@
 """Commands to a session and what came of them: the record that replay obeys."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError, RobocalError
 
 CONFIGURE = "configure"
 CALIBRATE_SENSOR = "calibrate_sensor"
@@ -71,3 +72,15 @@ class Outcome:
     def done(self) -> bool:
         """Whether the command did what was asked."""
         return self.status is Code.ACCEPT
+
+
+def carried_out(
+    handlers: Mapping[str, Callable[[Command, int], Outcome]], command: Command, wall_ns: int
+) -> Outcome:
+    """What the command's handler makes of it; what it refuses is its outcome."""
+    try:
+        if command.name not in handlers:
+            raise InputError(f"unknown command '{command.name}'; known: {', '.join(handlers)}")
+        return handlers[command.name](command, wall_ns)
+    except RobocalError as error:
+        return Outcome(command, error.code, str(error))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StorageError
+from robocal_ros.core.errors import ConflictError, RobocalError, StorageError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
 from robocal_ros.core.samples import (
@@ -192,12 +192,7 @@ class ThermalSession:
             events.REJECT: self._decide,
             events.ROLLBACK: self._decide,
         }
-        try:
-            if command.name not in handlers:
-                raise InputError(f"unknown command '{command.name}'; known: {', '.join(handlers)}")
-            return handlers[command.name](command, wall_ns)
-        except RobocalError as error:
-            return Outcome(command, error.code, str(error))
+        return events.carried_out(handlers, command, wall_ns)
 
     def _calibrate_sensor(self, command: Command, wall_ns: int) -> Outcome:
         """Place the sensor; the samples stay, for the cold reference."""

@@ -209,12 +209,7 @@ class ToolSession:
             events.REJECT: self._decide,
             events.ROLLBACK: self._decide,
         }
-        try:
-            if command.name not in handlers:
-                raise InputError(f"unknown command '{command.name}'; known: {', '.join(handlers)}")
-            return handlers[command.name](command, wall_ns)
-        except RobocalError as error:
-            return Outcome(command, error.code, str(error))
+        return events.carried_out(handlers, command, wall_ns)
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
         return decide(self._history, command, self.in_force.revision, wall_ns, TOOL)
