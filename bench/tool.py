@@ -326,7 +326,7 @@ def check_table(runs: int = 120) -> Table:
         wrong = max(wrong, share["recalibrate"] if moved <= 1.0 else 0.0)
         goal = Goal(wrong, 5.0 + 400.0 * float(np.sqrt(0.05 * 0.95 / runs)))
         table.add(f"{moved * limit * 1e3:.2f}", *share.values(), goal)
-    table.add("motion, s", None, None, None, Goal(duration, 4.0))
+    table.add("motion, s", duration, None, None, Goal(duration, 4.0))
     return table
 
 
