@@ -1,0 +1,1 @@
+"""Where a sensor sits on the robot: line-laser profile sensors and cameras."""

@@ -1,0 +1,115 @@
+"""The outcome of a hand-eye calibration, whatever the target: pose, covariance, what it rests on."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.documents import transform_document, verdict_document
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+Method = Literal["best", "classic"]
+TargetKind = Literal["sphere", "step", "line", "tracker", "camera", "joint"]
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeResult:
+    """Where a sensor sits.
+
+    Attributes
+    ----------
+    kind, method : of the target and of the estimator.
+    T_flange_sensor : (4, 4), m. For a sensor that does not move (eye-to-hand) ``parent`` is "base"
+        and this is T_base_sensor.
+    covariance : (6, 6) of the increment (v, w), m and rad, in the sensor frame: the true pose is
+        ``T_flange_sensor @ [[exp(w), v], [0, 1]]``; None where the method tells none.
+    samples : names (n,) of the samples used; ``residual_m`` (n,) their distances, and
+        ``residual_rad`` (n,) their angles where the target has any.
+    leave_one_out_m : (n,) distance of each sample from the solution without it; None where too few
+        samples remain to solve without one.
+    rejected : name of each sample not used, with the reason.
+    target : what was found of the target, as a document (``center_mm``, ``line`` …).
+    working_error_m : rms error to expect of a point at the working distance; None if not known.
+    more : further entries of the document, such as ``point_residual_mm``.
+    """
+
+    kind: TargetKind
+    method: Method
+    T_flange_sensor: Array
+    covariance: Array | None
+    samples: tuple[str, ...]
+    residual_m: Array
+    verdict: Verdict
+    residual_rad: Array | None = None
+    leave_one_out_m: Array | None = None
+    rejected: Mapping[str, str] = field(default_factory=dict)
+    unobservable: tuple[str, ...] = ()
+    target: Document = field(default_factory=dict)
+    working_error_m: float | None = None
+    more: Document = field(default_factory=dict)
+    parent: Literal["flange", "base"] = "flange"
+
+
+def point_covariance(result: HandEyeResult, points: Array) -> Array:
+    """Covariance (n, 3, 3), m^2, sensor axes, of sensor points (n, 3) once they are in the flange.
+
+    Raises
+    ------
+    ValueError
+        When the method tells no covariance.
+    """
+    if result.covariance is None:
+        raise ValueError("a method without a covariance")
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
+    return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
+
+
+def hand_eye_document(result: HandEyeResult) -> Document:
+    """The document of ``robocal hand-eye`` and of the history, in the units people read."""
+    return {
+        "kind": result.kind,
+        "method": result.method,
+        f"T_{result.parent}_sensor": transform_document(result.T_flange_sensor),
+        "sigma": _sigma_document(result.covariance),
+        "covariance": None if result.covariance is None else result.covariance.tolist(),
+        "target": result.target,
+        "residual_mm": _residual_document(result.samples, result.residual_m * 1e3),
+        "residual_deg": None
+        if result.residual_rad is None
+        else _residual_document(result.samples, np.degrees(result.residual_rad)),
+        "leave_one_out_mm": _left_out_document(result.leave_one_out_m),
+        "working_error_mm": None
+        if result.working_error_m is None
+        else result.working_error_m * 1e3,
+        "rejected": list(result.rejected),
+        "rejected_because": dict(result.rejected),
+        "unobservable": list(result.unobservable),
+        **result.more,
+        "verdict": verdict_document(result.verdict),
+    }
+
+
+def _sigma_document(covariance: Array | None) -> Document | None:
+    if covariance is None:
+        return None
+    sigma = np.sqrt(np.diag(covariance))
+    return {"xyz_mm": (sigma[:3] * 1e3).tolist(), "rot_deg": np.degrees(sigma[3:]).tolist()}
+
+
+def _residual_document(samples: tuple[str, ...], residual: Array) -> Document:
+    return {
+        "rms": float(np.sqrt(np.mean(residual**2))),
+        "max": float(np.max(residual)),
+        "per_sample": dict(zip(samples, residual.tolist(), strict=True)),
+    }
+
+
+def _left_out_document(distance_m: Array | None) -> Document | None:
+    if distance_m is None:
+        return None
+    return {"mean": float(distance_m.mean()) * 1e3, "max": float(distance_m.max()) * 1e3}
