@@ -1,4 +1,4 @@
-"""The outcome of a hand-eye calibration, whatever the target: pose, covariance, what it rests on."""
+"""The outcome of a hand-eye calibration, whatever the target."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -69,14 +69,27 @@ def point_covariance(result: HandEyeResult, points: Array) -> Array:
     return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
 
 
+def parent_covariance(result: HandEyeResult) -> Array | None:
+    """Covariance (6, 6) of the sensor's origin and of its turn, along the parent's axes."""
+    if result.covariance is None:
+        return None
+    turn = np.kron(np.eye(2), result.T_flange_sensor[:3, :3])
+    return np.asarray(turn @ result.covariance @ turn.T)
+
+
 def hand_eye_document(result: HandEyeResult) -> Document:
-    """The document of ``robocal hand-eye`` and of the history, in the units people read."""
+    """The document of ``robocal hand-eye`` and of the history, in the units people read.
+
+    ``covariance`` (6, 6), SI, and ``sigma``: of the sensor's origin, and of its turn about that
+    origin, both along the axes of the parent frame.
+    """
+    covariance = parent_covariance(result)
     return {
         "kind": result.kind,
         "method": result.method,
         f"T_{result.parent}_sensor": transform_document(result.T_flange_sensor),
-        "sigma": _sigma_document(result.covariance),
-        "covariance": None if result.covariance is None else result.covariance.tolist(),
+        "sigma": _sigma_document(covariance),
+        "covariance": None if covariance is None else covariance.tolist(),
         "target": result.target,
         "residual_mm": _residual_document(result.samples, result.residual_m * 1e3),
         "residual_deg": None
