@@ -1,6 +1,6 @@
 """One task per target: read its features from profiles, start, solve in the classic way."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from robocal_ros.core.errors import RobocalError, TooFewSamplesError
 from robocal_ros.core.fitting.arc import ArcRule, fit_arc
 from robocal_ros.core.fitting.edge import EdgeRule, fit_edge
-from robocal_ros.core.hand_eye.edge_start import line_starts
+from robocal_ros.core.hand_eye.edge_start import least_distances, line_starts
+from robocal_ros.core.hand_eye.mount_fit import MountFit
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.result import TargetKind
@@ -71,8 +72,11 @@ class Task(Protocol):
     def found(self, place: Array) -> Document:
         """What was found of the target."""
 
+    def more(self, fit: MountFit, data: HandEyeData) -> Document:
+        """Further figures of a fit."""
 
-def usable(rows: Mapping[str, object], rejected: Mapping[str, str], fewest: int, what: str) -> None:
+
+def usable(rows: Collection[str], rejected: Mapping[str, str], fewest: int, what: str) -> None:
     """Refuse when fewer than ``fewest`` shots gave a feature.
 
     Raises
@@ -125,6 +129,19 @@ class SphereTask:
         """Its centre in base."""
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
 
+    def more(self, fit: MountFit, data: HandEyeData) -> Document:
+        """How far profile points are from the sphere: each on its arc, all profiles together."""
+        s, centre = fit.views[0].sightings, fit.state.places[0]
+        rule = ArcRule(self.target.radius_m)
+        far = []
+        for i in s.pose:
+            arc = seen(data.profiles[i])
+            own = arc[fit_arc(arc, rule).used]
+            T = data.T_base_flange[i] @ fit.state.T_flange_sensor
+            base = np.outer(own[:, 0], T[:3, 0]) + np.outer(own[:, 1], T[:3, 2]) + T[:3, 3]
+            far.append(np.linalg.norm(base - centre, axis=1) - self.target.radius_m)
+        return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
+
 
 @dataclass(frozen=True, eq=False)
 class LineTask:
@@ -164,14 +181,16 @@ class LineTask:
 
     def classic(self, view: View, near: MountState) -> MountState:
         """Least squares of the distances from the line, all alike."""
-        from robocal_ros.core.hand_eye.edge_start import least_distances
-
         return least_distances(view, near)
 
     def found(self, place: Array) -> Document:
         """A point of it and its direction in base."""
         line = {"point_mm": (place[0] * 1e3).tolist(), "direction": place[1].tolist()}
         return {"line": line, "known": self.target is not None}
+
+    def more(self, fit: MountFit, data: HandEyeData) -> Document:
+        """None."""
+        return {}
 
 
 def seen(profile: Profile | RobocalError) -> Array:
