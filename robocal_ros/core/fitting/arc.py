@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.core.errors import ResidualError, RobocalError, TooFewSamplesError
 from robocal_ros.core.fitting.arc_search import find_circle, linearised, step
+from robocal_ros.core.fitting.neighbours import together
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
 
 Array = NDArray[np.float64]
@@ -24,9 +25,7 @@ FEWEST_POINTS = 20
 _NEAR = 3.5  # standard deviations of a point near a start
 _NEAR_M = 2e-5
 _ROUNDS = 25
-_NEIGHBOURS = 9  # columns
 _AGREEING = 0.7  # share of a point's neighbours that are on the arc too
-_PIECE = 0.2  # smallest piece of an arc, of its largest
 _ISOTROPIC = 5.0  # points' worth of belief that noise does not depend on the slope
 _STEEPEST = 0.05  # smallest share of variances of both directions
 _SURE = 4.0  # standard deviations
@@ -114,7 +113,7 @@ def _fitted(points: Array, radius: float) -> ArcFit:
             "radius, and that the laser line crosses the sphere"
         )
     residual = linearised(circle, points)[1]
-    used = _agreeing((np.abs(residual) < limit) & (points[:, 1] < circle[1]))
+    used = together((np.abs(residual) < limit) & (points[:, 1] < circle[1]), _AGREEING)
     ab = np.full(2, (limit / _NEAR) ** 2)
     for _ in range(_ROUNDS):
         _require_points(used, len(points))
@@ -124,7 +123,7 @@ def _fitted(points: Array, radius: float) -> ArcFit:
         parts = _parts(circle, points)
         ab = _variances(parts[used], residual[used], pull[used] / (parts[used] @ ab))
         near = _fitting(residual, parts @ ab, np.where(used, -pull, pull))
-        before, used = used, _agreeing(near & (points[:, 1] < circle[1]))
+        before, used = used, together(near & (points[:, 1] < circle[1]), _AGREEING)
         if np.array_equal(before, used):
             break
     _require_points(used, len(points))
@@ -188,22 +187,6 @@ def _fitting(residual: Array, variance: Array, pull: Array) -> Mask:
     expected = variance + np.maximum(pull, -0.5 * variance)
     limit = chi2_quantile(1.0 - FALSE_REJECTION / len(residual), 1.0)
     return np.asarray(residual**2 < limit * expected)
-
-
-def _agreeing(near: Mask) -> Mask:
-    """Those of the points near a circle that are not there by chance: a crossing line's are.
-
-    Most neighbours of a point are near the circle too, and it belongs to a large piece.
-    """
-    window = np.ones(_NEIGHBOURS)
-    votes = np.convolve(near.astype(np.float64), window, mode="same")
-    votes /= np.convolve(np.ones(len(near)), window, mode="same")
-    agreeing = np.flatnonzero(near & (votes > _AGREEING))
-    piece = np.cumsum(np.diff(agreeing, prepend=agreeing[:1]) > _NEIGHBOURS)
-    size = np.bincount(piece, minlength=1)
-    kept = np.zeros(len(near), dtype=np.bool_)
-    kept[agreeing[size[piece] >= _PIECE * size.max()]] = True
-    return kept
 
 
 def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:

@@ -149,8 +149,10 @@ def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
     difference = np.pad(kernel, (2, 0)) - np.pad(kernel, (0, 2))
     sigma = spacing * noise * float(np.linalg.norm(difference)) / (2.0 * abs(bend))
     at = float(grid[top] + shift * spacing)
-    smooth = savgol_filter(height, _WINDOW, _DEGREE)
+    near = height[top - _SMOOTHED : top + _SMOOTHED + 1]
+    x_variance = sigma**2 + spacing**2 / 12.0
+    steepness = float(np.mean((np.diff(near) / spacing) ** 2))
     return EdgeFit(
-        point=np.array([at, float(np.interp(at, grid, smooth))]),
-        covariance=np.diag([sigma**2, noise**2 / _WINDOW]),
+        point=np.array([at, float(np.interp(at, grid, height))]),
+        covariance=np.diag([x_variance, noise**2 + steepness * x_variance]),
     )

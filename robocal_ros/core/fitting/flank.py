@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.core.fitting.neighbours import together
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M
 
 Array = NDArray[np.float64]
@@ -13,6 +14,7 @@ Mask = NDArray[np.bool_]
 
 FEWEST_POINTS = 6
 _ROUNDS = 12
+_AGREEING = 0.5  # share of a point's neighbours that are on the line too; the last one's are
 _WORST = 0.5  # share of points beside a line that is still one
 
 
@@ -56,25 +58,27 @@ class Flank:
         return self.noise_m**2 * (1.0 / len(self.rows) + along_m**2 / self.spread_m2)
 
 
-def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
+def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None) -> Flank | None:
     """Line through the points of a profile (m, 2) with these row numbers (n,), ascending in x.
 
-    The start is the median of the directions between points half of the piece apart; total least
-    squares over the points whose residual fits its predicted variance is the answer. None where
-    fewer than six points, or fewer than half of them, lie on a line.
+    Where no start is given it is the median of the directions between points half of the piece
+    apart; total least squares over the points whose residual fits its predicted variance is the
+    answer. None where fewer than six points, or fewer than half of them, lie on a line.
     """
     cloud = points[rows]
     count = len(rows)
     if count < FEWEST_POINTS:
         return None
-    half = count // 2
-    step = cloud[half:] - cloud[: count - half]
-    angle = float(np.median(np.arctan2(step[:, 1], step[:, 0])))
-    direction = np.array([np.cos(angle), np.sin(angle)])
-    residual = cloud @ np.array([-direction[1], direction[0]])
-    residual = residual - np.median(residual)
     factor = chi2_quantile(1.0 - FALSE_REJECTION / count, 1.0) ** 0.5
-    near = np.abs(residual) <= factor * _scatter(residual)
+    if start is None:
+        direction, residual = _first_line(cloud)
+        scatter = np.full(count, MAD * float(np.median(np.abs(residual))) + SMALLEST_M)
+    else:
+        direction = start.direction
+        residual = (cloud - start.middle) @ start.normal
+        along = (cloud - start.middle) @ direction
+        scatter = start.noise_m * np.sqrt(1.0 + along**2 / start.spread_m2)
+    near = np.abs(residual) <= factor * scatter
     for _ in range(_ROUNDS):
         if np.sum(near) < max(FEWEST_POINTS, _WORST * count):
             return None
@@ -89,6 +93,7 @@ def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
         # A point in use pulled the line to itself, any other did not.
         expected = 1.0 + np.where(near, -1.0, 1.0) * np.minimum(leverage, 0.5)
         before, near = near, residual**2 < (factor * noise) ** 2 * expected
+        near = together(near, _AGREEING)
         if np.array_equal(before, near):
             break
     return Flank(
@@ -102,8 +107,13 @@ def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
     )
 
 
-def _scatter(residual: Array) -> float:
-    return MAD * float(np.median(np.abs(residual))) + SMALLEST_M
+def _first_line(cloud: Array) -> tuple[Array, Array]:
+    """Direction (2,) of points (n, 2) ascending in x, and their distances (n,) from the line."""
+    half = len(cloud) // 2
+    step = cloud[half:] - cloud[: len(cloud) - half]
+    angle = float(np.median(np.arctan2(step[:, 1], step[:, 0])))
+    residual = cloud @ np.array([-np.sin(angle), np.cos(angle)])
+    return np.array([np.cos(angle), np.sin(angle)]), residual - np.median(residual)
 
 
 def _main_direction(away: Array, towards: Array) -> Array:
