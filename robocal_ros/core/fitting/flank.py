@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
-from robocal_ros.core.fitting.neighbours import together
+from robocal_ros.core.fitting.neighbours import on_curve
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M
 
 Array = NDArray[np.float64]
@@ -14,7 +14,6 @@ Mask = NDArray[np.bool_]
 
 FEWEST_POINTS = 6
 _ROUNDS = 12
-_AGREEING = 0.5  # share of a point's neighbours that are on the line too; the last one's are
 _WORST = 0.5  # share of points beside a line that is still one
 
 
@@ -92,8 +91,7 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
         noise = float(np.sqrt(np.sum(residual[near] ** 2) / (np.sum(near) - 2))) + SMALLEST_M
         # A point in use pulled the line to itself, any other did not.
         expected = 1.0 + np.where(near, -1.0, 1.0) * np.minimum(leverage, 0.5)
-        before, near = near, residual**2 < (factor * noise) ** 2 * expected
-        near = together(near, _AGREEING)
+        before, near = near, on_curve((residual / (factor * noise)) ** 2 / expected)
         if np.array_equal(before, near):
             break
     return Flank(
