@@ -27,6 +27,7 @@ FEWEST_POINTS = 20
 _WINDOW = 21  # columns of the smoothing
 _DEGREE = 3
 _SMOOTHED = 5  # columns
+_WIDEST = 5.0  # columns without a return beyond the end of a surface
 _RIVAL = 0.8  # share of the sharpest turn at which another one could be meant as well
 
 
@@ -94,8 +95,7 @@ def _best(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
         corners = [c for c in corners if abs(c.turn_rad) >= _RIVAL * sharpest]
         candidates = [EdgeFit(corner.point, corner.covariance) for corner in corners]
     elif rule.kind == "edge":
-        spacing = float(np.median(np.diff(profile[:, 0])))
-        candidates = _ends(found, spacing)
+        candidates = _ends(found, profile)
     else:
         candidates = []
     if len(candidates) != 1:
@@ -108,18 +108,29 @@ def _best(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
     return candidates[0]
 
 
-def _ends(found: Surfaces, spacing: float) -> list[EdgeFit]:
-    """Where a surface ends before a farther one: within the column after its last point."""
+def _ends(found: Surfaces, profile: Array) -> list[EdgeFit]:
+    """Where a surface ends before a farther one: between its last point and the next one seen.
+
+    Where the sensor saw nothing for several columns nobody knows where the surface ends.
+    """
+    x = profile[:, 0]
+    widest = _WIDEST * float(np.median(np.diff(x)))
     ends = []
     for a, b, corner in zip(found.flanks[:-1], found.flanks[1:], found.corners, strict=True):
         if corner is not None:
             continue
-        last, first = a.at(a.end_m), b.at(b.start_m)
-        flank, end, way = (a, a.end_m, 1.0) if last[1] < first[1] else (b, b.start_m, -1.0)
-        column = spacing / float(flank.direction[0])
+        if a.at(a.end_m)[1] < b.at(b.start_m)[1]:
+            flank, row, beyond = a, int(a.rows[-1]), int(a.rows[-1]) + 1
+        else:
+            flank, row, beyond = b, int(b.rows[0]), int(b.rows[0]) - 1
+        gap = float(x[beyond] - x[row])
+        if abs(gap) > widest:
+            continue
+        column = gap / float(flank.direction[0])
+        end = flank.along(profile[row]) + 0.5 * column
         axes = np.array([flank.direction, flank.normal])
         variances = np.array([column**2 / 12.0, flank.variance(end)])
-        ends.append(EdgeFit(flank.at(end + way * 0.5 * column), (axes.T * variances) @ axes))
+        ends.append(EdgeFit(flank.at(end), (axes.T * variances) @ axes))
     return ends
 
 

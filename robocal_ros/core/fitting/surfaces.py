@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _SPLIT = 8.0  # standard deviations of a point
-_SPLIT_M = 2e-5
+_SPLIT_COLUMNS = 3.0  # a corner lies between two columns
 _SMOOTHED = 5  # columns
 _OVERLAP = 5.0  # columns by which pieces may pass their corner
 _GAP = 5.0  # columns
@@ -92,7 +92,7 @@ def surfaces(profile: Array, noise: float, rule: SurfaceRule) -> Surfaces:
 
 def split(profile: Array, noise: float) -> Rows:
     """Rows (v,) at which a profile (n, 2), ascending in x, is split; its ends are among them."""
-    threshold = max(_SPLIT * noise, _SPLIT_M)
+    threshold = max(_SPLIT * noise, _SPLIT_COLUMNS * float(np.median(np.diff(profile[:, 0]))))
     smooth = np.column_stack(
         [profile[:, 0], median_filter(profile[:, 1], _SMOOTHED, mode="nearest")]
     )
