@@ -116,8 +116,10 @@ def _first_line(cloud: Array) -> tuple[Array, Array]:
 
 def _main_direction(away: Array, towards: Array) -> Array:
     """Direction (2,) of largest extent of points (n, 2) about their mean."""
-    main = np.linalg.eigh(away.T @ away)[1][:, 1]
-    return np.asarray(main if main @ towards > 0.0 else -main)
+    (xx, xz), (_, zz) = (away.T @ away).tolist()
+    angle = 0.5 * np.arctan2(2.0 * xz, xx - zz)
+    main = np.array([np.cos(angle), np.sin(angle)])
+    return main if main @ towards > 0.0 else -main
 
 
 def angle_between(a: Flank, b: Flank) -> float:
@@ -128,8 +130,12 @@ def angle_between(a: Flank, b: Flank) -> float:
 
 def intersection(a: Flank, b: Flank) -> tuple[Array, Array]:
     """Point (2,) where two lines meet and its covariance (2, 2), m^2; they are not parallel."""
-    normals = np.array([a.normal, b.normal])
-    point = np.linalg.solve(normals, np.array([a.normal @ a.middle, b.normal @ b.middle]))
-    inverse = np.linalg.inv(normals)
-    variances = np.array([a.variance(a.along(point)), b.variance(b.along(point))])
-    return point, np.asarray((inverse * variances) @ inverse.T)
+    # Along a line of direction u to where it meets another: cross(b - a, v) / cross(u, v).
+    sine = np.sin(angle_between(a, b))
+    between = b.middle - a.middle
+    along_a = (between[0] * b.direction[1] - between[1] * b.direction[0]) / sine
+    along_b = (between[0] * a.direction[1] - between[1] * a.direction[0]) / sine
+    # An error of one line along its normal moves the point along the other.
+    moved = np.array([b.direction, a.direction]) / sine
+    variances = np.array([a.variance(along_a), b.variance(along_b)])
+    return a.at(along_a), np.asarray((moved.T * variances) @ moved)

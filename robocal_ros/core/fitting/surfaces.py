@@ -79,9 +79,10 @@ def surfaces(profile: Array, noise: float, rule: SurfaceRule) -> Surfaces:
     """Straight surfaces in points (n, 2) of a profile, ascending in x; noise is that of z, m."""
     spacing = float(np.median(np.diff(profile[:, 0])))
     slack = _OVERLAP * spacing + rule.margin_m
+    threshold = off_chord(noise, spacing)
     flanks = [
         flank
-        for flank in _merged(profile, _pieces(profile, _GAP * spacing, noise))
+        for flank in _merged(profile, _pieces(profile, _GAP * spacing, threshold))
         if flank.end_m - flank.start_m > rule.shortest_m
     ]
     flanks = _chain(flanks, slack, rule)
@@ -90,9 +91,13 @@ def surfaces(profile: Array, noise: float, rule: SurfaceRule) -> Surfaces:
     return Surfaces(flanks, _corners(flanks, slack, rule))
 
 
-def split(profile: Array, noise: float) -> Rows:
+def off_chord(noise: float, spacing: float) -> float:
+    """How far from a chord a point of a straight surface may be, m."""
+    return max(_SPLIT * noise, _SPLIT_COLUMNS * spacing)
+
+
+def split(profile: Array, threshold: float) -> Rows:
     """Rows (v,) at which a profile (n, 2), ascending in x, is split; its ends are among them."""
-    threshold = max(_SPLIT * noise, _SPLIT_COLUMNS * float(np.median(np.diff(profile[:, 0]))))
     smooth = np.column_stack(
         [profile[:, 0], median_filter(profile[:, 1], _SMOOTHED, mode="nearest")]
     )
@@ -111,12 +116,12 @@ def split(profile: Array, noise: float) -> Rows:
     return np.sort(np.array(vertices, dtype=np.int64))
 
 
-def _pieces(profile: Array, gap: float, noise: float) -> list[Flank]:
+def _pieces(profile: Array, gap: float, threshold: float) -> list[Flank]:
     """Straight pieces of a profile, none across a gap in x."""
     pieces = []
     ends = np.flatnonzero(np.diff(profile[:, 0]) > gap) + 1
     for first, last in zip([0, *ends], [*ends, len(profile)], strict=True):
-        vertices = first + split(profile[first:last], noise)
+        vertices = first + split(profile[first:last], threshold)
         for start, end in itertools.pairwise(vertices):
             piece = fit_flank(profile, np.arange(start, end + 1))
             if piece is not None and _whole(profile, piece):
