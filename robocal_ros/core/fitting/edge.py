@@ -137,13 +137,13 @@ def _ends(found: Surfaces, profile: Array) -> list[EdgeFit]:
 def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
     """Extremum of the second derivative of the smoothed profile, refined by a parabola."""
     x, first = np.unique(profile[:, 0], return_index=True)
-    spacing = float(np.median(np.diff(x)))
-    grid = np.arange(x[0], x[-1], spacing)
-    height = median_filter(np.interp(grid, x, profile[first, 1]), _SMOOTHED, mode="nearest")
-    if len(grid) < 2 * _WINDOW:
+    if len(x) < 2 * _WINDOW:
         raise TooFewSamplesError(
-            f"{len(grid)} columns give no {kind}: at least {2 * _WINDOW} are needed"
+            f"{len(x)} columns give no {kind}: at least {2 * _WINDOW} are needed; check the "
+            "exposure and that the target is in range"
         )
+    grid, spacing = np.linspace(x[0], x[-1], len(x), retstep=True)
+    height = median_filter(np.interp(grid, x, profile[first, 1]), _SMOOTHED, mode="nearest")
     curvature = savgol_filter(height, _WINDOW, _DEGREE, deriv=2, delta=spacing)
     curvature *= 1.0 if kind == "edge" else -1.0
     inner = slice(_WINDOW // 2 + 1, -_WINDOW // 2 - 1)

@@ -85,6 +85,8 @@ def surfaces(profile: Array, noise: float, rule: SurfaceRule) -> Surfaces:
         for flank in _merged(profile, _pieces(profile, _GAP * spacing, threshold))
         if flank.end_m - flank.start_m > rule.shortest_m
     ]
+    if not flanks:
+        return Surfaces([], [])
     flanks = _chain(flanks, slack, rule)
     for _ in range(_REFINEMENTS):
         flanks = _refined(profile, flanks, slack, rule)
@@ -177,7 +179,7 @@ def _chain(flanks: list[Flank], slack: float, rule: SurfaceRule) -> list[Flank]:
             if worth > value[j]:
                 value[j], before[j] = worth, i
     chain = []
-    at = int(np.argmax(value)) if flanks else -1
+    at = int(np.argmax(value))
     while at >= 0:
         chain.append(flanks[at])
         at = before[at]
