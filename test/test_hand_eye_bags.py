@@ -19,7 +19,7 @@ from robocal_ros.storage.robots import load_robot
 BAGS = Path(__file__).parent.parent / "bags"
 KINDS = ("sphere", "step", "line")
 UR10 = load_robot("ur10")
-FLANGE_M = 2e-3  # an arm whose lengths err by 0.1 mm and angles by 0.1 mrad, at a metre
+FLANGE_M = 1e-3  # an arm whose lengths err by 0.05 mm and angles by 0.05 mrad, at a metre
 SPIKES = 0.02  # more of the points than are speckled (0.3 %) or ragged
 
 
