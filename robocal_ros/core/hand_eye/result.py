@@ -58,7 +58,7 @@ class HandEyeResult:
 
 
 def increment(T_from: Array, T_to: Array, pivot: Array) -> Array:
-    """(v, w) (6,) along the axes of T_from: from it to T_to a pivot (3,) moves by v, turned by w."""
+    """(v, w) (6,) from T_from to T_to, along T_from's axes: a pivot moves by v, turned by w."""
     T = frames.invert(T_from) @ T_to
     return np.concatenate([T[:3, :3] @ pivot + T[:3, 3] - pivot, frames.log_rotation(T[:3, :3])])
 

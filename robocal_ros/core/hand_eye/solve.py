@@ -90,7 +90,7 @@ def solve_task(
     rejected = {**read.rejected, **fit.rejected, **_swapped(read.view, fit)}
     if method == "classic":
         return _classic(task, read, fit.state, len(data.names), settings)
-    return result_of(task, fit, rejected, data, settings)
+    return result_of(task, fit, read, rejected, data, settings)
 
 
 def best_fit(task: Task, view: View, settings: HandEyeSettings) -> MountFit:
@@ -140,6 +140,7 @@ def _swapped(view: View, fit: MountFit) -> dict[str, str]:
 def result_of(
     task: Task,
     fit: MountFit,
+    read: Read,
     rejected: dict[str, str],
     data: HandEyeData,
     settings: HandEyeSettings,
@@ -165,7 +166,7 @@ def result_of(
         more={
             "robot_sigma_mm": fit.noise.sigma_m * 1e3,
             "working_distance_mm": float(field[0, 2]) * 1e3,
-            **task.more(fit, data),
+            **task.more(fit, read),
         },
     )
 

@@ -13,7 +13,7 @@ from robocal_ros.core.errors import InputError, ResidualError, RobocalError
 from robocal_ros.core.fitting.polyline import CornerFit, CornerRule, fit_corners
 from robocal_ros.core.hand_eye.corner_matching import Match, along, nearest
 from robocal_ros.core.hand_eye.edge_start import linear_corners, robust_corners
-from robocal_ros.core.hand_eye.mount_fit import MountFit
+from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.sightings import Sightings
 from robocal_ros.core.hand_eye.target_models import CornerModel
@@ -45,7 +45,9 @@ class StepTask:
         starts = [robust_corners(view.sightings.value, _in_flange(view)) for view in views]
         miss = [float(np.median(_distances(v, X))) for v, X in zip(views, starts, strict=True)]
         turned = miss[0] > TURNED_M and miss[1] < TURNED * miss[0]
-        view = reader.view(reader.predicted(starts[int(turned)]))
+        start = MountState(starts[int(turned)], (self.target.T_base_user,))
+        near = first_look((views[int(turned)],), start, None)
+        view = reader.view(reader.predicted(near.T_flange_sensor))
         usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
         return Read(view, reader.rejected)
 
@@ -63,7 +65,7 @@ class StepTask:
         """The user frame."""
         return {"T_base_user": transform_document(place)}
 
-    def more(self, fit: MountFit, data: HandEyeData) -> Document:
+    def more(self, fit: MountFit, read: Read) -> Document:
         """How well the light was laid on the marks."""
         return {"aim_sigma_mm": fit.noise.aim_m * 1e3}
 

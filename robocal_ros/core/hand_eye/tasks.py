@@ -43,10 +43,17 @@ class HandEyeData:
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """Features of a data set: ``view``, and which shots gave none and why."""
+    """Features of a data set.
+
+    Attributes
+    ----------
+    view : of the features; rejected: which shots gave none, and why.
+    points : profile points (n, 2) that each feature rests on, where they are on the target.
+    """
 
     view: View
     rejected: Mapping[str, str]
+    points: Mapping[str, Array] = field(default_factory=dict)
 
 
 class Task(Protocol):
@@ -72,7 +79,7 @@ class Task(Protocol):
     def found(self, place: Array) -> Document:
         """What was found of the target."""
 
-    def more(self, fit: MountFit, data: HandEyeData) -> Document:
+    def more(self, fit: MountFit, read: Read) -> Document:
         """Further figures of a fit."""
 
 
@@ -106,16 +113,18 @@ class SphereTask:
         """Circles."""
         rule = ArcRule(self.target.radius_m)
         found: dict[str, tuple[int, Array, Array]] = {}
-        rejected = {}
+        rejected, points = {}, {}
         for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
             try:
                 arc = fit_arc(seen(profile), rule)
             except RobocalError as error:
                 rejected[name] = str(error)
                 continue
+            points[name] = seen(profile)[arc.used]
             found[name] = i, np.array([*arc.centre, arc.radius_m]), arc.covariance
         usable(found, rejected, self.fewest, "the sphere")
-        return Read(View(SphereModel(self.target.radius_m), _gathered(data, found)), rejected)
+        view = View(SphereModel(self.target.radius_m), _gathered(data, found))
+        return Read(view, rejected, points)
 
     def starts(self, view: View) -> list[MountState]:
         """All sides of the laser plane are tried."""
@@ -129,16 +138,14 @@ class SphereTask:
         """Its centre in base."""
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
 
-    def more(self, fit: MountFit, data: HandEyeData) -> Document:
-        """How far profile points are from the sphere: each on its arc, all profiles together."""
+    def more(self, fit: MountFit, read: Read) -> Document:
+        """How far profile points are from the sphere, all profiles together."""
         s, centre = fit.views[0].sightings, fit.state.places[0]
-        rule = ArcRule(self.target.radius_m)
         far = []
-        for i in s.pose:
-            arc = seen(data.profiles[i])
-            own = arc[fit_arc(arc, rule).used]
-            T = data.T_base_flange[i] @ fit.state.T_flange_sensor
-            base = np.outer(own[:, 0], T[:3, 0]) + np.outer(own[:, 1], T[:3, 2]) + T[:3, 3]
+        for name, T_base_flange in zip(s.names, s.T_base_flange, strict=True):
+            x, z = read.points[name].T
+            T = T_base_flange @ fit.state.T_flange_sensor
+            base = np.outer(x, T[:3, 0]) + np.outer(z, T[:3, 2]) + T[:3, 3]
             far.append(np.linalg.norm(base - centre, axis=1) - self.target.radius_m)
         return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
 
@@ -188,7 +195,7 @@ class LineTask:
         line = {"point_mm": (place[0] * 1e3).tolist(), "direction": place[1].tolist()}
         return {"line": line, "known": self.target is not None}
 
-    def more(self, fit: MountFit, data: HandEyeData) -> Document:
+    def more(self, fit: MountFit, read: Read) -> Document:
         """None."""
         return {}
 
