@@ -11,9 +11,9 @@ _actions = Actions(
         "step": "hand_eye_step",
         "line": "hand_eye_line",
         "joint": "hand_eye_joint",
-        # "check-plan": "hand_eye_check_plan",
+        "check-plan": "hand_eye_check_plan",
         "verify": "hand_eye_verify",
-        # "export": "hand_eye_export",
+        "export": "hand_eye_export",
     }
 )
 add_arguments, run = _actions.add_arguments, _actions.run
