@@ -17,6 +17,7 @@ from robocal_ros.cli.hand_eye_shots import (
 )
 from robocal_ros.cli.hand_eye_view import show_sigma, show_verdict
 from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.cli.tool_frames import three_numbers
 from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +59,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or quat_xyzw",
     )
     add_target(parser)
+    parser.add_argument(
+        "--center-mm",
+        type=three_numbers,
+        metavar="X,Y,Z",
+        help="of a sphere, roughly, in base; default: where the poses look, each past it at the "
+        "side of y > 0",
+    )
     add_robot(parser)
     sensor = parser.add_argument_group("the sensor")
     for name, (value, words) in SENSOR.items():
@@ -79,10 +87,9 @@ def run(args: argparse.Namespace) -> Outcome:
     from robocal_ros.storage.hand_eye_tables import read_pose_table, write_pose_table
 
     settings, sensor = settings_of(args), _sensor(args)
-    target = _planned(
-        args.target_kind, given_target(args.target_kind, args.target, args.radius_mm), sensor
-    )
+    known = given_target(args.target_kind, args.target, args.radius_mm)
     table = read_pose_table(args.poses, arm_of(args), None)
+    target = _planned(known, args.center_mm, sensor, table.mark)
     X = read_flange_mount(args.mount)
     report = check_plan(target, table.T_base_flange, X, sensor, _noise(settings), settings.limit_m)
     if args.propose is not None:
@@ -111,16 +118,26 @@ def _noise(settings: "HandEyeSettings") -> "PoseNoise":
     return settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
 
 
-def _planned(kind: str, target: "Target | None", sensor: "SensorRange") -> "PlannedTarget":
+def _planned(
+    target: "Target | None",
+    center_mm: tuple[float, float, float] | None,
+    sensor: "SensorRange",
+    marks: tuple[str, ...] | None,
+) -> "PlannedTarget":
     import numpy as np
 
-    from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere
+    from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
     from robocal_ros.core.hand_eye.targets import SphereTarget, StepTarget
 
     if isinstance(target, SphereTarget):
-        return PlannedSphere(target.radius_m, sensor)
+        if center_mm is None:
+            return PlannedSphere(target.radius_m, sensor)
+        x, y, z = center_mm
+        return PlannedSphere(target.radius_m, sensor, (x * 1e-3, y * 1e-3, z * 1e-3))
+    if center_mm is not None:
+        raise InputError("--center-mm is a sphere's")
     if isinstance(target, StepTarget):
-        return PlannedStep(target, sensor)
+        return PlannedStep(target, sensor, marks)
     line = None if target is None else np.stack([target.point_base, target.direction_base])
     return PlannedLine(sensor, line)
 

@@ -30,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FRAME",
         help="default tool0; of a sensor beside the robot base",
     )
-    parser.add_argument("--child", type=text, default="laser", metavar="FRAME", help="default laser")
+    parser.add_argument(
+        "--child", type=text, default="laser", metavar="FRAME", help="default laser"
+    )
 
 
 def run(args: argparse.Namespace) -> Outcome:

@@ -61,6 +61,4 @@ def _part(kind: str, folder: Path, feature: str, arm: "SerialArm | None") -> "Pa
     file = folder / "target.yaml"
     known = kind != "line" or file.exists()
     target = given_target(kind, file if known else None, None)
-    return task_of(target, feature), read_shots(
-        folder / "poses.csv", folder / "profiles", arm
-    ).data
+    return task_of(target, feature), read_shots(folder / "poses.csv", folder / "profiles", arm).data

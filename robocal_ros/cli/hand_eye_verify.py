@@ -66,9 +66,7 @@ def run(args: argparse.Namespace) -> Outcome:
         "target": found.target,
         "held_out": errors
         | {"rejected": list(found.rejected), "rejected_because": dict(found.rejected)},
-        "per_sample_mm": dict(
-            zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)
-        ),
+        "per_sample_mm": dict(zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)),
         "verdict": verdict_document(found.verdict),
     }
     return Outcome(document, partial(_show, document=document))

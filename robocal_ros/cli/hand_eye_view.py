@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 def show_mount(console: "Console", document: Document) -> None:
-    """Print where a sensor sits: verdict, pose, standard deviations, distances, what was left out."""
+    """Print where a sensor sits, how well that is known, and which samples were left out."""
     show_verdict(console, document)
     show_pose(console, "Sensor in the flange frame", document["T_flange_sensor"])
     if document["sigma"] is not None:
@@ -23,8 +23,7 @@ def show_mount(console: "Console", document: Document) -> None:
     )
     if left_out is not None:
         console.print(
-            f"Each without itself: mean {left_out['mean']:.3f} mm, largest "
-            f"{left_out['max']:.3f} mm"
+            f"Each without itself: mean {left_out['mean']:.3f} mm, largest {left_out['max']:.3f} mm"
         )
     if document.get("held_out") is not None:
         show_held_out(console, document["held_out"])

@@ -11,7 +11,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
-from robocal_ros.core.hand_eye.step_task import StepTask
+from robocal_ros.core.hand_eye.step_task import StepTask, require_marks
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import StepTarget
 
@@ -153,12 +153,21 @@ class PlannedLine:
 
 @dataclass(frozen=True, eq=False)
 class PlannedStep:
-    """A staircase; ``marks``: on which each planned pose lays the light, None for the first."""
+    """A staircase; ``marks``: on which each planned pose lays the light, None for the first.
+
+    Raises
+    ------
+    InputError
+        For a mark that the target does not have.
+    """
 
     target: StepTarget
     sensor: SensorRange
     marks: Sequence[str] | None = None
     fewest: int = field(default=1, init=False)
+
+    def __post_init__(self) -> None:
+        require_marks(self.target, self.marks or ())
 
     def place(self, T_base_sensor: Array) -> Array:
         """The taught user frame."""

@@ -1,6 +1,6 @@
 """The staircase: corners at known places, laid under the laser mark by mark."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -90,9 +90,7 @@ class _Reader:
         self._task, self._data = task, data
         known = task.target.corners
         marks = data.marks or (next(iter(known)),) * len(data.names)
-        strange = next((mark for mark in marks if mark not in known), None)
-        if strange is not None:
-            raise InputError(f"mark '{strange}' is not one of {', '.join(known)}")
+        require_marks(task.target, marks)
         self._corners = {name: known[m] for name, m in zip(data.names, marks, strict=True)}
         self.rejected: dict[str, str] = {}
         self._fits: dict[str, CornerFit] = {}
@@ -154,6 +152,19 @@ class _Reader:
             np.array(covariances).reshape(-1, 3, 3),
         )
         return View(self._task.model(np.array(corners).reshape(-1, 3)), sightings)
+
+
+def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
+    """Refuse marks that the target does not have.
+
+    Raises
+    ------
+    InputError
+        Naming the first of them.
+    """
+    strange = next((mark for mark in marks if mark not in target.corners), None)
+    if strange is not None:
+        raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
 
 
 def _corner_model(view: View) -> CornerModel:
