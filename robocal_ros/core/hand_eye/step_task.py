@@ -1,6 +1,7 @@
 """The staircase: corners at known places, laid under the laser mark by mark."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
