@@ -36,9 +36,17 @@ class StepTask:
     kind: Literal["step"] = field(default="step", init=False)
     fewest: int = field(default=1, init=False)
 
-    def read(self, data: HandEyeData) -> Read:
+    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Corners, each with its mark."""
         reader = _Reader(self, data)
+        if T_flange_sensor is None:
+            T_flange_sensor = self._rough(reader)
+        view = reader.view(reader.predicted(T_flange_sensor))
+        usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
+        return Read(view, reader.rejected)
+
+    def _rough(self, reader: "_Reader") -> Array:
+        """Where the sensor sits, by the profiles that show the whole target."""
         matches = reader.sure()
         both = [matches, {name: match.turned for name, match in matches.items()}]
         views = [reader.view(each) for each in both]
@@ -46,10 +54,7 @@ class StepTask:
         miss = [float(np.median(_distances(v, X))) for v, X in zip(views, starts, strict=True)]
         turned = miss[0] > TURNED_M and miss[1] < TURNED * miss[0]
         start = MountState(starts[int(turned)], (self.target.T_base_user,))
-        near = first_look((views[int(turned)],), start)
-        view = reader.view(reader.predicted(near.T_flange_sensor))
-        usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
-        return Read(view, reader.rejected)
+        return first_look((views[int(turned)],), start).T_flange_sensor
 
     def starts(self, view: View) -> list[MountState]:
         """The closed form of the corners that agree."""
