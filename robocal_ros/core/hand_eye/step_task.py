@@ -56,6 +56,10 @@ class StepTask:
         start = MountState(starts[int(turned)], (self.target.T_base_user,))
         return first_look((views[int(turned)],), start).T_flange_sensor
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Which corner is which depends on the poses."""
+        return self.read(data).view
+
     def starts(self, view: View) -> list[MountState]:
         """The closed form of the corners that agree."""
         X = robust_corners(view.sightings.value, _in_flange(view))
