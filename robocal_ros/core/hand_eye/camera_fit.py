@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
 _SETTLED = 0.02  # of a standard deviation
-_ENOUGH_TO_DOUBT = 6  # samples, to look for outliers among them
+_ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ def fit_pairs(
             state,
             prior_information=problem.prior_information,
             noise_known=not np.any(free),
-            robust=len(pairs) > _ENOUGH_TO_DOUBT,
+            robust=len(pairs) >= _ENOUGH_TO_DOUBT,
         )
         before, state = noise, found.state
         miss, J = linearised(pairs, state)
-        if np.any(free):
-            keep = ~found.rejected
+        keep = ~found.rejected
+        if np.any(free) and int(keep.sum()) >= _ENOUGH_TO_DOUBT:
             parts = components(pairs, state.at.X)[:, keep]
             rest = covariances(pairs, state.at.X, PairNoise(0.0, 0.0))[keep]
             noise = estimate(miss[keep], J[keep], parts, rest, free, noise)

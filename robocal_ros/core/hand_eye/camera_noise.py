@@ -105,21 +105,22 @@ def _round(
     """One solution of the minimum-norm equations."""
     from scipy.optimize import nnls
 
-    W = np.linalg.inv(V)
-    WJ = W @ jacobian
-    k = jacobian.shape[2]
-    M = np.linalg.pinv(WJ.reshape(-1, k).T @ jacobian.reshape(-1, k), hermitian=True)
-    step = M @ (WJ.reshape(-1, k).T @ differences.ravel())
-    e = (W @ (differences - jacobian @ step)[..., None])[..., 0]
+    root = np.linalg.inv(np.linalg.cholesky(V))
+    turned = root.swapaxes(1, 2)
+    J = root @ jacobian
+    k = J.shape[2]
+    rows = J.reshape(-1, k)
+    M = np.linalg.pinv(rows.T @ rows, hermitian=True)
+    e = (root @ differences[..., None])[..., 0]
+    e = e - J @ (M @ (rows.T @ e.ravel()))
     # the known rest is one more component, with factor one
-    all_parts = np.concatenate([parts, rest[None]])
-    WV = W @ all_parts
-    VWJ = all_parts @ WJ
-    G = np.einsum("mia,kmib->kab", WJ, VWJ, optimize=True) @ M
-    cross = np.einsum("kmia,mij,lmjb,ab->kl", VWJ, W, VWJ, M, optimize=True)
-    trace = np.einsum("kmij,lmji->kl", WV, WV, optimize=True)
-    F = trace - 2.0 * cross + np.einsum("kab,lba->kl", G, G)
-    q = np.einsum("mi,kmij,mj->k", e, all_parts, e, optimize=True)
+    U = np.stack([root @ part @ turned for part in (*parts, rest)])
+    Y = U @ J
+    G = rows.T @ Y.reshape(len(U), -1, k) @ M
+    flat, Yf = U.reshape(len(U), -1), Y.reshape(len(U), -1)
+    F = flat @ flat.T - 2.0 * Yf @ (Y @ M).reshape(len(U), -1).T
+    F += np.einsum("kab,lba->kl", G, G)
+    q = np.sum((U @ e[..., None])[..., 0] * e, axis=(1, 2))
     held = np.append(np.where(free, 0.0, theta), 1.0)
     chosen = np.flatnonzero(free)
     right = q[chosen] - F[chosen] @ held

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 
 _SUBSETS = 32  # of which one is clean with 99 % chance where three in ten samples are wrong
 _SUBSET_SIZE = 5
+_STRAY = 5.0  # medians from which a sample may lead a solution of all astray
 _HALVINGS = 3  # of the better half, solved again (Rousseeuw and Van Driessen 1999)
 
 
@@ -24,15 +25,17 @@ def robust_start(pairs: PosePairs) -> Placement:
     ``pairs`` of two or more rotation axes; else the answer is one of many.
     """
     m = len(pairs)
-    weights = np.ones((1, m))
-    if m > _SUBSET_SIZE:
-        order = np.random.default_rng(0).random((_SUBSETS, m)).argsort(axis=1)
-        weights = np.concatenate([weights, np.where(order < _SUBSET_SIZE, 1.0, 0.0)])
-    best = min(_closed_forms(pairs, weights), key=lambda at: score(pairs, at))
+    best = _closed_forms(pairs, np.ones((1, m)))[0]
+    size = sample_sizes(pairs, best)
+    if size.max() <= _STRAY * np.median(size) or m <= _SUBSET_SIZE:
+        return best
+    order = np.random.default_rng(0).random((_SUBSETS, m)).argsort(axis=1)
+    few = _closed_forms(pairs, np.where(order < _SUBSET_SIZE, 1.0, 0.0))
+    best = min((best, *few), key=lambda at: score(pairs, at))
     for _ in range(_HALVINGS):
         size = sample_sizes(pairs, best)
         half = np.where(size <= np.median(size), 1.0, 0.0)
-        if half.sum() < min(m, _SUBSET_SIZE):
+        if half.sum() < _SUBSET_SIZE:
             break
         trial = _closed_forms(pairs, half[None])[0]
         if score(pairs, trial) >= score(pairs, best):

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 
 Array = NDArray[np.float64]
+_STRAIGHT = 1e-12  # sine of an angle that is its sine to the last digit
+_NEARLY_BACK = -0.9
 Mount = Literal["in-hand", "to-hand"]
 
 
@@ -98,8 +100,23 @@ def predicted(pairs: PosePairs, at: Placement) -> Array:
 def differences(predicted_T: Array, pairs: PosePairs) -> Array:
     """Difference (m, 6) of predicted from seen board poses: position and turn, camera axes."""
     seen = pairs.T_camera_board
-    turn = frames.log_rotation(predicted_T[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2))
+    turn = _log(predicted_T[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2))
     return np.concatenate([predicted_T[:, :3, 3] - seen[:, :3, 3], turn], axis=1)
+
+
+def _log(R: Array) -> Array:
+    """`frames.log_rotation` of many rotations (m, 3, 3), most of them small."""
+    sine = 0.5 * np.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1
+    )
+    length = np.sqrt(np.einsum("mi,mi->m", sine, sine))
+    cosine = 0.5 * (np.einsum("mii->m", R) - 1.0)
+    w = sine * (np.arctan2(length, cosine) / np.maximum(length, np.finfo(float).tiny))[:, None]
+    w[length < _STRAIGHT] = sine[length < _STRAIGHT]
+    large = cosine < _NEARLY_BACK
+    if np.any(large):  # the sine loses the axis
+        w[large] = frames.log_rotation(R[large])
+    return np.asarray(w)
 
 
 def levers(pairs: PosePairs, X: Array) -> Array:
