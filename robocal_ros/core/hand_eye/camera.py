@@ -58,14 +58,25 @@ def calibrate_camera(
     """
     if method not in METHODS:
         raise ValueError(f"{method} is not one of {', '.join(METHODS)}")
-    require_pairs(pairs)
-    sound = robust_start(pairs)
-    _require_fit(pairs, sound, score(pairs, sound), LARGEST_START_M)
+    require_sound(pairs)
     fit = fit_pairs(pairs, given, _start(pairs, method))
     about = _noise_document(fit, given) | {"mount": pairs.mount} | (more or {})
     if method == "classic":
         return _classic(pairs, dict(rejected or {}), about)
     return _result(fit, method, dict(rejected or {}), about)
+
+
+def require_sound(pairs: PosePairs) -> None:
+    """Refuse pairs in which no placement is worth a search, and name the mistake if it is known.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError, InputError, ResidualError
+        As `calibrate_camera`.
+    """
+    require_pairs(pairs)
+    sound = robust_start(pairs)
+    _require_fit(pairs, sound, score(pairs, sound), LARGEST_START_M)
 
 
 def _start(pairs: PosePairs, method: str) -> Placement | None:

@@ -56,8 +56,19 @@ class PairFit:
 
     @property
     def covariance(self) -> Array:
-        """Of both placements."""
-        return self.estimate.covariance[:12, :12]
+        """Of both placements; of a stream widened, because neighbours share their errors."""
+        return self.whole_covariance[:12, :12]
+
+    @property
+    def whole_covariance(self) -> Array:
+        """The same with the common errors (12 + s, 12 + s)."""
+        widened = 1.0 if self.pairs.time_s is None else correlation(self._whitened)
+        return self.estimate.covariance * widened
+
+    @property
+    def _whitened(self) -> Array:
+        root = np.linalg.inv(np.linalg.cholesky(self.expected[~self.rejected]))
+        return np.asarray((root @ self.differences[~self.rejected][..., None])[..., 0])
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -121,3 +132,20 @@ def _split(pairs: PosePairs, given: GivenNoise) -> tuple[PairNoise, NDArray[np.b
 def _same(before: PairNoise, after: PairNoise) -> bool:
     old, new = np.sqrt(before.variances), np.sqrt(after.variances)
     return bool(np.all(np.abs(new - old) <= _SETTLED * np.maximum(old, new)))
+
+
+def correlation(residual: Array) -> float:
+    """How many neighbours in a stream (n, c) count as one: 1 + 2 sum of autocorrelations.
+
+    Summed up to the first pair of lags that is not positive (Geyer 1992).
+    """
+    r = residual - residual.mean(axis=0)
+    n = len(r)
+    power = np.abs(np.fft.rfft(r, 2 * n, axis=0)) ** 2
+    lagged = np.fft.irfft(power.sum(axis=1))[:n]
+    if lagged[0] <= 0.0:
+        return 1.0
+    rho = lagged / lagged[0]
+    pairs = rho[0 : n - n % 2 : 2] + rho[1 : n + n % 2 : 2][: n // 2]
+    until = int(np.argmax(pairs <= 0.0)) if np.any(pairs <= 0.0) else len(pairs)
+    return max(float(2.0 * pairs[:until].sum() - 1.0), 1.0)
