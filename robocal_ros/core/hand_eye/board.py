@@ -181,9 +181,9 @@ def boards_of_corners(
     seen = _solve(tuple(names), corners, board, size, intrinsics)
     gross = seen.rms_px > GROSS_RATIO * np.median(seen.rms_px)
     if np.any(gross):
-        for i in np.flatnonzero(gross):
+        for i in np.flatnonzero(gross).tolist():
             out[names[i]] = f"its corners miss a flat board by {seen.rms_px[i]:.2f} px rms"
-        kept = np.flatnonzero(~gross)
+        kept = np.flatnonzero(~gross).tolist()
         _require(len(kept), intrinsics, out)
         seen = _solve(tuple(names[i] for i in kept), corners[kept], board, size, intrinsics)
     seen.rejected.update(out)
@@ -216,19 +216,14 @@ def _solve(
     noise = float(np.sqrt(np.sum(miss**2) / (miss.size - unknowns)))
     alone = np.linalg.inv(J_pose.swapaxes(1, 2) @ J_pose)
     sensitivity = -alone @ J_pose.swapaxes(1, 2) @ J_camera
-    shared = None
     if intrinsics is None:
         rest = J_camera + J_pose @ sensitivity
         camera = _with_covariance(camera, rest.reshape(-1, rest.shape[2]), noise)
-        assert camera.covariance is not None
-        shared = Shared(sensitivity, camera.covariance)
-    elif intrinsics.covariance is not None:
-        shared = Shared(sensitivity, intrinsics.covariance)
     return SeenBoards(
         names=names,
         T_camera_board=T,
         covariance=noise**2 * alone,
-        shared=shared,
+        shared=None if camera.covariance is None else Shared(sensitivity, camera.covariance),
         intrinsics=camera,
         noise_px=noise,
         rms_px=np.sqrt(np.mean(miss**2, axis=1) * 2.0),
@@ -242,7 +237,11 @@ def _calibrate(corners: Array, board: Chessboard, size: tuple[int, int]) -> Intr
     points = [board.points.astype(np.float32)] * len(corners)
     seen = list(corners.astype(np.float32))
     _, matrix, distortion, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
-    return Intrinsics(np.asarray(matrix), np.asarray(distortion).ravel(), size)
+    return Intrinsics(
+        np.asarray(matrix, dtype=np.float64),
+        np.asarray(distortion, dtype=np.float64).ravel(),
+        size,
+    )
 
 
 def _with_covariance(camera: Intrinsics, rows: Array, noise_px: float) -> Intrinsics:
@@ -250,8 +249,8 @@ def _with_covariance(camera: Intrinsics, rows: Array, noise_px: float) -> Intrin
     information = rows.T @ rows
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
     scaled = information * np.outer(scale, scale)
-    covariance = noise_px**2 * np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
-    covariance *= np.outer(scale, scale)
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+    covariance = np.asarray(noise_px**2 * inverse * np.outer(scale, scale))
     focal = float(np.sqrt(covariance[0, 0])) / float(camera.matrix[0, 0])
     if not focal < LARGEST_FOCAL_SIGMA:
         raise RankDeficientError(

@@ -63,7 +63,7 @@ def covariances(pairs: PosePairs, X: Array, noise: PairNoise) -> Array:
     """Covariance (m, 6, 6) of the differences of each sample."""
     V = np.einsum("k,kmij->mij", noise.variances, components(pairs, X))
     V += np.diag(np.repeat([SMALLEST_M**2, SMALLEST_RAD**2], 3))
-    return V if pairs.covariance is None else V + pairs.covariance
+    return np.asarray(V if pairs.covariance is None else V + pairs.covariance)
 
 
 def first_guess(differences: Array, free: NDArray[np.bool_], known: PairNoise) -> PairNoise:

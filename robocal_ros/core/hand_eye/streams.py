@@ -5,7 +5,6 @@ placement; then it is one more unknown of maximum likelihood (Furrer et al. 2017
 combined time-offset estimation and hand-eye calibration on robotic datasets").
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.hand_eye.camera import calibrate_camera, require_sound
+from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera, require_sound
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.pose_pairs import Mount, PosePairs, Shared, differences, predicted
 from robocal_ros.core.hand_eye.result import HandEyeResult
@@ -88,7 +87,8 @@ def stream_of(stamp_ns: NDArray[np.int64], T: Array, names: tuple[str, ...], ori
         raise TooFewSamplesError(
             f"{len(stamps)} {what} poses are no stream (at least {FEWEST_POSES})"
         )
-    return PoseStream((stamps - origin_ns) * 1e-9, T[first], tuple(names[i] for i in first))
+    time_s = np.asarray((stamps - origin_ns) * 1e-9, dtype=np.float64)
+    return PoseStream(time_s, T[first], tuple(names[i] for i in first))
 
 
 def coarse_offset(robot: PoseStream, camera: PoseStream) -> float:
@@ -213,17 +213,27 @@ def _sigma(fit: PairFit) -> float:
 
 
 def calibrate_streams(
-    robot: PoseStream, camera: PoseStream, mount: Mount = "in-hand", method: str = "best",
-    given: GivenNoise | None = None, more: Mapping[str, object] | None = None,
+    robot: PoseStream, camera: PoseStream, mount: Mount = "in-hand",
+    settings: CameraSettings | None = None, check: PoseStream | None = None,
 ) -> HandEyeResult:  # fmt: skip
     """Place a camera from two streams; the result's ``more`` tells the offset.
+
+    ``check``: a stream of the robot at times of the camera's that judge the result.
 
     Raises
     ------
     InputError, TooFewSamplesError, RankDeficientError, ResidualError
         As `pair_streams` and `calibrate_camera`.
     """
-    found = pair_streams(robot, camera, mount, given)
-    about = {"time_offset_s": found.offset_s, "time_offset_sigma_s": found.sigma_s}
-    left_out = dict.fromkeys(found.left_out, "no robot pose at its time")
-    return calibrate_camera(found.pairs, method, given, left_out, dict(more or {}) | about)
+    how = settings or CameraSettings()
+    found = pair_streams(robot, camera, mount, how.noise)
+    judges = None
+    if check is not None:  # the common error is the offset, which is in the times already
+        judges = pairs_at(check, camera, found.offset_s, mount)[0]
+    return calibrate_camera(
+        found.pairs,
+        how,
+        check=judges,
+        rejected=dict.fromkeys(found.left_out, "no robot pose at its time"),
+        more={"time_offset_s": found.offset_s, "time_offset_sigma_s": found.sigma_s},
+    )
