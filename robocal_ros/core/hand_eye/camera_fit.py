@@ -92,6 +92,7 @@ def fit_pairs(
     sound = robust_start(pairs)
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
     state = PairState(start or sound, np.zeros(count))
+    enough = len(pairs) >= _ENOUGH_TO_DOUBT
     noise = first_guess(differences(predicted(pairs, sound), pairs), free, known)
     for _ in range(_ROUNDS):
         V = covariances(pairs, state.at.X, noise)
@@ -100,13 +101,13 @@ def fit_pairs(
             problem,
             state,
             prior_information=problem.prior_information,
-            noise_known=not np.any(free),
-            robust=len(pairs) >= _ENOUGH_TO_DOUBT,
+            noise_known=enough or not np.any(free),
+            robust=enough,
         )
         before, state = noise, found.state
         miss, J = linearised(pairs, state)
-        keep = ~found.rejected
-        if np.any(free) and int(keep.sum()) >= _ENOUGH_TO_DOUBT:
+        if np.any(free) and enough:
+            keep = ~found.rejected
             parts = components(pairs, state.at.X)[:, keep]
             rest = covariances(pairs, state.at.X, PairNoise(0.0, 0.0))[keep]
             noise = estimate(miss[keep], J[keep], parts, rest, free, noise)

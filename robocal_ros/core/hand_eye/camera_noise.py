@@ -15,7 +15,7 @@ from robocal_ros.core.hand_eye.pose_pairs import PosePairs, levers
 
 Array = NDArray[np.float64]
 
-SMALLEST_M, SMALLEST_RAD = 1e-9, 1e-9  # keep noise-free data solvable
+SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data solvable
 _NORMAL_MEDIAN = 1.538  # median length of three unit normals
 _ROUNDS = 8
 _SETTLED = 1e-2
@@ -69,7 +69,7 @@ def covariances(pairs: PosePairs, X: Array, noise: PairNoise) -> Array:
 def first_guess(differences: Array, free: NDArray[np.bool_], known: PairNoise) -> PairNoise:
     """Unknown variances from the median of the differences (m, 6), shared out evenly."""
     place, turn = (
-        max(float(np.median(np.linalg.norm(part, axis=1))) / _NORMAL_MEDIAN, 1e-7)
+        max(float(np.median(np.linalg.norm(part, axis=1))) / _NORMAL_MEDIAN, SMALLEST_M)
         for part in (differences[:, :3], differences[:, 3:])
     )
     parts = int(free[1]) + int(free[2])
