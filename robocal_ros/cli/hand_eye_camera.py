@@ -40,6 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="YAML",
         help="of the camera, as ROS writes them; default: from the same images",
     )
+    _add_other_options(parser)
+
+
+def _add_other_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--measured",
         type=Path,

@@ -247,7 +247,7 @@ def write_profile(path: Path, points: Array) -> None:
 def write_pose_table(
     path: Path,
     T_base_flange: Array,
-    files: Sequence[str],
+    files: Sequence[str] | None = None,
     *,
     file_column: str = "profile",
     names: Sequence[str] | None = None,
@@ -265,7 +265,8 @@ def write_pose_table(
     columns: dict[str, list[str]] = {}
     if names is not None:
         columns["sample"] = list(names)
-    columns[file_column] = list(files)
+    if files is not None:
+        columns[file_column] = list(files)
     if mark is not None:
         columns["mark"] = list(mark)
     if stamp_ns is not None:

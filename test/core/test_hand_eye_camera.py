@@ -32,7 +32,7 @@ from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePo
 
 MOUNTS = ("in-hand", "to-hand")
 EXACT = BoardNoise(0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-KNOWN = GivenNoise(robot_m=2e-4, robot_rad=3e-4)
+KNOWN = GivenNoise(robot_m=2e-4, robot_rad=3e-4, camera_scale=1.0)
 BOARD = Chessboard(9, 6, 0.025)
 LENS = TrueLens()
 
@@ -134,7 +134,18 @@ def test_unknown_noise_of_both_sides_is_found() -> None:
     # 1200 degrees of freedom each: 2 % of a sigma, more where components compete
     assert np.sqrt(noise.variances[0]) == pytest.approx(5e-4, rel=0.12)
     assert noise.turn_rad == pytest.approx(8e-4, rel=0.12)
-    assert noise.camera_rad == pytest.approx(1.2e-3, rel=0.12)
+    assert noise.camera == pytest.approx(1.2e-3, rel=0.12)
+
+
+def test_a_camera_that_is_worse_than_it_says_is_found_out() -> None:
+    """As of a lens that is not as assumed: its errors are those of larger noise in the corners."""
+    truth = BoardNoise(board_m=(3e-4, 3e-4, 12e-4), board_rad=(3e-3, 3e-3, 6e-4))
+    cell, pairs = measured(200, 24, noise=truth)
+    told = replace(pairs, covariance=np.tile(truth.board_covariance / 9.0, (200, 1, 1)))
+    fit = fit_pairs(told)
+    assert fit.noise.camera_scale == pytest.approx(3.0, rel=0.12)
+    e = error(fit.at.X, cell.camera)
+    assert e @ np.linalg.solve(fit.covariance[:6, :6], e) < chi2.ppf(0.9999, 6)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -377,7 +388,7 @@ def test_from_corners_the_covariance_holds(given: bool) -> None:
         pairs = PosePairs(
             robot, seen.T_camera_board, seen.names, "in-hand", seen.covariance, seen.shared
         )
-        fit = fit_pairs(pairs, GivenNoise(1e-4, 2e-4))
+        fit = fit_pairs(pairs, GivenNoise(1e-4, 2e-4, camera_scale=1.0))
         e = error(fit.at.X, cell.camera)
         total += float(e @ np.linalg.solve(fit.covariance[:6, :6], e))
     assert sound(total, 6 * runs)

@@ -16,6 +16,7 @@ from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.camera_mistakes import mistake, require_pairs, swapped, wrong_scale
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised
 from robocal_ros.core.hand_eye.camera_quality import (
+    LARGEST_RMS_M,
     distances,
     left_out,
     rms,
@@ -31,7 +32,6 @@ Document = dict[str, Any]
 
 METHODS = ("best", "classic", *CLOSED_FORMS)
 LARGEST_START_M = 3e-2  # median miss beyond which no search can be trusted
-LARGEST_RMS_M = 1e-2
 MOST_COMPARED = 100  # samples for the closed forms: OpenCV pairs each with each
 
 
@@ -100,24 +100,21 @@ def require_sound(pairs: PosePairs) -> None:
     """
     require_pairs(pairs)
     sound = robust_start(pairs)
-    _require_fit(pairs, sound, score(pairs, sound), LARGEST_START_M)
+    size_m = score(pairs, sound)
+    if size_m <= LARGEST_START_M:
+        return
+    words = mistake(pairs, sound)
+    if words:
+        raise InputError(words)
+    raise ResidualError(
+        f"robot and board miss each other by {size_m * 1e3:.4g} mm (allowed "
+        f"{LARGEST_START_M * 1e3:.0f}): check that each board pose belongs to its robot pose, the "
+        "mount (in-hand or to-hand), units and angles, and that the board stayed where it was"
+    )
 
 
 def _start(pairs: PosePairs, method: str) -> Placement | None:
     return closed_form(method, pairs) if method in CLOSED_FORMS else None
-
-
-def _require_fit(pairs: PosePairs, at: Placement, size_m: float, limit_m: float) -> None:
-    if size_m <= limit_m:
-        return
-    words = mistake(pairs, at)
-    if words:
-        raise InputError(words)
-    raise ResidualError(
-        f"robot and board miss each other by {size_m * 1e3:.4g} mm (allowed {limit_m * 1e3:.0f}): "
-        "check that each board pose belongs to its robot pose, the mount (in-hand or to-hand), "
-        "units and angles, and that the board stayed where it was"
-    )
 
 
 def closed_forms(pairs: PosePairs) -> dict[str, Placement | None]:
@@ -146,14 +143,14 @@ def _check_document(check: PosePairs | None, state: PairState) -> Document:
 
 
 def _noise_document(fit: PairFit, known: GivenNoise) -> Document:
-    noise = fit.noise
+    noise, own = fit.noise, fit.pairs.covariance is not None
     return {
         "noise": {
-            "position_mm": float(np.sqrt(noise.variances[0])) * 1e3,
+            "position_mm": noise.position_m * 1e3,
             "robot_turn_deg": float(np.degrees(noise.turn_rad)),
-            "camera_turn_deg": float(np.degrees(noise.camera_rad)),
-            "robot_given": known.robot_m is not None and known.robot_rad is not None,
-            "camera_given": fit.pairs.covariance is not None or known.camera_m is not None,
+            "camera_turn_deg": None if own else float(np.degrees(noise.camera)),
+            "camera_scale": noise.camera_scale if own else None,
+            "estimated": bool(np.any(np.isnan(known.variances(own)))),
         }
     }
 
@@ -180,10 +177,10 @@ def _result(
     pairs, used = fit.pairs, ~fit.rejected
     miss = fit.differences[used]
     size = np.linalg.norm(miss[:, :3], axis=1)
-    _require_fit(pairs, fit.at, float(np.sqrt(np.mean(size**2))), LARGEST_RMS_M)
-    scale = wrong_scale(pairs.take(used), fit.at)
-    if scale:
-        raise InputError(scale)
+    wrong = mistake(pairs, fit.at) if rms(size) > LARGEST_RMS_M else ""
+    wrong = wrong or wrong_scale(pairs.take(used), fit.at)
+    if wrong:
+        raise InputError(wrong)
     kept = pairs.take(used)
     error = working_error(fit)
     return HandEyeResult(

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.hand_eye.camera_model import PairProblem, PairState, linearised
 from robocal_ros.core.hand_eye.camera_noise import (
+    Evidence,
     PairNoise,
-    components,
     covariances,
     estimate,
     first_guess,
@@ -26,12 +26,31 @@ _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several varianc
 
 @dataclass(frozen=True)
 class GivenNoise:
-    """What is known of the noise, standard deviations per axis; None is estimated."""
+    """What is known of the noise, standard deviations per axis; None is estimated.
+
+    Attributes
+    ----------
+    camera_m, camera_rad : of board poses without a covariance of their own.
+    camera_scale : factor of the sigmas in the covariance that board poses have: 1 to trust it. What
+        is told of corners alone knows nothing of a lens or a board that are not as assumed.
+    """
 
     robot_m: float | None = None
     robot_rad: float | None = None
     camera_m: float | None = None
     camera_rad: float | None = None
+    camera_scale: float | None = None
+
+    def variances(self, own_covariance: bool) -> Array:
+        """(3,) as of `PairNoise`; nan where they are to be estimated."""
+        unknown = float("nan")
+        robot = unknown if self.robot_m is None else self.robot_m**2
+        turn = unknown if self.robot_rad is None else self.robot_rad**2
+        if own_covariance:
+            scale = unknown if self.camera_scale is None else self.camera_scale**2 - 1.0
+            return np.array([robot, turn, scale])
+        place = unknown if self.camera_m is None else robot + self.camera_m**2
+        return np.array([place, turn, unknown if self.camera_rad is None else self.camera_rad**2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,15 +107,17 @@ def fit_pairs(
     TooFewSamplesError, RankDeficientError
         As `robocal_ros.core.estimation.solve`.
     """
-    known, free = _split(pairs, given or GivenNoise())
+    known = (given or GivenNoise()).variances(pairs.covariance is not None)
+    free = np.isnan(known)
     sound = robust_start(pairs)
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
     state = PairState(start or sound, np.zeros(count))
     enough = len(pairs) >= _ENOUGH_TO_DOUBT
-    noise = first_guess(differences(predicted(pairs, sound), pairs), free, known)
+    noise = first_guess(pairs, differences(predicted(pairs, sound), pairs), known)
     for _ in range(_ROUNDS):
         V = covariances(pairs, state.at.X, noise)
-        problem = PairProblem.of(pairs, V)
+        scale = 1.0 if pairs.covariance is None else noise.camera_scale
+        problem = PairProblem.of(pairs, V, scale)
         found = solve(
             problem,
             state,
@@ -108,26 +129,12 @@ def fit_pairs(
         miss, J = linearised(pairs, state)
         if np.any(free) and enough:
             keep = ~found.rejected
-            parts = components(pairs, state.at.X)[:, keep]
-            rest = covariances(pairs, state.at.X, PairNoise(0.0, 0.0))[keep]
-            noise = estimate(miss[keep], J[keep], parts, rest, free, noise)
+            used = pairs if np.all(keep) else pairs.take(keep)
+            seen = Evidence.of(used, state.at.X, miss[keep], J[keep], state.common)
+            noise = estimate(seen, free, noise)
         if _same(before, noise):
             break
     return PairFit(pairs, state.at, noise, miss, J, V, found)
-
-
-def _split(pairs: PosePairs, given: GivenNoise) -> tuple[PairNoise, NDArray[np.bool_]]:
-    """What is known, and which of the three variances are to be estimated."""
-    camera_known = pairs.covariance is not None
-    known = PairNoise(
-        given.robot_m or 0.0, given.robot_rad or 0.0, given.camera_m or 0.0, given.camera_rad or 0.0
-    )
-    free = [
-        given.robot_m is None or (given.camera_m is None and not camera_known),
-        given.robot_rad is None,
-        given.camera_rad is None and not camera_known,
-    ]
-    return known, np.array(free)
 
 
 def _same(before: PairNoise, after: PairNoise) -> bool:

@@ -12,6 +12,7 @@ from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differenc
 Array = NDArray[np.float64]
 
 MOST_REJECTED = 1.0 / 3.0
+LARGEST_RMS_M = 5e-3
 
 
 def distances(pairs: PosePairs, at: Placement) -> Array:
@@ -51,6 +52,12 @@ def verdict(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdic
     )
     if fit.estimate.creeping:
         return Verdict(Code.POSES_NOT_INFORMATIVE, f"{fit.estimate.creeping}; {words}")
+    if rms(size) > LARGEST_RMS_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
+            "intrinsics, the robot's model, and that board and camera sit tight",
+        )
     if total - count > MOST_REJECTED * total:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
