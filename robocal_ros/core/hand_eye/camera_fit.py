@@ -1,6 +1,7 @@
 """Maximum likelihood of a hand-eye calibration, with the noise of both sides."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from robocal_ros.core.hand_eye.camera_noise import (
     first_guess,
 )
 from robocal_ros.core.hand_eye.camera_start import robust_start
-from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
+from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
 
 Array = NDArray[np.float64]
 
@@ -59,23 +60,40 @@ class PairFit:
 
     Attributes
     ----------
-    at : the placement; ``covariance`` (12, 12) of the increments (v, w) of X along the camera's
-        axes and of Z along the board's.
-    differences : (m, 6) of all samples, camera axes, m and rad; ``expected`` (m, 6, 6) their
-        covariance by the noise alone.
+    noise : of both sides, given or estimated.
+    expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
     """
 
     pairs: PosePairs
-    at: Placement
     noise: PairNoise
-    differences: Array
-    jacobian: Array
     expected: Array
     estimate: Estimate[PairState]
 
     @property
+    def at(self) -> Placement:
+        """Where camera and board are."""
+        return self.estimate.state.at
+
+    @cached_property
+    def _linearised(self) -> tuple[Array, Array]:
+        return linearised(self.pairs, self.estimate.state)
+
+    @property
+    def differences(self) -> Array:
+        """Differences (m, 6) of all samples, camera axes, m and rad."""
+        return self._linearised[0]
+
+    @property
+    def jacobian(self) -> Array:
+        """Their Jacobian (m, 6, 12 + s)."""
+        return self._linearised[1]
+
+    @property
     def covariance(self) -> Array:
-        """Of both placements; of a stream widened, because neighbours share their errors."""
+        """Covariance (12, 12) of the increments (v, w) of X, camera axes, and of Z, board axes.
+
+        Of a stream it is widened, because neighbours share their errors.
+        """
         return self.whole_covariance[:12, :12]
 
     @property
@@ -113,7 +131,7 @@ def fit_pairs(
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
     state = PairState(start or sound, np.zeros(count))
     enough = len(pairs) >= _ENOUGH_TO_DOUBT
-    noise = first_guess(pairs, differences(predicted(pairs, sound), pairs), known)
+    noise = first_guess(pairs, sound, known)
     for _ in range(_ROUNDS):
         V = covariances(pairs, state.at.X, noise)
         scale = 1.0 if pairs.covariance is None else noise.camera_scale
@@ -126,15 +144,15 @@ def fit_pairs(
             robust=enough,
         )
         before, state = noise, found.state
-        miss, J = linearised(pairs, state)
         if np.any(free) and enough:
+            miss, J = linearised(pairs, state)
             keep = ~found.rejected
             used = pairs if np.all(keep) else pairs.take(keep)
             seen = Evidence.of(used, state.at.X, miss[keep], J[keep], state.common)
             noise = estimate(seen, free, noise)
         if _same(before, noise):
             break
-    return PairFit(pairs, state.at, noise, miss, J, V, found)
+    return PairFit(pairs, noise, V, found)
 
 
 def _same(before: PairNoise, after: PairNoise) -> bool:

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs, levers
+from robocal_ros.core.hand_eye.pose_pairs import (
+    Placement,
+    PosePairs,
+    differences,
+    levers,
+    predicted,
+)
 
 Array = NDArray[np.float64]
 
@@ -76,14 +82,17 @@ def covariances(pairs: PosePairs, X: Array, noise: PairNoise) -> Array:
     return np.asarray(parts + known_part(pairs))
 
 
-def first_guess(pairs: PosePairs, differences: Array, known: Array) -> PairNoise:
-    """Unknown variances, nan in ``known`` (3,), from the median of the differences (m, 6).
+def first_guess(pairs: PosePairs, at: Placement, known: Array) -> PairNoise:
+    """Unknown variances, nan in ``known`` (3,), from the median of the differences at a start.
 
     On the large side: what is rejected by too small a noise makes it smaller still.
     """
+    if not np.any(np.isnan(known)):
+        return _noise(known)
+    miss = differences(predicted(pairs, at), pairs)
     place, turn = (
         max(float(np.median(np.linalg.norm(part, axis=1))) * _GENEROUS / _NORMAL_MEDIAN, SMALLEST_M)
-        for part in (differences[:, :3], differences[:, 3:])
+        for part in (miss[:, :3], miss[:, 3:])
     )
     guess = np.square([place, turn, turn if pairs.covariance is None else _GENEROUS])
     return _noise(np.where(np.isnan(known), guess, known))
@@ -103,10 +112,10 @@ class Evidence:
 
     @classmethod
     def of(
-        cls, pairs: PosePairs, X: Array, differences: Array, jacobian: Array, common: Array
+        cls, pairs: PosePairs, X: Array, miss: Array, jacobian: Array, common: Array
     ) -> "Evidence":
         """Of pairs at a solution; ``common`` (s,) errors are evidence of the camera's too."""
-        own = cls(differences, jacobian, components(pairs, X), known_part(pairs))
+        own = cls(miss, jacobian, components(pairs, X), known_part(pairs))
         if pairs.covariance is None or pairs.shared is None:
             return own
         # Their deviations from zero, made independent, in rows of six as all others; rows that
