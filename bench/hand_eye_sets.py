@@ -5,7 +5,7 @@ a camera and time stamps (Furrer et al. 2017, BSD-3-Clause), below $ROBOCAL_DATA
 """
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from pathlib import Path
 
@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from bench.ur10_campaigns import data_folder
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.board import Chessboard, Image, decode_image
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+from robocal_ros.core.hand_eye.camera_closed_forms import closed_form
+from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
 from robocal_ros.core.hand_eye.streams import PoseStream, stream_of
 from robocal_ros.storage.hand_eye_tables import write_pose_table
 
@@ -50,6 +51,14 @@ def tmac_pairs(series: str) -> PosePairs:
     place = columns("measurement_x", "measurement_y", "measurement_z") * 1e-3
     names = tuple(str(row) for row in range(2, len(rows) + 2))
     return PosePairs(flange, frames.transform(turn, place), names, "to-hand")
+
+
+def turned_tsai(pairs: PosePairs) -> Placement | None:
+    """OpenCV's Tsai with the roles of X and Z exchanged: on series B it is off by millimetres."""
+    found = closed_form(
+        "tsai", replace(pairs, mount="in-hand", T_camera_board=frames.invert(pairs.T_camera_board))
+    )
+    return None if found is None else Placement(found.Z, found.X)
 
 
 @dataclass(frozen=True, eq=False)

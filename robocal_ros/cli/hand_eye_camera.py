@@ -18,6 +18,7 @@ HELP = "place a camera from images of a chessboard, or from poses of a board or 
 
 METHODS = ("best", "classic", *CLOSED_FORMS)
 MOUNTS = ("in-hand", "to-hand")
+MOST_NAMED = 5  # samples left out for one reason
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,7 +104,6 @@ def _board(value: str) -> tuple[int, int]:
 
 
 def _show(console: "Console", document: Document) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     verdict = document["verdict"]
@@ -130,6 +130,12 @@ def _show(console: "Console", document: Document) -> None:
         console.print(
             f"Check, {check['n']} poses: mean {check['mean_mm']:.3f} mm, max {check['max_mm']:.3f}"
         )
+    _show_residuals(console, document)
+
+
+def _show_residuals(console: "Console", document: Document) -> None:
+    from rich.table import Table
+
     table = Table(title="Mean residual, mm", title_justify="left")
     table.add_column("method")
     table.add_column("mm", justify="right")
@@ -138,5 +144,10 @@ def _show(console: "Console", document: Document) -> None:
     per_sample = document["residual_mm"]["per_sample"].values()
     table.add_row(document["method"], f"{sum(per_sample) / len(per_sample):.3f}")
     console.print(table)
+    same: dict[str, list[str]] = {}
     for name, reason in document["rejected_because"].items():
-        console.print(f"Left out: {name}: {reason}", soft_wrap=True, markup=False)
+        same.setdefault(reason, []).append(name)
+    for reason, names in same.items():
+        who = ", ".join(names[:MOST_NAMED]) + (", …" if len(names) > MOST_NAMED else "")
+        count = f"{len(names)} samples, " if len(names) > 1 else ""
+        console.print(f"Left out: {count}{who}: {reason}", soft_wrap=True, markup=False)

@@ -132,8 +132,9 @@ def fit_pairs(
     state = PairState(start or sound, np.zeros(count))
     enough = len(pairs) >= _ENOUGH_TO_DOUBT
     noise = first_guess(pairs, sound, known)
+    X = sound.X  # not of a start that may be far off: weights follow from it
     for _ in range(_ROUNDS):
-        V = covariances(pairs, state.at.X, noise)
+        V = covariances(pairs, X, noise)
         scale = 1.0 if pairs.covariance is None else noise.camera_scale
         problem = PairProblem.of(pairs, V, scale)
         found = solve(
@@ -143,12 +144,12 @@ def fit_pairs(
             noise_known=enough or not np.any(free),
             robust=enough,
         )
-        before, state = noise, found.state
+        before, state, X = noise, found.state, found.state.at.X
         if np.any(free) and enough:
             miss, J = linearised(pairs, state)
             keep = ~found.rejected
             used = pairs if np.all(keep) else pairs.take(keep)
-            seen = Evidence.of(used, state.at.X, miss[keep], J[keep], state.common)
+            seen = Evidence.of(used, X, miss[keep], J[keep], state.common)
             noise = estimate(seen, free, noise)
         if _same(before, noise):
             break
