@@ -26,7 +26,7 @@ def closed_form(name: str, pairs: PosePairs) -> Placement | None:
     """
     import cv2
 
-    carrier, board = pairs.T_reference_carrier, pairs.T_camera_board
+    carrier, board = pairs.T_boardside_cameraside, pairs.T_camera_board
     try:
         if name in HAND_EYE:
             code = getattr(cv2, f"CALIB_HAND_EYE_{name.upper()}")

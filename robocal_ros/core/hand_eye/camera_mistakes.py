@@ -77,7 +77,7 @@ def _require_turns(pairs: PosePairs) -> None:
     words = " ".join(f"{value:+.2f}" for value in axis)
     hidden = [f"translation along the common rotation axis ({words} in the {where})"]
     remedy = "turn the flange about another axis too, by 20 deg or more"
-    if _one_centre(pairs.T_reference_carrier):
+    if _one_centre(pairs.T_boardside_cameraside):
         hidden.append(f"turn about the same axis ({words} in the {where})")
     raise RankDeficientError(
         f"the flange turned about one axis only ({np.degrees(spread[0]):.1f} deg rms, "
@@ -99,7 +99,7 @@ def _one_centre(T: Array) -> bool:
 
 def scale_of_board(pairs: PosePairs, at: Placement) -> tuple[float, float]:
     """Factor by which board positions would fit the robot's better, and its sigma."""
-    carrier = pairs.T_reference_carrier
+    carrier = pairs.T_boardside_cameraside
     R = carrier[:, :3, :3]
     seen = R @ (at.X[:3, :3] @ pairs.T_camera_board[:, :3, 3, None])
     A = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape), seen], axis=2).reshape(-1, 7)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, TooFewSamplesError
+from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera, require_sound
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.pose_pairs import Mount, PosePairs, Shared, differences, predicted
@@ -213,6 +213,12 @@ def pair_streams(
         pairs, left_out = pairs_at(robot, camera, offset, mount)
         if abs(step) < max(_CLOSE_S, 0.01 * _sigma(fit)):
             break
+    else:
+        raise RankDeficientError(
+            f"the time offset did not settle (last {offset:.4f} s): record a motion that turns "
+            "about all axes, with changes of speed",
+            ("time offset",),
+        )
     return StreamPairs(_with_offset(robot, pairs, fit, offset), offset, _sigma(fit), left_out)
 
 
