@@ -21,6 +21,8 @@ from robocal_ros.cli.tool_frames import three_numbers
 from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.console import Console
 
     from robocal_ros.core.hand_eye.mount_problem import PoseNoise
@@ -92,10 +94,11 @@ def run(args: argparse.Namespace) -> Outcome:
     target = _planned(known, args.center_mm, sensor, table.mark)
     X = read_flange_mount(args.mount)
     report = check_plan(target, table.T_base_flange, X, sensor, _noise(settings), settings.limit_m)
+    marks = None if table.mark is None else _lit(target, report.proposed @ X)
     if args.propose is not None:
         names = [f"proposed_{i + 1:02d}" for i in range(len(report.proposed))]
-        write_pose_table(args.propose, report.proposed, names=names)
-    document = _document(report, table.names)
+        write_pose_table(args.propose, report.proposed, names=names, mark=marks)
+    document = _document(report, table.names) | {"proposed_marks": marks}
     return Outcome(document, partial(_show, document=document))
 
 
@@ -142,6 +145,13 @@ def _planned(
     return PlannedLine(sensor, line)
 
 
+def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[str] | None:
+    """Marks of the stairs on which proposed poses lay the light."""
+    from robocal_ros.core.hand_eye.planned_targets import PlannedStep
+
+    return list(target.lit(T_base_sensor)) if isinstance(target, PlannedStep) else None
+
+
 def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
     from math import degrees
 
@@ -181,7 +191,9 @@ def _show(console: "Console", document: Document) -> None:
             f"With {len(proposed)} more poses, expected error "
             f"{document['proposed_error_mm']:.3f} mm rms:"
         )
-    for pose in proposed:
+    for pose, mark in zip(
+        proposed, document["proposed_marks"] or [""] * len(proposed), strict=True
+    ):
         xyz = ", ".join(f"{value:.1f}" for value in pose["xyz_mm"])
         quat = " ".join(f"{value:.4f}" for value in pose["quat_xyzw"])
-        console.print(f"  {xyz} mm; x y z w {quat}")
+        console.print(f"  {xyz} mm; x y z w {quat} {mark}".rstrip())

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+from camera_tables import camera_tables
 from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
@@ -43,6 +44,7 @@ FEW_SPHERE = [*SPHERE[:2], "--poses", "sphere/few.csv", *SPHERE[4:]]
 STEP = ["--target", "step/target.yaml", "--poses", "step/poses.csv", "--profiles", "step/profiles"]
 LINE = ["--poses", "line/poses.csv", "--profiles", "line/profiles"]
 PLANNED = ["hand-eye", "check-plan", "--target-kind", "sphere", "--radius-mm", "20"]
+CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -207,6 +209,12 @@ CASES = {
         ["hand-eye", "export", "--result", "sphere/target.yaml", "--format", "urdf"],
         (2, "BAD_INPUT"),
     ),
+    "hand-eye camera": (
+        "hand-eye.camera.json",
+        [*CAMERA, "--poses", "camera_poses.csv", "--check", "camera_check.csv"],
+        [*CAMERA, "--poses", "few_camera_poses.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -232,6 +240,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shots = (folder / "sphere" / "poses.csv").read_text().splitlines()
     (folder / "sphere" / "few.csv").write_text("\n".join(shots[:4]) + "\n")
     (folder / "mount.yaml").write_text(json.dumps({"T_flange_sensor": transform_document(TRUE)}))
+    camera_tables(folder)
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)
