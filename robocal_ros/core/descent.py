@@ -60,20 +60,27 @@ class Run(Generic[S]):
 
 @dataclass(frozen=True)
 class Descent(Generic[S]):
-    """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known."""
+    """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known.
+
+    ``sizes`` (m,): how many of its c components each sample has; the others are zero.
+    """
 
     problem: Problem[S]
     prior: Array
     scale_components: int
+    sizes: NDArray[np.int64]
 
     def run(
         self,
         run: Run[S],
         keep: NDArray[np.bool_],
-        huber: float = np.inf,
+        huber: Array | None = None,
         tolerance: float = STEP_TOLERANCE,
     ) -> Run[S]:
-        """Minimise the (Huber) cost until a step is far below a standard deviation."""
+        """Minimise the cost until a step is far below a standard deviation.
+
+        ``huber`` (m,): length of each sample's residual from which it counts linearly.
+        """
         k = run.jacobian.shape[2]
         state, residual, jacobian = run.state, run.residual, run.jacobian
         for iterations in range(run.iterations + 1, run.iterations + MOST_ITERATIONS + 1):
@@ -95,11 +102,9 @@ class Descent(Generic[S]):
             state, residual, jacobian = trial, new_residual, new_jacobian
         return Run(state, residual, jacobian, iterations, False)
 
-    def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: float) -> float:
+    def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: Array | None) -> float:
         return (
-            self.plain_scale(residual, keep)
-            if huber == np.inf
-            else self.robust_scale(residual, keep)
+            self.plain_scale(residual, keep) if huber is None else self.robust_scale(residual, keep)
         )
 
     def plain_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
@@ -125,21 +130,27 @@ class Descent(Generic[S]):
             return self.plain_scale(residual, keep)
         used = residual[keep]
         explained = float(np.trace(information @ self.posterior(information, 1.0)))
-        freedom = used.size - explained
+        freedom = float(np.sum(self.sizes[keep])) - explained
         misfit = float(np.sum(used**2))
         if freedom < 1.0 or misfit <= chi2_quantile(SOUND_FIT, freedom):
             return 1.0
         return float(np.sqrt(misfit / freedom))
 
-    def _stretch(self, squared: Array, keep: NDArray[np.bool_], c: int) -> float:
+    def _stretch(self, squared: Array, keep: NDArray[np.bool_]) -> float:
         """Factor by which studentised distances (m,) are larger than given sigmas explain.
 
         From their median, which outliers cannot inflate; 1 unless it is clearly larger.
         """
         if self.scale_components:
             return 1.0
-        stretch = float(np.sqrt(np.median(squared[keep]) / chi2_quantile(0.5, c)))
+        share = squared[keep] / self.quantiles(0.5)[keep]
+        stretch = float(np.sqrt(np.median(share)))
         return stretch if stretch > CLEAR_STRETCH else 1.0
+
+    def quantiles(self, probability: float) -> Array:
+        """Quantile (m,) of each sample's chi-square distribution."""
+        values = {int(n): chi2_quantile(probability, int(n)) for n in np.unique(self.sizes)}
+        return np.array([values[int(n)] for n in self.sizes])
 
     def _normal(
         self,
@@ -148,10 +159,10 @@ class Descent(Generic[S]):
         jacobian: Array,
         keep: NDArray[np.bool_],
         scale: float,
-        huber: float,
+        huber: Array | None,
     ) -> tuple[Array, Array, float]:
         weight = np.where(keep, 1.0, 0.0)
-        if huber < np.inf:
+        if huber is not None:
             distance = _lengths(residual)
             weight *= np.minimum(1.0, huber * scale / np.maximum(distance, np.finfo(float).tiny))
         J = jacobian.reshape(-1, jacobian.shape[2])
@@ -161,10 +172,15 @@ class Descent(Generic[S]):
         return information, gradient, self._cost(state, residual, keep, scale, huber)
 
     def _cost(
-        self, state: S, residual: Array, keep: NDArray[np.bool_], scale: float, huber: float
+        self,
+        state: S,
+        residual: Array,
+        keep: NDArray[np.bool_],
+        scale: float,
+        huber: Array | None,
     ) -> float:
         distance = _lengths(residual[keep]) / scale
-        near = np.minimum(distance, huber)
+        near = distance if huber is None else np.minimum(distance, huber[keep])
         away = self.problem.deviation(state)
         return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
 
@@ -188,7 +204,7 @@ class Descent(Generic[S]):
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
         squared = np.sum(run.residual * whitened, axis=1)
-        limit = chi2_quantile(1.0 - FALSE_REJECTION / m, c) * self._stretch(squared, keep, c) ** 2
+        limit = self.quantiles(1.0 - FALSE_REJECTION / m) * self._stretch(squared, keep) ** 2
         inlier = squared < limit
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep

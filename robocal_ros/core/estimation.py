@@ -17,7 +17,6 @@ from robocal_ros.core.descent import (
     Descent,
     Problem,
     Run,
-    chi2_quantile,
     information_of,
     rows_of,
 )
@@ -71,6 +70,7 @@ def solve(
     prior_information: Array | None = None,
     noise_known: bool = True,
     robust: bool = True,
+    sizes: NDArray[np.int64] | None = None,
 ) -> Estimate[S]:
     """Find the most likely state.
 
@@ -80,6 +80,8 @@ def solve(
     noise_known : whether residuals are in units of their true sigma; otherwise a common scale
         is estimated with them.
     robust : whether to look for outliers.
+    sizes : (m,) how many of its c components each sample has, where they differ; the residuals
+        and Jacobians of the others are zero.
 
     Raises
     ------
@@ -91,14 +93,16 @@ def solve(
         When the residuals at the start are not finite.
     """
     residual, jacobian = problem.linearise(start)
-    k = jacobian.shape[2]
+    m, c, k = jacobian.shape
+    if sizes is None:
+        sizes = np.full(m, c, dtype=np.int64)
     if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
         raise ValueError("the residuals at the start are not finite")
     flat = prior_information is None
     if flat:
-        _require_enough(jacobian, problem.names)
+        _require_enough(jacobian, int(np.sum(sizes)), problem.names)
     prior = np.zeros((k, k)) if prior_information is None else prior_information
-    descent = Descent(problem, prior, 0 if noise_known else problem.scale_components)
+    descent = Descent(problem, prior, 0 if noise_known else problem.scale_components, sizes)
     run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
     information = information_of(run.jacobian, keep)
     seen = observability(rows_of(run.jacobian, keep), information)
@@ -125,10 +129,9 @@ def _settle(
     descent: Descent[S], run: Run[S], robust: bool, flat: bool
 ) -> tuple[Run[S], NDArray[np.bool_]]:
     """Descend and reject in turn until the samples in use no longer change."""
-    m, c, _ = run.jacobian.shape
-    keep = np.ones(m, dtype=np.bool_)
+    keep = np.ones(len(run.jacobian), dtype=np.bool_)
     if robust:
-        limit = float(np.sqrt(chi2_quantile(0.95, c)))
+        limit = np.sqrt(descent.quantiles(0.95))
         run = descent.run(run, keep, huber=limit, tolerance=FIRST_TOLERANCE)
         keep = descent.inliers(run, keep)
     for attempt in count():
@@ -145,10 +148,10 @@ def _settle(
     return run, keep
 
 
-def _require_enough(jacobian: Array, names: tuple[str, ...]) -> None:
-    m, c, k = jacobian.shape
-    if m * c < k:
-        raise TooFewSamplesError(f"{m} samples give {m * c} equations for {k} unknowns")
+def _require_enough(jacobian: Array, equations: int, names: tuple[str, ...]) -> None:
+    m, _, k = jacobian.shape
+    if equations < k:
+        raise TooFewSamplesError(f"{m} samples give {equations} equations for {k} unknowns")
     _require_full_rank(observability(jacobian.reshape(-1, k)), names)
 
 

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import InvalidOperation
 from pathlib import Path
@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted, read_text
+from robocal_ros.storage.files import quoted, read_text, write_text
 
 Array = NDArray[np.float64]
 
 LARGEST = 1e9  # in any unit: beyond it squares lose what is left of a measurement
+DIGITS = ".12g"  # 1e-9 mm in a metre, and no trailing noise of binary fractions
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,10 @@ class Cells:
         """
         raise InputError(message, file=self.file, row=self.rows[index], column=column)
 
-    def numbers(self, name: str) -> Array:
+    def numbers(self, name: str, *, gaps: bool = False) -> Array:
         """A column of finite numbers (m,).
+
+        With ``gaps`` a cell that is empty or says nan is not-a-number.
 
         Raises
         ------
@@ -52,15 +55,17 @@ class Cells:
             At the first cell that is none.
         """
         cells = self.columns[name]
+        if gaps:
+            cells = tuple(cell.strip() or "nan" for cell in cells)
         try:
             values = np.array([float(cell) for cell in cells])
         except ValueError:
-            self.fail_at_text(name, float)
+            self.fail_at_text(name, float, gaps=gaps)
         if "_" in "".join(cells):  # Python reads 1_000 as a thousand; a table must not mean that
             index = next(i for i, cell in enumerate(cells) if "_" in cell)
             self.fail(f"{quoted(cells[index])} is not a number", index, name)
         for wrong, words in (
-            (~np.isfinite(values), "is not a finite number"),
+            (np.isinf(values) if gaps else ~np.isfinite(values), "is not a finite number"),
             (np.abs(values) > LARGEST, "is no measurement"),
         ):
             if np.any(wrong):
@@ -81,8 +86,10 @@ class Cells:
             self.fail("the cell is empty", words.index(""), name)
         return words
 
-    def fail_at_text(self, name: str, convert: Callable[[str], object]) -> NoReturn:
-        """Refuse the first cell that ``convert`` refuses.
+    def fail_at_text(
+        self, name: str, convert: Callable[[str], object], *, gaps: bool = False
+    ) -> NoReturn:
+        """Refuse the first cell that ``convert`` refuses, with ``gaps`` the first such text.
 
         Raises
         ------
@@ -91,7 +98,7 @@ class Cells:
         """
         for index, cell in enumerate(self.columns[name]):
             try:
-                convert(cell.strip())
+                convert(cell.strip() or ("nan" if gaps else ""))
             except (ValueError, InvalidOperation):
                 text = cell.strip()
                 if not text:
@@ -130,6 +137,26 @@ def read_cells(path: Path, check: Callable[[list[str], str], None]) -> Cells:
     names = [name.strip() for name in header]
     columns = zip(*rows, strict=True)
     return Cells(file, tuple(numbers), dict(zip(names, columns, strict=True)))
+
+
+def texts(values: Array) -> list[str]:
+    """Numbers as cells."""
+    return [format(value, DIGITS) for value in values.tolist()]
+
+
+def write_cells(path: Path, columns: Mapping[str, Sequence[str]]) -> None:
+    """Write a table by its columns; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    write_text(path, text.getvalue())
 
 
 def _ragged(row: list[str], width: int) -> str:

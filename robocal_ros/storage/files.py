@@ -31,6 +31,23 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" (did you mean '{folded[found[0]]}'?)" if found else ""
 
 
+def read_bytes(path: Path, what: str) -> bytes:
+    """Content of a file.
+
+    Raises
+    ------
+    InputError
+        When the file is missing or unreadable.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"no such {what}", file=str(path)) from error
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"this {what} cannot be read: {reason}", file=str(path)) from error
+
+
 def read_text(path: Path, what: str) -> str:
     """Text of a UTF-8 file, without a byte order mark.
 
@@ -39,13 +56,7 @@ def read_text(path: Path, what: str) -> str:
     InputError
         When the file is missing, unreadable, empty or not UTF-8.
     """
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"no such {what}", file=str(path)) from error
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"this {what} cannot be read: {reason}", file=str(path)) from error
+    data = read_bytes(path, what)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -47,7 +47,7 @@ class Fields:
     """A mapping of the file; ``place`` says where it is ("" is the top)."""
 
     def __init__(self, values: Any, file: str, place: str) -> None:
-        self._file = file
+        self.file = file
         self.place = place
         if not isinstance(values, dict):
             self.fail(f"must be keys and values, not {_kind(values)}")
@@ -56,7 +56,7 @@ class Fields:
     def fail(self, message: str, key: str = "") -> NoReturn:
         """Refuse the file; ``message`` continues the place and the key."""
         place = ", ".join(part for part in (self.place, key) if part) or "the file"
-        raise InputError(f"{place} {message}", file=self._file)
+        raise InputError(f"{place} {message}", file=self.file)
 
     def only(self, *known: str) -> None:
         """Refuse keys beside the known ones."""
@@ -124,14 +124,14 @@ class Fields:
 
     def below(self, key: str) -> "Fields":
         """The mapping at ``key``."""
-        return Fields(self._get(key), self._file, key)
+        return Fields(self._get(key), self.file, key)
 
     def items(self, key: str, name: str) -> list["Fields"]:
         """The mappings of the list at ``key``, which must not be empty."""
         value = self._get(key)
         if not isinstance(value, list) or not value:
             self.fail(f"must be a list with at least one {name}", key)
-        return [Fields(item, self._file, f"{name} {i}") for i, item in enumerate(value, start=1)]
+        return [Fields(item, self.file, f"{name} {i}") for i, item in enumerate(value, start=1)]
 
 
 def _kind(value: Any) -> str:

@@ -15,6 +15,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.storage.files import nearest, quoted, read_text, write_text
 from robocal_ros.storage.places import share_folders
+from robocal_ros.storage.pose_fields import read_pose
 from robocal_ros.storage.robot_fields import Fields, load_yaml
 
 Array = NDArray[np.float64]
@@ -186,22 +187,8 @@ class _Joint:
 
 
 def _pose(top: Fields, key: str) -> Array:
-    """Transform (4, 4) of an optional ``{xyz_mm, quat_xyzw or rpy_deg}``."""
-    if key not in top.values:
-        return np.eye(4)
-    fields = top.below(key)
-    fields.only("xyz_mm", "quat_xyzw", "rpy_deg")
-    xyz = np.array(fields.numbers("xyz_mm", 3)) * MM
-    if "quat_xyzw" in fields.values and "rpy_deg" in fields.values:
-        fields.fail("is given beside rpy_deg; use one of them", "quat_xyzw")
-    if "quat_xyzw" in fields.values:
-        quat = np.array(fields.numbers("quat_xyzw", 4))
-        length = float(np.linalg.norm(quat))
-        if abs(length - 1.0) > 1e-3:
-            fields.fail(f"has length {length:.6g}, not 1", "quat_xyzw")
-        return frames.transform_from_quat(xyz, quat)
-    rpy = np.array(fields.numbers("rpy_deg", 3, (0.0, 0.0, 0.0))) * RAD
-    return frames.transform(frames.rotation_from_rpy(rpy), xyz)
+    """Transform (4, 4) of an optional pose."""
+    return read_pose(top.below(key)) if key in top.values else np.eye(4)
 
 
 def _open_limits(arm: SerialArm) -> tuple[str, ...]:

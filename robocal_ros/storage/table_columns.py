@@ -3,6 +3,7 @@
 The contract is written in docs/csv.md.
 """
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NoReturn
@@ -25,7 +26,13 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 ORIENTATIONS = (EULER, ROTATION_VECTOR, QUATERNION)
 NUMBERS = ("stamp_s", "sigma_mm")
 WORDS = ("target", "sample", "pose", "cycle")
+JOINT = re.compile(r"q[1-9][0-9]?_(deg|rad|mm|m)")
 SEPARATORS = {";": "semicolons", "\t": "tabs"}
+_NO_POSE = (
+    "where the flange was is missing: add x_mm, y_mm, z_mm and qx, qy, qz, qw (or another "
+    "orientation), or the joints q1_deg …"
+)
+_NO_ARM = "the table has joints but no flange poses: name the robot, whose model tells the poses"
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,45 @@ def read_joint_columns(
     if "stamp_s" not in names:
         _fail("column stamp_s is missing", file)
     return _joint_columns({name: i for i, name in enumerate(names)}, arm, file)
+
+
+def read_pose_columns(
+    header: Sequence[str], arm: SerialArm | None, file: str, words: Sequence[str]
+) -> Layout:
+    """Understand a header of flange poses, of joint readings, or of both, and ``words``.
+
+    Without ``arm`` columns of joints are known by their form alone, and are left out of the layout.
+
+    Raises
+    ------
+    InputError
+        As `read_layout`; for a position without an orientation, and when neither pose nor joints
+        are there.
+    """
+    names = [name.strip() for name in header]
+    _check_separator(names, file)
+    joints = [name for name in names if JOINT.fullmatch(name)]
+    known = [*words, *(name for group in (*POSITION.values(), *ORIENTATIONS) for name in group)]
+    if arm is None:
+        _check_known(names, [*known, *joints], file)
+    else:
+        of_arm = [f"q{i + 1}_{unit}" for i in range(arm.n) for unit in joint_units(arm, i)]
+        _check_known(names, [*known, *of_arm], file, arm)
+    place = {name: i for i, name in enumerate(names)}
+    columns: tuple[str, ...] = ()
+    factors = np.zeros(0)
+    if arm is not None and joints:
+        columns, factors = _joint_columns(place, arm, file)
+    orientation = orientation_columns(place, file)
+    if orientation is None and not any(n in place for group in POSITION.values() for n in group):
+        if not columns:
+            _fail(_NO_ARM if joints else _NO_POSE, file)
+        return Layout(place, columns, factors, (), 1.0, None)
+    position, factor = _position_columns(place, file)
+    if orientation is None:
+        ways = "; or ".join(", ".join(group) for group in ORIENTATIONS)
+        _fail(f"the flange's orientation is missing: add {ways}", file)
+    return Layout(place, columns, factors, position, factor, orientation)
 
 
 def check_plain(

@@ -1,7 +1,5 @@
 """Measurements as CSV tables; the contract is written in docs/csv.md."""
 
-import csv
-import io
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -14,8 +12,8 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import DEFAULT_TARGET, Measurements
 from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits
-from robocal_ros.storage.cells import Cells, read_cells
-from robocal_ros.storage.files import quoted, write_text
+from robocal_ros.storage.cells import Cells, read_cells, texts, write_cells
+from robocal_ros.storage.files import quoted
 from robocal_ros.storage.table_columns import (
     EULER,
     QUATERNION,
@@ -29,7 +27,6 @@ Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 1e-3
 LARGEST_STAMP_S = 9_000_000_000
 SMALLEST_SIGMA_MM = 1e-9
-DIGITS = ".12g"  # 1e-9 mm in a metre, and no trailing noise of binary fractions
 
 
 def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
@@ -79,7 +76,7 @@ def _measurements(table: Cells, layout: Layout, arm: SerialArm) -> Measurements:
         q=numbers[:, :n] * layout.joint_factors,
         position=numbers[:, n : n + 3] * layout.position_factor,
         target=table.words("target") or (DEFAULT_TARGET,) * len(numbers),
-        sample=_samples(table),
+        sample=read_samples(table, tuple(map(str, table.rows))),
         rotation=None if layout.orientation is None else read_rotations(table, layout.orientation),
         sigma=_sigma(table, rest[:, -1]) if "sigma_mm" in layout.place else None,
         stamp_ns=read_stamps(table) if "stamp_s" in layout.place else None,
@@ -112,26 +109,30 @@ def write_measurements(path: str | Path, data: Measurements, arm: SerialArm) -> 
     """
     columns: dict[str, list[str]] = {"sample": list(data.sample), "target": list(data.target)}
     if data.stamp_ns is not None:
-        columns["stamp_s"] = [f"{Decimal(int(t)).scaleb(-9):.9f}" for t in data.stamp_ns]
-    for joint in range(arm.n):
-        name, factor = ("mm", 1e3) if arm.prismatic[joint] else ("deg", 180.0 / np.pi)
-        columns[f"q{joint + 1}_{name}"] = _texts(data.q[:, joint] * factor)
+        columns["stamp_s"] = stamp_texts(data.stamp_ns)
+    columns |= joint_texts(data.q, arm)
     for axis, name in enumerate(("x_mm", "y_mm", "z_mm")):
-        columns[name] = _texts(data.position[:, axis] * 1e3)
+        columns[name] = texts(data.position[:, axis] * 1e3)
     if data.rotation is not None:
         for axis, values in enumerate(frames.quat_xyzw(data.rotation).T):
-            columns[QUATERNION[axis]] = _texts(values)
+            columns[QUATERNION[axis]] = texts(values)
     if data.sigma is not None:
-        columns["sigma_mm"] = _texts(data.sigma * 1e3)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    write_text(Path(path), text.getvalue())
+        columns["sigma_mm"] = texts(data.sigma * 1e3)
+    write_cells(Path(path), columns)
 
 
-def _texts(values: Array) -> list[str]:
-    return [format(value, DIGITS) for value in values.tolist()]
+def stamp_texts(stamp_ns: NDArray[np.int64]) -> list[str]:
+    """Cells of ``stamp_s``."""
+    return [f"{Decimal(stamp).scaleb(-9):.9f}" for stamp in stamp_ns.tolist()]
+
+
+def joint_texts(q: Array, arm: SerialArm) -> dict[str, list[str]]:
+    """Columns of joint readings (m, n), in degrees and millimetres."""
+    columns = {}
+    for joint in range(arm.n):
+        name, factor = ("mm", 1e3) if arm.prismatic[joint] else ("deg", 180.0 / np.pi)
+        columns[f"q{joint + 1}_{name}"] = texts(q[:, joint] * factor)
+    return columns
 
 
 def _read(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
@@ -140,15 +141,31 @@ def _read(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
     return table, found[0]
 
 
-def _samples(table: Cells) -> tuple[str, ...]:
-    samples = table.words("sample") or tuple(map(str, table.rows))
-    if len(set(samples)) != len(samples):
-        first: dict[str, int] = {}
-        for index, name in enumerate(samples):
-            if first.setdefault(name, index) != index:
-                row = table.rows[first[name]]
-                table.fail(f"sample {quoted(name)} is already in row {row}", index, "sample")
-    return samples
+def read_samples(table: Cells, otherwise: tuple[str, ...]) -> tuple[str, ...]:
+    """Names (m,) of the column ``sample``, all different; ``otherwise`` where there is none.
+
+    Raises
+    ------
+    InputError
+        At the first name that is there already.
+    """
+    require_different(table, "sample")
+    return table.words("sample") or otherwise
+
+
+def require_different(table: Cells, column: str) -> None:
+    """Refuse a word that a column has twice.
+
+    Raises
+    ------
+    InputError
+        At the first word that is there already.
+    """
+    first: dict[str, int] = {}
+    for index, name in enumerate(table.words(column)):
+        if first.setdefault(name, index) != index:
+            row = table.rows[first[name]]
+            table.fail(f"{column} {quoted(name)} is already in row {row}", index, column)
 
 
 def _sigma(table: Cells, sigma_mm: Array) -> Array:

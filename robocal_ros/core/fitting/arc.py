@@ -1,0 +1,241 @@
+"""The circle in which a laser plane cuts a reference sphere, from one profile.
+
+The profile may hold the table, the stem, gaps, spikes and double reflections. The start is the
+circle nearest to most points (`arc_search`); the answer is the maximum likelihood over the points
+whose residual fits its own predicted variance. How the noise depends on the slope of the surface
+is estimated with it: sensors err along the beam, along the surface's normal, or in between.
+Source of the use: methods of the fixed sphere, where y = +-sqrt(R^2 - r^2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.core.errors import ResidualError, RobocalError, TooFewSamplesError
+from robocal_ros.core.fitting.arc_search import find_circle, gauss_newton, linearised
+from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FEWEST_POINTS = 20
+_NEAR = 3.5  # standard deviations of a point near a start
+_NEAR_M = 2e-5
+_ROUNDS = 25
+_NEIGHBOURS = 9  # columns
+_AGREEING = 0.7  # share of a point's neighbours that are on the arc too
+_ISOTROPIC = 20.0  # points' worth of belief that noise does not depend on the slope
+_STEEPEST = 0.05  # smallest share of variances of both directions
+_SURE = 4.0  # standard deviations
+_FORM_DEGREE = 6
+_FORM_M = 2e-5
+
+
+@dataclass(frozen=True)
+class ArcRule:
+    """What the arc of a sphere in a profile must be like.
+
+    Attributes
+    ----------
+    radius_m : R, of the sphere.
+    radius_tolerance_m : how far the arc's radius may exceed the sphere's.
+    radius_sigma_m : largest standard deviation of the arc's radius; a short arc has a larger one.
+    noise_m : largest standard deviation of a point along its normal.
+    """
+
+    radius_m: float
+    radius_tolerance_m: float = 1e-4
+    radius_sigma_m: float = 4e-4
+    noise_m: float = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class ArcFit:
+    """A fitted arc.
+
+    Attributes
+    ----------
+    centre : (2,) x0, z0 of the circle, sensor frame, m.
+    radius_m : r, of the circle.
+    covariance : (3, 3) of (x0, z0, r) from the points' scatter, m^2.
+    noise_m : standard deviation of a point along its normal, root mean square over the arc.
+    used : (n,) which points were taken for the arc's.
+    """
+
+    centre: Array
+    radius_m: float
+    covariance: Array
+    noise_m: float
+    used: Mask
+
+
+def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
+    """Fit the near side of a circle to points (n, 2) of a profile: x, z in the sensor frame, m.
+
+    Points are in the order of the sensor's columns; the sensor looks along +z. The circle's
+    radius is 0.2 R to R of the sphere.
+
+    Raises
+    ------
+    TooFewSamplesError
+        Fewer than 20 points on a circle.
+    ResidualError
+        No arc, an arc larger than the sphere, too much noise, a surface that is not round, or an
+        arc too short to know its radius: the message holds the figure that failed.
+    """
+    finite = np.all(np.isfinite(points), axis=1)
+    rows = np.ascontiguousarray(points[finite], dtype=np.float64)
+    if len(rows) < FEWEST_POINTS:
+        raise TooFewSamplesError(
+            f"{len(rows)} points give no arc: at least {FEWEST_POINTS} are needed; check the "
+            "exposure and that the sphere is in range"
+        )
+    try:
+        fit = _fitted(rows, rule.radius_m)
+        _require(fit, rows, rule)
+    except RobocalError:
+        _blame_radius(rows, rule.radius_m)
+        raise
+    used = np.zeros(len(finite), dtype=np.bool_)
+    used[np.flatnonzero(finite)[fit.used]] = True
+    return ArcFit(fit.centre, fit.radius_m, fit.covariance, fit.noise_m, used)
+
+
+def _fitted(points: Array, radius: float) -> ArcFit:
+    """The arc of a sphere of about this radius, whatever its quality."""
+    limit = max(_NEAR * local_noise(points[:, 1]), _NEAR_M)
+    circle = find_circle(points, radius, limit)
+    if circle is None:
+        raise ResidualError(
+            f"no arc of a sphere of radius {radius * 1e3:.3f} mm is in the profile: check the "
+            "radius, and that the laser line crosses the sphere"
+        )
+    _, residual = linearised(circle, points)
+    used = _agreeing((np.abs(residual) < limit) & (points[:, 1] < circle[1]))
+    variance = np.full(len(points), (limit / _NEAR) ** 2)
+    for _ in range(_ROUNDS):
+        _require_points(used, len(points))
+        circle, information = gauss_newton(circle, points[used], 1.0 / variance[used])
+        J, residual = linearised(circle, points)
+        pull = np.einsum("ij,jk,ik->i", J, np.linalg.pinv(information), J)
+        leverage = pull[used] / variance[used]
+        variance = _variance(points, circle, residual, leverage, used)
+        before, used = used, _inliers(points, circle, residual, pull, variance, used)
+        if np.array_equal(before, used):
+            break
+    _require_points(used, len(points))
+    circle, information = gauss_newton(circle, points[used], 1.0 / variance[used])
+    return ArcFit(
+        centre=circle[:2],
+        radius_m=float(circle[2]),
+        covariance=np.asarray(np.linalg.pinv(information, hermitian=True)),
+        noise_m=float(np.sqrt(np.mean(variance[used]))),
+        used=used,
+    )
+
+
+def _require_points(used: Mask, count: int) -> None:
+    if np.sum(used) < FEWEST_POINTS:
+        raise TooFewSamplesError(
+            f"{np.sum(used)} of {count} points lie on an arc: at least {FEWEST_POINTS} are "
+            "needed; clean the sphere, or bring it into the laser line"
+        )
+
+
+def _variance(points: Array, circle: Array, residual: Array, leverage: Array, used: Mask) -> Array:
+    """Variance (n,) of a point along its normal, a cos^2 + b sin^2 of the slope of the surface.
+
+    a is the variance along the beam and b across it. The slope is taken from x: where the noise
+    is along the beam it then does not depend on the error of the point.
+    """
+    sine = np.clip((points[:, 0] - circle[0]) / circle[2], -1.0, 1.0) ** 2
+    parts = np.column_stack([1.0 - sine, sine])
+    near = parts[used]
+    robust = (MAD * float(np.median(np.abs(residual[used])))) ** 2 + SMALLEST_M**2
+    square = residual[used] ** 2 / np.maximum(1.0 - leverage, 0.5)
+    ab = np.full(2, robust)
+    for _ in range(3):
+        weight = robust**2 / (near @ ab) ** 2
+        normal = (near.T * weight) @ near + _ISOTROPIC * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        ab = np.linalg.solve(normal, near.T @ (weight * square))
+        ab = np.maximum(ab, _STEEPEST * float(np.max(ab))) + SMALLEST_M**2
+    return np.asarray(parts @ ab)
+
+
+def _inliers(
+    points: Array, circle: Array, residual: Array, pull: Array, variance: Array, used: Mask
+) -> Mask:
+    """Points on the near side whose residual fits its predicted variance, as do their neighbours'.
+
+    A point in use pulled the circle to itself, any other did not.
+    """
+    expected = variance + np.where(used, -1.0, 1.0) * np.minimum(pull, 0.5 * variance)
+    limit = chi2_quantile(1.0 - FALSE_REJECTION / len(points), 1.0)
+    near = (residual**2 < limit * expected) & (points[:, 1] < circle[1])
+    return _agreeing(near)
+
+
+def _agreeing(near: Mask) -> Mask:
+    """Those of the points near a circle that are not there by chance: a crossing line's are."""
+    window = np.ones(_NEIGHBOURS)
+    votes = np.convolve(near.astype(np.float64), window, mode="same")
+    votes /= np.convolve(np.ones(len(near)), window, mode="same")
+    return np.asarray(near & (votes > _AGREEING))
+
+
+def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:
+    r, R = fit.radius_m, rule.radius_m
+    sigma = float(np.sqrt(fit.covariance[2, 2]))
+    if sigma > rule.radius_sigma_m or r < _SURE * sigma:
+        raise ResidualError(
+            f"the arc is too short: its radius of {r * 1e3:.3f} mm is known to {sigma * 1e3:.3f} "
+            f"mm (allowed {rule.radius_sigma_m * 1e3:.3f} mm); show the sensor more of the sphere"
+        )
+    if r - R > max(rule.radius_tolerance_m, _SURE * sigma):
+        raise ResidualError(_larger(r, R))
+    if fit.noise_m > rule.noise_m:
+        raise ResidualError(
+            f"the points scatter by {fit.noise_m * 1e3:.3f} mm about the arc (allowed "
+            f"{rule.noise_m * 1e3:.3f} mm): clean the sphere and check the exposure"
+        )
+    form = _form(fit, points[fit.used])
+    if form > max(_FORM_M, np.sqrt(0.5) * fit.noise_m):
+        raise ResidualError(
+            f"the surface differs from an arc of radius {r * 1e3:.3f} mm by {form * 1e3:.3f} mm, "
+            "which is no noise: it is not round; show the sphere to the sensor"
+        )
+
+
+def _larger(r: float, R: float) -> str:
+    return (
+        f"the profile shows an arc of radius {r * 1e3:.3f} mm, but a plane cuts a sphere of radius "
+        f"{R * 1e3:.3f} mm in no larger circle than that: check which sphere is mounted, and the "
+        "sensor's scale"
+    )
+
+
+def _form(fit: ArcFit, points: Array) -> float:
+    """Root mean square of the smooth part of the residuals, m."""
+    _, residual = linearised(np.append(fit.centre, fit.radius_m), points)
+    x = points[:, 0] - points[:, 0].mean()
+    basis = np.polynomial.legendre.legvander(x / np.max(np.abs(x)), _FORM_DEGREE)
+    smooth = basis @ np.linalg.lstsq(basis, residual, rcond=None)[0]
+    return float(np.sqrt(np.mean(smooth**2)))
+
+
+def _blame_radius(points: Array, radius: float) -> None:
+    """Raise when a sphere of a radius a thousand times smaller or larger is there instead."""
+    for factor in (1e-3, 1e3):
+        other = radius * factor
+        try:
+            fit = _fitted(points, other)
+            _require(fit, points, ArcRule(other))
+        except RobocalError:
+            continue
+        raise ResidualError(
+            f"the profile shows an arc of radius {fit.radius_m * 1e3:.3f} mm, the sphere's radius "
+            f"is given as {radius * 1e3:.6g} mm: it is about {1.0 / factor:g} times too "
+            f"{'large' if factor < 1.0 else 'small'}; give it in metres"
+        )

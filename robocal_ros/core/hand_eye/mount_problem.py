@@ -1,0 +1,183 @@
+"""The pose of a sensor on the flange as an estimation problem, with the robot's error as nuisance.
+
+A sighting's residual is value(X, target, T (1 + d)) - measured: the pose error d is common to all
+that one profile shows. It is marginalised: its covariance is added to the features' own before the
+residuals are whitened, profile by profile.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.sightings import COMPONENTS, Index, Sightings, TargetModel
+
+Array = NDArray[np.float64]
+
+SENSOR_UNKNOWNS = ("sensor x", "sensor y", "sensor z", "turn x", "turn y", "turn z")
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviations of a reported pose: of a coordinate, and of the turn about an axis."""
+
+    sigma_m: float
+    sigma_rad: float
+
+    def covariance(self) -> Array:
+        """(6, 6) of (v, w), flange axes."""
+        return np.diag(np.repeat([self.sigma_m**2, self.sigma_rad**2], 3))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Sightings of one target, and its model."""
+
+    model: TargetModel
+    sightings: Sightings
+
+    def take(self, rows: NDArray[np.bool_] | Index) -> "View":
+        """The sightings at ``rows``."""
+        return View(self.model.take(rows), self.sightings.take(rows))
+
+
+@dataclass(frozen=True, eq=False)
+class MountState:
+    """Pose of the sensor, and the place of each view's target."""
+
+    T_flange_sensor: Array
+    places: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """All sightings (m) linearised: nothing is whitened yet.
+
+    Attributes
+    ----------
+    residual : (m, 3), prediction minus measurement.
+    jacobian : (m, 3, k) for the unknowns.
+    pose : (m, 3, 6) for the error (v, w) of the reported pose, flange axes.
+    covariance : (m, 3, 3) of the measured value.
+    """
+
+    residual: Array
+    jacobian: Array
+    pose: Array
+    covariance: Array
+
+
+class MountProblem:
+    """``descent.Problem`` of one sensor and several targets; a sample is a profile, or a sighting.
+
+    Parameters
+    ----------
+    together : whether the sightings of one pose are one sample, and their common error is known to
+        be common; otherwise each is its own (to find the one that is wrong).
+    """
+
+    scale_components = 0  # noise is always given
+
+    def __init__(self, views: tuple[View, ...], noise: PoseNoise, together: bool = True) -> None:
+        self.views, self.noise = views, noise
+        names = [name for view in views for name in view.model.names]
+        self.names = (*SENSOR_UNKNOWNS, *names)
+        poses = np.concatenate([view.sightings.pose for view in views])
+        if not together:
+            poses = np.arange(len(poses))
+        self.poses, self.sample = np.unique(poses, return_inverse=True)
+        self._place = _place_in_sample(self.sample)
+        sizes = np.concatenate([np.full(len(v.sightings.names), v.model.components) for v in views])
+        self.sizes = np.bincount(self.sample, weights=sizes).astype(np.int64)
+
+    def linear(self, state: MountState) -> Linear:
+        """Linearise all sightings."""
+        X, k = state.T_flange_sensor, len(self.names)
+        parts, first = [], len(SENSOR_UNKNOWNS)
+        for view, place in zip(self.views, state.places, strict=True):
+            seen_from = view.sightings.T_base_flange @ X
+            seen = view.model.see(seen_from, place)
+            own = len(view.model.names)
+            J = np.zeros((len(seen.value), COMPONENTS, k))
+            J[:, :, :3] = -seen.slope
+            J[:, :, 3:6] = seen.slope @ frames.skew(seen.point)
+            turned = np.swapaxes(seen_from[:, :3, :3], 1, 2) @ seen.spread
+            J[:, :, first : first + own] = seen.slope @ turned
+            first += own
+            flange = seen.point @ X[:3, :3].T + X[:3, 3]
+            down = seen.slope @ X[:3, :3].T
+            pose = np.concatenate([-down, down @ frames.skew(flange)], axis=2)
+            s = view.sightings
+            parts.append(Linear(seen.value - s.value, J, pose, s.covariance))
+        return Linear(
+            np.concatenate([p.residual for p in parts]),
+            np.concatenate([p.jacobian for p in parts]),
+            np.concatenate([p.pose for p in parts]),
+            np.concatenate([p.covariance for p in parts]),
+        )
+
+    def grouped(self, linear: Linear) -> tuple[Array, Array, Array, Array]:
+        """Residual (g, c), Jacobian (g, c, k), pose (g, c, 6), covariance (g, c, c) of samples."""
+        groups, width = len(self.poses), int(self._place.max()) + 1
+        c, k = width * COMPONENTS, linear.jacobian.shape[2]
+        at = self.sample, self._place
+        residual = np.zeros((groups, width, COMPONENTS))
+        jacobian = np.zeros((groups, width, COMPONENTS, k))
+        pose = np.zeros((groups, width, COMPONENTS, 6))
+        covariance = np.zeros((groups, width, COMPONENTS, width, COMPONENTS))
+        row = np.arange(width)
+        covariance[:, row, :, row, :] = np.eye(COMPONENTS)  # empty places stay zero, not singular
+        residual[at], jacobian[at], pose[at] = linear.residual, linear.jacobian, linear.pose
+        covariance[self.sample, self._place, :, self._place, :] = linear.covariance
+        return (
+            residual.reshape(groups, c),
+            jacobian.reshape(groups, c, k),
+            pose.reshape(groups, c, 6),
+            covariance.reshape(groups, c, c),
+        )
+
+    def linearise(self, state: MountState) -> tuple[Array, Array]:
+        """Whitened residual (g, c) and Jacobian (g, c, k)."""
+        residual, jacobian, pose, covariance = self.grouped(self.linear(state))
+        spread = covariance + pose @ self.noise.covariance() @ np.swapaxes(pose, 1, 2)
+        L = np.linalg.cholesky(spread)
+        whitened = np.linalg.solve(L, np.concatenate([residual[..., None], jacobian], axis=2))
+        return whitened[..., 0], whitened[..., 1:]
+
+    def retract(self, state: MountState, step: Array) -> MountState:
+        """Move sensor and targets."""
+        move = frames.transform(frames.exp_rotation(step[3:6]), step[:3])
+        places, first = [], len(SENSOR_UNKNOWNS)
+        for view, place in zip(self.views, state.places, strict=True):
+            own = len(view.model.names)
+            places.append(view.model.moved(place, step[first : first + own]))
+            first += own
+        return MountState(state.T_flange_sensor @ move, tuple(places))
+
+    def deviation(self, state: MountState) -> Array:
+        """Distance (k,) from the priors' means; zero where there is none."""
+        pairs = zip(self.views, state.places, strict=True)
+        return np.concatenate(
+            [np.zeros(len(SENSOR_UNKNOWNS)), *(v.model.deviation(place) for v, place in pairs)]
+        )
+
+    def prior(self) -> Array | None:
+        """Information (k, k) about the unknowns beforehand; None where nothing is known."""
+        k, first = len(self.names), len(SENSOR_UNKNOWNS)
+        information = np.zeros((k, k))
+        for view in self.views:
+            own = len(view.model.names)
+            information[first : first + own, first : first + own] = view.model.prior
+            first += own
+        return information if np.any(information) else None
+
+
+def _place_in_sample(sample: Index) -> Index:
+    """Number (m,) of each sighting within its sample."""
+    order = np.argsort(sample, kind="stable")
+    ordered = sample[order]
+    start = np.searchsorted(ordered, ordered)
+    place = np.empty(len(sample), dtype=np.int64)
+    place[order] = np.arange(len(sample)) - start
+    return place

@@ -1,0 +1,96 @@
+"""What profiles show of a target, and how a model of the target predicts it.
+
+Each profile is reduced to features that hold all it says (Fisher information) about where the
+target is: the circle that the laser plane cuts out of a sphere (x0, z0, r), or the point where an
+edge pierces that plane (x, z), for a marked edge with the place along it.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+COMPONENTS = 3  # of every sighting; a model with fewer leaves the last ones empty
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Features (m) of one target.
+
+    Attributes
+    ----------
+    names : of the features, for reports.
+    pose : (m,) index of the pose that each was seen from; those with one index share its error.
+    T_base_flange : (m, 4, 4) reported pose of each.
+    value : (m, 3), m; covariance : (m, 3, 3). Empty components have value 0 and variance 1.
+    """
+
+    names: tuple[str, ...]
+    pose: Index
+    T_base_flange: Array
+    value: Array
+    covariance: Array
+
+    def take(self, rows: NDArray[np.bool_] | Index) -> "Sightings":
+        """Those at ``rows`` (mask or index)."""
+        index = np.arange(len(self.names))[rows]
+        return Sightings(
+            tuple(self.names[i] for i in index),
+            self.pose[index],
+            self.T_base_flange[index],
+            self.value[index],
+            self.covariance[index],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a model predicts for m sightings.
+
+    Attributes
+    ----------
+    value : (m, 3) predicted features.
+    point : (m, 3) the point of the target that is seen, sensor frame, m.
+    slope : (m, 3, 3) change of the value as that point moves with the target, sensor axes.
+    spread : (m, 3, k) displacement of that point, base axes, for each unknown of the target.
+    """
+
+    value: Array
+    point: Array
+    slope: Array
+    spread: Array
+
+
+class TargetModel(Protocol):
+    """A target with k unknowns of its own; ``place`` is whatever says where it is."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names (k) of the unknowns."""
+
+    @property
+    def components(self) -> int:
+        """How many of the three components of a sighting it has."""
+
+    @property
+    def prior(self) -> Array:
+        """Information (k, k) about the unknowns beforehand."""
+
+    def see(self, T_base_sensor: Array, place: Array) -> Seen:
+        """Predict the sightings from sensor poses (m, 4, 4)."""
+
+    def moved(self, place: Array, step: Array) -> Array:
+        """The place after an increment (k,) of the unknowns."""
+
+    def deviation(self, place: Array) -> Array:
+        """Distance (k,) of the place from the prior's mean."""
+
+    def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
+        """How far (m,) sightings (m, 3), put into base, are from the target, m."""
+
+    def take(self, rows: NDArray[np.bool_] | Index) -> "TargetModel":
+        """The model for the sightings at ``rows``."""

@@ -1,0 +1,37 @@
+"""Profiles of known shapes, as a line-laser sensor would measure them: simulated."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+NOISE_M = 3.7e-5
+COLUMNS = np.linspace(-0.045, 0.045, 1280)  # x, m
+TABLE_M = 0.208
+
+
+def arc_profile(
+    circle: tuple[float, float, float],
+    rng: np.random.Generator,
+    *,
+    noise: float = NOISE_M,
+    along: str = "normal",
+    half_angle: float = np.radians(65.0),
+    x: Array = COLUMNS,
+    table: bool = True,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Points (n, 2) of a circle's near side before a table, and which ones are the circle's.
+
+    The noise is along the surface's normal or along the beam.
+    """
+    x0, z0, r = circle
+    angle = (x - x0) / r
+    on = np.abs(angle) < np.sin(half_angle)
+    angle = np.arcsin(np.clip(angle, -1.0, 1.0))
+    error = rng.normal(scale=noise, size=len(x))
+    points = np.column_stack([x, np.full(len(x), TABLE_M) + 0.02 * x + error])
+    arc = np.column_stack([np.sin(angle), -np.cos(angle)])
+    shift = arc * error[:, None] if along == "normal" else np.array([0.0, 1.0]) * error[:, None]
+    points[on] = (np.array([x0, z0]) + r * arc + shift)[on]
+    keep = on | table
+    return points[keep], on[keep]
