@@ -11,6 +11,7 @@ Solver = Callable[[DataSet, Sequence[HandEyeSample], str, HandEyeConfig], HandEy
 
 METHODS = ("best", "classic")
 MOUNTS = (IN_HAND, TO_HAND)
+WITHOUT_FILE = ("line", "camera")  # solved with the sensor's place
 SOLVERS: Mapping[str, Solver] = {}
 
 
