@@ -35,3 +35,28 @@ def arc_profile(
     points[on] = (np.array([x0, z0]) + r * arc + shift)[on]
     keep = on | table
     return points[keep], on[keep]
+
+
+def stairs(
+    steps: int, tilt: float, *, tread: float = 0.01, rise: float = 0.01, ends: float = 0.012
+) -> Array:
+    """Vertices (2 steps + 1, 2) of a staircase, turned by tilt: its corners and both its ends.
+
+    At a tilt of 45 deg treads and risers are seen alike. The corners in between alternate, the
+    first is convex.
+    """
+    moves = [(tread, 0.0), (0.0, rise)] * steps
+    moves = [(ends, 0.0), *moves[1:-1], (0.0, ends)]
+    vertices = np.vstack([[0.0, 0.0], np.cumsum(moves, axis=0)])
+    turn = np.array([[np.cos(tilt), np.sin(tilt)], [-np.sin(tilt), np.cos(tilt)]])
+    vertices = vertices @ turn.T
+    return np.asarray(vertices - vertices.mean(axis=0) + np.array([0.0, 0.2]))
+
+
+def polyline_profile(
+    vertices: Array, rng: np.random.Generator, *, noise: float = NOISE_M, x: Array = COLUMNS
+) -> Array:
+    """Points (n, 2) of straight surfaces between vertices (v, 2) ascending in x; noise along z."""
+    seen = x[(x > vertices[0, 0]) & (x < vertices[-1, 0])]
+    z = np.interp(seen, vertices[:, 0], vertices[:, 1])
+    return np.column_stack([seen, z + rng.normal(scale=noise, size=len(seen))])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.core.errors import ResidualError, RobocalError, TooFewSamplesError
-from robocal_ros.core.fitting.arc_search import find_circle, gauss_newton, linearised
+from robocal_ros.core.fitting.arc_search import find_circle, linearised, step
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
 
 Array = NDArray[np.float64]
@@ -26,7 +26,8 @@ _NEAR_M = 2e-5
 _ROUNDS = 25
 _NEIGHBOURS = 9  # columns
 _AGREEING = 0.7  # share of a point's neighbours that are on the arc too
-_ISOTROPIC = 20.0  # points' worth of belief that noise does not depend on the slope
+_PIECE = 0.2  # smallest piece of an arc, of its largest
+_ISOTROPIC = 5.0  # points' worth of belief that noise does not depend on the slope
 _STEEPEST = 0.05  # smallest share of variances of both directions
 _SURE = 4.0  # standard deviations
 _FORM_DEGREE = 6
@@ -112,28 +113,24 @@ def _fitted(points: Array, radius: float) -> ArcFit:
             f"no arc of a sphere of radius {radius * 1e3:.3f} mm is in the profile: check the "
             "radius, and that the laser line crosses the sphere"
         )
-    _, residual = linearised(circle, points)
+    residual = linearised(circle, points)[1]
     used = _agreeing((np.abs(residual) < limit) & (points[:, 1] < circle[1]))
-    variance = np.full(len(points), (limit / _NEAR) ** 2)
+    ab = np.full(2, (limit / _NEAR) ** 2)
     for _ in range(_ROUNDS):
         _require_points(used, len(points))
-        circle, information = gauss_newton(circle, points[used], 1.0 / variance[used])
+        circle, covariance = _improved(circle, points[used], ab)
         J, residual = linearised(circle, points)
-        pull = np.einsum("ij,jk,ik->i", J, np.linalg.pinv(information), J)
-        leverage = pull[used] / variance[used]
-        variance = _variance(points, circle, residual, leverage, used)
-        before, used = used, _inliers(points, circle, residual, pull, variance, used)
+        pull = np.einsum("ij,jk,ik->i", J, covariance, J)
+        parts = _parts(circle, points)
+        ab = _variances(parts[used], residual[used], pull[used] / (parts[used] @ ab))
+        near = _fitting(residual, parts @ ab, np.where(used, -pull, pull))
+        before, used = used, _agreeing(near & (points[:, 1] < circle[1]))
         if np.array_equal(before, used):
             break
     _require_points(used, len(points))
-    circle, information = gauss_newton(circle, points[used], 1.0 / variance[used])
-    return ArcFit(
-        centre=circle[:2],
-        radius_m=float(circle[2]),
-        covariance=np.asarray(np.linalg.pinv(information, hermitian=True)),
-        noise_m=float(np.sqrt(np.mean(variance[used]))),
-        used=used,
-    )
+    circle, covariance = _improved(circle, points[used], ab)
+    noise = float(np.sqrt(np.mean(_parts(circle, points[used]) @ ab)))
+    return ArcFit(circle[:2], float(circle[2]), covariance, noise, used)
 
 
 def _require_points(used: Mask, count: int) -> None:
@@ -144,45 +141,69 @@ def _require_points(used: Mask, count: int) -> None:
         )
 
 
-def _variance(points: Array, circle: Array, residual: Array, leverage: Array, used: Mask) -> Array:
-    """Variance (n,) of a point along its normal, a cos^2 + b sin^2 of the slope of the surface.
+def _parts(circle: Array, points: Array) -> Array:
+    """Shares (n, 2) of the variances along and across the beam in that along the normal.
 
-    a is the variance along the beam and b across it. The slope is taken from x: where the noise
-    is along the beam it then does not depend on the error of the point.
+    The slope is taken from x: where the noise is along the beam, it then does not depend on it.
     """
     sine = np.clip((points[:, 0] - circle[0]) / circle[2], -1.0, 1.0) ** 2
-    parts = np.column_stack([1.0 - sine, sine])
-    near = parts[used]
-    robust = (MAD * float(np.median(np.abs(residual[used])))) ** 2 + SMALLEST_M**2
-    square = residual[used] ** 2 / np.maximum(1.0 - leverage, 0.5)
+    return np.column_stack([1.0 - sine, sine])
+
+
+def _variances(parts: Array, residual: Array, leverage: Array) -> Array:
+    """Variances (2,) of a point along and across the beam, by regression of squared residuals."""
+    robust = (MAD * float(np.median(np.abs(residual)))) ** 2 + SMALLEST_M**2
+    square = residual**2 / np.maximum(1.0 - leverage, 0.5)
     ab = np.full(2, robust)
     for _ in range(3):
-        weight = robust**2 / (near @ ab) ** 2
-        normal = (near.T * weight) @ near + _ISOTROPIC * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        ab = np.linalg.solve(normal, near.T @ (weight * square))
+        weight = robust**2 / (parts @ ab) ** 2
+        normal = (parts.T * weight) @ parts + _ISOTROPIC * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        ab = np.linalg.solve(normal, parts.T @ (weight * square))
         ab = np.maximum(ab, _STEEPEST * float(np.max(ab))) + SMALLEST_M**2
-    return np.asarray(parts @ ab)
+    return np.asarray(ab)
 
 
-def _inliers(
-    points: Array, circle: Array, residual: Array, pull: Array, variance: Array, used: Mask
-) -> Mask:
-    """Points on the near side whose residual fits its predicted variance, as do their neighbours'.
+def _improved(circle: Array, points: Array, ab: Array) -> tuple[Array, Array]:
+    """Circle after a step of the maximum likelihood, and its covariance (3, 3).
 
-    A point in use pulled the circle to itself, any other did not.
+    The normal is that of the likeliest true point, which the residual does not depend on: that of
+    the measured point would bias the circle where the noise is not along the normal.
     """
-    expected = variance + np.where(used, -1.0, 1.0) * np.minimum(pull, 0.5 * variance)
-    limit = chi2_quantile(1.0 - FALSE_REJECTION / len(points), 1.0)
-    near = (residual**2 < limit * expected) & (points[:, 1] < circle[1])
-    return _agreeing(near)
+    J, residual = linearised(circle, points)
+    variance = _parts(circle, points) @ ab
+    # J holds the normal with a minus sign: the true point is this far from the measured one.
+    moved = points + (residual / variance)[:, None] * J[:, :2] * ab[::-1]
+    J, _ = linearised(circle, moved)
+    residual = -np.einsum("ij,ij->i", J[:, :2], points - circle[:2]) - circle[2]
+    increment, information = step(J, residual, 1.0 / variance)
+    return circle + increment, np.asarray(np.linalg.pinv(information, hermitian=True))
+
+
+def _fitting(residual: Array, variance: Array, pull: Array) -> Mask:
+    """Points (n,) whose residual fits its predicted variance.
+
+    ``pull`` is the variance of the circle at a point: less than zero where the point, in use,
+    pulled the circle to itself.
+    """
+    expected = variance + np.maximum(pull, -0.5 * variance)
+    limit = chi2_quantile(1.0 - FALSE_REJECTION / len(residual), 1.0)
+    return np.asarray(residual**2 < limit * expected)
 
 
 def _agreeing(near: Mask) -> Mask:
-    """Those of the points near a circle that are not there by chance: a crossing line's are."""
+    """Those of the points near a circle that are not there by chance: a crossing line's are.
+
+    Most neighbours of a point are near the circle too, and it belongs to a large piece.
+    """
     window = np.ones(_NEIGHBOURS)
     votes = np.convolve(near.astype(np.float64), window, mode="same")
     votes /= np.convolve(np.ones(len(near)), window, mode="same")
-    return np.asarray(near & (votes > _AGREEING))
+    agreeing = np.flatnonzero(near & (votes > _AGREEING))
+    piece = np.cumsum(np.diff(agreeing, prepend=agreeing[:1]) > _NEIGHBOURS)
+    size = np.bincount(piece, minlength=1)
+    kept = np.zeros(len(near), dtype=np.bool_)
+    kept[agreeing[size[piece] >= _PIECE * size.max()]] = True
+    return kept
 
 
 def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:

@@ -46,20 +46,19 @@ def find_circle(points: Array, radius: float, limit: float) -> Array | None:
     return np.asarray(improved[np.argmin(_costs(improved, points, limit))])
 
 
-def gauss_newton(circle: Array, points: Array, weight: Array | float = 1.0) -> tuple[Array, Array]:
-    """Circle after one step to the least squares of the distances of points, and its normal matrix.
-
-    The unknowns are (x0, z0, r); a point's residual is its distance from the centre less r.
-    """
-    J, residual = linearised(circle, points)
+def step(J: Array, residual: Array, weight: Array | float = 1.0) -> tuple[Array, Array]:
+    """Least-squares increment (3,) of a circle and the normal matrix (3, 3) it comes from."""
     weighted = J.T * weight
     normal = weighted @ J
     ridge = np.finfo(float).eps * np.trace(normal) * np.eye(3)
-    return circle - np.linalg.solve(normal + ridge, weighted @ residual), normal
+    return -np.linalg.solve(normal + ridge, weighted @ residual), normal
 
 
 def linearised(circle: Array, points: Array) -> tuple[Array, Array]:
-    """Jacobian (n, 3) and residual (n,) of points against a circle (x0, z0, r)."""
+    """Jacobian (n, 3) and residual (n,), distance from the centre less r, of points (n, 2).
+
+    The unknowns are those of the circle (x0, z0, r).
+    """
     away = points - circle[:2]
     distance = np.sqrt(np.einsum("ij,ij->i", away, away))
     J = np.full((len(points), 3), -1.0)
@@ -114,5 +113,5 @@ def _improved(circle: Array, points: Array, limit: float) -> Array:
         near &= points[:, 1] < circle[1]
         if np.sum(near) < _FEWEST:
             break
-        circle, _ = gauss_newton(circle, points[near])
+        circle = circle + step(*linearised(circle, points[near]))[0]
     return circle

@@ -5,7 +5,7 @@ that one profile shows. It is marginalised: its covariance is added to the featu
 residuals are whitened, profile by profile.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,7 +139,16 @@ class MountProblem:
 
     def linearise(self, state: MountState) -> tuple[Array, Array]:
         """Whitened residual (g, c) and Jacobian (g, c, k)."""
-        residual, jacobian, pose, covariance = self.grouped(self.linear(state))
+        return self._whitened(self.linear(state))
+
+    def whitened(self, linear: Linear, column: Array) -> tuple[Array, Array]:
+        """Whitened rows (N,) and (N, k + 1) with one unknown more, whose column is (m, 3, 1)."""
+        more = replace(linear, jacobian=np.concatenate([linear.jacobian, column], axis=2))
+        residual, jacobian = self._whitened(more)
+        return residual.ravel(), jacobian.reshape(residual.size, -1)
+
+    def _whitened(self, linear: Linear) -> tuple[Array, Array]:
+        residual, jacobian, pose, covariance = self.grouped(linear)
         spread = covariance + pose @ self.noise.covariance() @ np.swapaxes(pose, 1, 2)
         L = np.linalg.cholesky(spread)
         whitened = np.linalg.solve(L, np.concatenate([residual[..., None], jacobian], axis=2))

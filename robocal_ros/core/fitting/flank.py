@@ -1,0 +1,127 @@
+"""A straight piece of a profile, and the corner where two of them meet."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FEWEST_POINTS = 6
+_ROUNDS = 12
+_WORST = 0.5  # share of points beside a line that is still one
+
+
+@dataclass(frozen=True, eq=False)
+class Flank:
+    """A straight piece of a profile.
+
+    Attributes
+    ----------
+    rows : (n,) indices of its points in the profile, ascending.
+    middle : (2,) mean of its points, m.
+    direction : (2,) unit vector in the order of the points.
+    start_m, end_m : of its points along the direction, from the middle.
+    noise_m : standard deviation of a point along the normal.
+    spread_m2 : sum of squares of its points along the direction.
+    """
+
+    rows: NDArray[np.int64]
+    middle: Array
+    direction: Array
+    start_m: float
+    end_m: float
+    noise_m: float
+    spread_m2: float
+
+    @property
+    def normal(self) -> Array:
+        """(2,) unit normal, a quarter turn from x to z ahead of the direction."""
+        return np.array([-self.direction[1], self.direction[0]])
+
+    def at(self, along_m: float) -> Array:
+        """Point (2,) of the line at a distance from the middle."""
+        return np.asarray(self.middle + along_m * self.direction)
+
+    def along(self, point: Array) -> float:
+        """Distance of a point (2,) from the middle, along the direction."""
+        return float((point - self.middle) @ self.direction)
+
+    def variance(self, along_m: float) -> float:
+        """Variance of the line along its normal at a distance from the middle, m^2."""
+        return self.noise_m**2 * (1.0 / len(self.rows) + along_m**2 / self.spread_m2)
+
+
+def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
+    """Line through the points of a profile (m, 2) with these row numbers (n,), ascending in x.
+
+    The start is the median of the directions between points half of the piece apart; total least
+    squares over the points whose residual fits its predicted variance is the answer. None where
+    fewer than six points, or fewer than half of them, lie on a line.
+    """
+    cloud = points[rows]
+    count = len(rows)
+    if count < FEWEST_POINTS:
+        return None
+    half = count // 2
+    step = cloud[half:] - cloud[: count - half]
+    angle = float(np.median(np.arctan2(step[:, 1], step[:, 0])))
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    residual = cloud @ np.array([-direction[1], direction[0]])
+    residual = residual - np.median(residual)
+    factor = chi2_quantile(1.0 - FALSE_REJECTION / count, 1.0) ** 0.5
+    near = np.abs(residual) <= factor * _scatter(residual)
+    for _ in range(_ROUNDS):
+        if np.sum(near) < max(FEWEST_POINTS, _WORST * count):
+            return None
+        middle = cloud[near].mean(axis=0)
+        direction = _main_direction(cloud[near] - middle, direction)
+        away = cloud - middle
+        residual = away @ np.array([-direction[1], direction[0]])
+        along = away @ direction
+        spread = float(np.sum(along[near] ** 2)) + SMALLEST_M**2
+        leverage = 1.0 / np.sum(near) + along**2 / spread
+        noise = float(np.sqrt(np.sum(residual[near] ** 2) / (np.sum(near) - 2))) + SMALLEST_M
+        # A point in use pulled the line to itself, any other did not.
+        expected = 1.0 + np.where(near, -1.0, 1.0) * np.minimum(leverage, 0.5)
+        before, near = near, residual**2 < (factor * noise) ** 2 * expected
+        if np.array_equal(before, near):
+            break
+    return Flank(
+        rows=rows[before],
+        middle=middle,
+        direction=direction,
+        start_m=float(np.min(along[before])),
+        end_m=float(np.max(along[before])),
+        noise_m=noise,
+        spread_m2=spread,
+    )
+
+
+def _scatter(residual: Array) -> float:
+    return MAD * float(np.median(np.abs(residual))) + SMALLEST_M
+
+
+def _main_direction(away: Array, towards: Array) -> Array:
+    """Direction (2,) of largest extent of points (n, 2) about their mean."""
+    main = np.linalg.eigh(away.T @ away)[1][:, 1]
+    return np.asarray(main if main @ towards > 0.0 else -main)
+
+
+def angle_between(a: Flank, b: Flank) -> float:
+    """Turn from the direction of a to that of b, rad; positive from x to z."""
+    turn = a.direction[0] * b.direction[1] - a.direction[1] * b.direction[0]
+    return float(np.arctan2(turn, a.direction @ b.direction))
+
+
+def intersection(a: Flank, b: Flank) -> tuple[Array, Array]:
+    """Point (2,) where two lines meet and its covariance (2, 2), m^2; they are not parallel."""
+    normals = np.array([a.normal, b.normal])
+    point = np.linalg.solve(normals, np.array([a.normal @ a.middle, b.normal @ b.middle]))
+    inverse = np.linalg.inv(normals)
+    variances = np.array([a.variance(a.along(point)), b.variance(b.along(point))])
+    return point, np.asarray((inverse * variances) @ inverse.T)

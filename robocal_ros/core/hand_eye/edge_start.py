@@ -1,0 +1,131 @@
+"""First poses of the sensor from corners at known places, and from points on a straight line."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import RankDeficientError
+from robocal_ros.core.estimation import solve
+from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.sightings import Sightings
+
+Array = NDArray[np.float64]
+
+TURNS = 400  # rotations of the sensor that are tried
+DIRECTIONS = 60  # directions of an unknown line that are tried
+KEPT = 8
+ALIKE_M = 1e-6  # small, so that the descent goes to the very minimum
+SEED = 5  # of the fixed set of trials
+NO_STRETCH = 1e-6  # of the largest singular value, below which corners are on one line
+
+
+def linear_corners(value: Array, p_flange: Array) -> Array:
+    """Classic closed form: X (4, 4) from corners (m, 3) = (x, z, .) at flange points (m, 3).
+
+    p = x r1 + z r3 + t is linear in nine unknowns; r2 = r3 x r1, then the nearest rotation.
+
+    Raises
+    ------
+    RankDeficientError
+        When all corners lie on one line of the laser plane.
+    """
+    A = np.column_stack([value[:, 0], value[:, 1], np.ones(len(value))])
+    s = np.linalg.svd(A - A.mean(axis=0), compute_uv=False)
+    if s[1] < NO_STRETCH * s[0]:
+        words = "rotation about the line of the corners"
+        raise RankDeficientError(
+            f"not determined: {words}: all corners lie on one line of the laser plane; show the "
+            "target from several poses, or a second line of corners",
+            [words],
+        )
+    r1, r3, t = np.linalg.lstsq(A, p_flange, rcond=None)[0]
+    return frames.transform(frames.nearest_rotation(np.column_stack([r1, np.cross(r3, r1), r3])), t)
+
+
+def robust_corners(value: Array, p_flange: Array) -> Array:
+    """`linear_corners` of the half of corners that agree best, and then of those near them."""
+    rng = np.random.default_rng(SEED)
+    m = len(value)
+    best, least = linear_corners(value, p_flange), np.inf
+    for _ in range(50):
+        rows = rng.permutation(m)[: max(4, m // 3)]
+        try:
+            X = linear_corners(value[rows], p_flange[rows])
+        except RankDeficientError:
+            continue
+        median = float(np.median(_miss(X, value, p_flange)))
+        if median < least:
+            best, least = X, median
+    near = _miss(best, value, p_flange) <= 3.0 * least
+    try:
+        return linear_corners(value[near], p_flange[near])
+    except RankDeficientError:
+        return best
+
+
+def _miss(X: Array, value: Array, p_flange: Array) -> Array:
+    own = np.column_stack([value[:, 0], np.zeros(len(value)), value[:, 1]])
+    return np.asarray(np.linalg.norm(own @ X[:3, :3].T + X[:3, 3] - p_flange, axis=1))
+
+
+def line_starts(sightings: Sightings, line: Array | None) -> list[MountState]:
+    """The most promising starts for features (x, z) of one straight line, best first.
+
+    ``line`` (2, 3): a point and the unit direction in base; None for an unknown line. With the
+    sensor's rotation and the line's direction held, all the rest is linear: both are tried over a
+    fixed set, and the best are handed to the maximum likelihood.
+    """
+    rng = np.random.default_rng(SEED)
+    turns = _random_rotations(TURNS, rng)
+    if line is not None:
+        directions = line[1][None]
+    else:
+        sphere = rng.standard_normal((DIRECTIONS, 3))
+        directions = sphere / np.linalg.norm(sphere, axis=1)[:, None]
+    found = [_held(sightings, turns, u, None if line is None else line[0]) for u in directions]
+    costs = np.array([cost for cost, _, _ in found])  # (directions, turns)
+    starts = []
+    for flat in np.argsort(costs, axis=None)[:KEPT]:
+        d, r = np.unravel_index(int(flat), costs.shape)
+        _, t, point = found[int(d)]
+        X = frames.transform(turns[int(r)], t[int(r)])
+        starts.append(MountState(X, (np.stack([point[int(r)], directions[int(d)]]),)))
+    return starts
+
+
+def _random_rotations(count: int, rng: np.random.Generator) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    quat = rng.standard_normal((count, 4))
+    return np.asarray(Rotation.from_quat(quat).as_matrix())
+
+
+def _held(
+    sightings: Sightings, turns: Array, direction: Array, point: Array | None
+) -> tuple[Array, Array, Array]:
+    """With rotations (p, 3, 3) and a direction held: costs (p,), t (p, 3), points (p, 3)."""
+    R, place = sightings.T_base_flange[:, :3, :3], sightings.T_base_flange[:, :3, 3]
+    own = np.column_stack([sightings.value[:, 0], np.zeros(len(place)), sightings.value[:, 1]])
+    across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)
+    lhs = np.einsum("ai,mij->maj", across, R)
+    if point is None:
+        lhs = np.concatenate([lhs, np.broadcast_to(-np.eye(2), (len(R), 2, 2))], axis=2)
+    lhs = lhs.reshape(2 * len(R), -1)
+    known = np.zeros(3) if point is None else point
+    rhs = np.einsum("ai,mij,pjk,mk->pma", across, R, turns, own)
+    rhs = rhs + np.einsum("ai,mi->ma", across, place - known)
+    rhs = rhs.reshape(len(turns), -1)
+    solution = -(np.linalg.pinv(lhs, rcond=1e-9) @ rhs.T).T
+    cost = np.sum((solution @ lhs.T + rhs) ** 2, axis=1)
+    points = np.broadcast_to(known, (len(turns), 3))
+    return cost, solution[:, :3], points if point is not None else solution[:, 3:] @ across
+
+
+def least_distances(view: View, near: MountState) -> MountState:
+    """Classic: the sum of squared distances from the line, every feature alike."""
+    plain = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
+    alike = View(view.model, replace(view.sightings, covariance=plain))
+    problem = MountProblem((alike,), PoseNoise(0.0, 0.0))
+    return solve(problem, near, robust=False, sizes=problem.sizes).state

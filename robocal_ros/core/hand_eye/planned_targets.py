@@ -1,0 +1,148 @@
+"""How a sphere and a straight edge would be seen from planned poses, and from where they could be."""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.mount_problem import View
+from robocal_ros.core.hand_eye.planning import SensorRange
+from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
+from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
+
+Array = NDArray[np.float64]
+
+OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
+STEEPEST_RAD = float(np.radians(60.0))  # slope of a surface that still returns light
+EDGE_POINTS = 10.0  # on each side of an edge, by which its place is known
+TILTS_RAD = np.radians([-25.0, 0.0, 25.0])
+ROLLS_RAD = np.radians([-60.0, 0.0, 60.0])
+ASIDE = (-0.25, 0.25)  # of the field's width
+ALONG_M = (-0.04, 0.0, 0.04)  # of an edge
+
+
+def _tilted(T_base_sensor: Array) -> Array:
+    """Rotations (n, 3, 3) of a sensor turned about the mean of planned ones."""
+    mean = frames.nearest_rotation(T_base_sensor[:, :3, :3].mean(axis=0))
+    turns = np.array(list(product(TILTS_RAD, TILTS_RAD, ROLLS_RAD)))
+    return np.stack([mean @ frames.rotation_from_rpy(turn) for turn in turns])
+
+
+def _looking(turns: Array, at: Array, target: Array) -> Array:
+    """Sensor poses (n, 4, 4) with these rotations that see the target (3,) at ``at`` (n, 3)."""
+    return frames.transform(turns, target - np.einsum("nij,nj->ni", turns, at))
+
+
+def _places(sensor: SensorRange, heights: tuple[float, ...]) -> Array:
+    """Where a target may be seen (k, 3), sensor frame, m."""
+    far = np.linspace(sensor.near_m, sensor.far_m, 5)[[1, 3]]
+    aside = np.array(ASIDE) * sensor.width_m
+    return np.array(list(product(aside, heights, far)))
+
+
+def _expected(model: TargetModel, seen: Seen, T_base_flange: Array, covariance: Array) -> View:
+    """A view in which everything is seen as predicted."""
+    m = len(T_base_flange)
+    names = tuple(f"pose {i + 1}" for i in range(m))
+    return View(model, Sightings(names, np.arange(m), T_base_flange, seen.value, covariance))
+
+
+def _out_of_range(x: Array, z: Array, reach: float, sensor: SensorRange) -> dict[int, str]:
+    """Poses whose sighting (x, z), with ``reach`` on each side, lies out of the field of view."""
+    found = {}
+    for i in np.flatnonzero((z < sensor.near_m - reach) | (z > sensor.far_m + reach)):
+        found[int(i)] = f"the target is at {z[i] * 1e3:.0f} mm, the sensor sees "
+        found[int(i)] += f"{sensor.near_m * 1e3:.0f} to {sensor.far_m * 1e3:.0f} mm"
+    for i in np.flatnonzero(np.abs(x) > 0.5 * sensor.width_m):
+        found.setdefault(int(i), f"the target is {x[i] * 1e3:.0f} mm aside, out of the laser line")
+    return found
+
+
+@dataclass(frozen=True)
+class PlannedSphere:
+    """A sphere; ``centre`` (3,) in base, or None: where the poses look."""
+
+    radius_m: float
+    sensor: SensorRange
+    centre: tuple[float, float, float] | None = None
+    fewest: int = 5
+
+    def place(self, T_base_sensor: Array) -> Array:
+        """Its centre."""
+        if self.centre is not None:
+            return np.array(self.centre)
+        at = np.array([0.0, OFF_EQUATOR * self.radius_m, self.sensor.middle_m, 1.0])
+        return np.asarray((T_base_sensor @ at).mean(axis=0)[:3])
+
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+        """Circles, with the covariance that their arcs will have."""
+        model = SphereModel(self.radius_m)
+        seen = model.see(T_base_flange @ T_flange_sensor, place)
+        r = np.maximum(seen.value[:, 2], 0.1 * self.radius_m)
+        slope = np.linspace(-STEEPEST_RAD, STEEPEST_RAD, 41)
+        J = np.column_stack([np.sin(slope), -np.cos(slope), np.ones(len(slope))])
+        step = self.sensor.width_m / self.sensor.points
+        share = np.cos(slope) * (slope[1] - slope[0])  # columns are even along the laser line
+        unit = np.linalg.inv((J * share[:, None]).T @ J)
+        return _expected(
+            model, seen, T_base_flange, self.sensor.noise_m**2 * (step / r)[:, None, None] * unit
+        )
+
+    def unseen(self, view: View) -> dict[int, str]:
+        """Out of the field of view, or beside the sphere."""
+        x, z, r = view.sightings.value.T
+        found = _out_of_range(x, z, self.radius_m, self.sensor)
+        for i in np.flatnonzero(r < 0.2 * self.radius_m):
+            found.setdefault(int(i), "the laser plane passes beside the sphere")
+        return found
+
+    def candidates(self, T_base_sensor: Array, place: Array) -> Array:
+        """On both sides of the laser plane."""
+        high = OFF_EQUATOR * self.radius_m
+        at = _places(self.sensor, (-high, high))
+        pairs = list(product(_tilted(T_base_sensor), at))
+        return _looking(np.array([R for R, _ in pairs]), np.array([s for _, s in pairs]), place)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedLine:
+    """A straight edge; ``line`` (2, 3), a point and the unit direction, or None: across the poses."""
+
+    sensor: SensorRange
+    line: Array | None = None
+
+    @property
+    def fewest(self) -> int:
+        """Two equations each."""
+        return 5 if self.line is None else 3
+
+    def place(self, T_base_sensor: Array) -> Array:
+        """A point and the direction."""
+        if self.line is not None:
+            return self.line
+        point = (T_base_sensor @ np.array([0.0, 0.0, self.sensor.middle_m, 1.0])).mean(axis=0)[:3]
+        normal = T_base_sensor[:, :3, 1].mean(axis=0)
+        return np.stack([point, normal / np.linalg.norm(normal)])
+
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+        """Points of the edge."""
+        model = LineModel(self.line is not None)
+        seen = model.see(T_base_flange @ T_flange_sensor, place)
+        step = self.sensor.width_m / self.sensor.points
+        spread = np.diag([(0.5 * step) ** 2, self.sensor.noise_m**2 / EDGE_POINTS, 1.0])
+        return _expected(model, seen, T_base_flange, np.tile(spread, (len(T_base_flange), 1, 1)))
+
+    def unseen(self, view: View) -> dict[int, str]:
+        """Out of the field of view."""
+        return _out_of_range(
+            view.sightings.value[:, 0], view.sightings.value[:, 1], 0.0, self.sensor
+        )
+
+    def candidates(self, T_base_sensor: Array, place: Array) -> Array:
+        """At several places along the edge."""
+        at = _places(self.sensor, (0.0,))
+        trios = list(product(_tilted(T_base_sensor), at, ALONG_M))
+        poses = [_looking(R[None], s[None], place[0] + a * place[1])[0] for R, s, a in trios]
+        return np.array(poses)

@@ -1,0 +1,222 @@
+"""Will planned poses do? Rank, expected error and better poses, before the robot moves.
+
+The Fisher information of a pose is that of its predicted sighting: the Jacobian of the estimator at
+the place where the target is expected, with the noise that sensor and robot are said to have.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.naming import describe_motion
+from robocal_ros.core.hand_eye.quality import expected_error_m
+from robocal_ros.core.observability import observability
+
+Array = NDArray[np.float64]
+
+OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
+VAGUE_M, VAGUE_RAD = 1.0, 1.0  # what is known of a mount without any measurement
+MOST_PROPOSED = 12
+
+
+@dataclass(frozen=True)
+class SensorRange:
+    """What a line-laser sensor sees: distances and width (m), points, noise along the beam (m)."""
+
+    near_m: float = 0.19
+    far_m: float = 0.21
+    width_m: float = 0.06
+    points: int = 1280
+    noise_m: float = 3.7e-5
+
+    @property
+    def middle_m(self) -> float:
+        """The distance to work at."""
+        return 0.5 * (self.near_m + self.far_m)
+
+    @property
+    def working_points(self) -> Array:
+        """Middle and ends (3, 3) of the line at the working distance, sensor frame, m."""
+        x = 0.5 * self.width_m * np.array([-1.0, 0.0, 1.0])
+        return np.column_stack([x, np.zeros(3), np.full(3, self.middle_m)])
+
+
+class PlannedTarget(Protocol):
+    """How a target would be seen, and from where it could be."""
+
+    @property
+    def fewest(self) -> int:
+        """Poses without which nothing is solved."""
+
+    def place(self, T_base_sensor: Array) -> Array:
+        """Where it is expected, from sensor poses (m, 4, 4) that look at it."""
+
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+        """Sightings to expect from flange poses (m, 4, 4); those with their pose's index."""
+
+    def unseen(self, view: View) -> dict[int, str]:
+        """Poses from which it is out of view, and why."""
+
+    def candidates(self, T_base_sensor: Array, place: Array) -> Array:
+        """Sensor poses (n, 4, 4) that see it well, turned about those that are planned."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanReport:
+    """What a plan is worth.
+
+    Attributes
+    ----------
+    rank, unknowns : of the problem; unobservable : open directions in words.
+    sigma : (6,) expected, sensor axes: m, rad; working_error_m: rms at the working distance.
+    unseen : poses (by index) that do not see the target, with the reason.
+    proposed : (n, 4, 4) flange poses to add, best first; proposed_error_m: with all of them.
+    """
+
+    rank: int
+    unknowns: int
+    unobservable: tuple[str, ...]
+    sigma: Array | None
+    working_error_m: float | None
+    unseen: dict[int, str]
+    proposed: Array
+    proposed_error_m: float | None
+    verdict: Verdict
+
+
+def check_plan(
+    target: PlannedTarget,
+    T_base_flange: Array,
+    T_flange_sensor: Array,
+    sensor: SensorRange,
+    noise: PoseNoise,
+    limit_m: float,
+) -> PlanReport:
+    """Judge planned flange poses (m, 4, 4), with an approximate T_flange_sensor (4, 4).
+
+    ``limit_m``: largest expected error (rms) of a point at the working distance.
+    """
+    place = target.place(T_base_flange @ T_flange_sensor)
+    whole = target.view(T_base_flange, T_flange_sensor, place)
+    unseen = target.unseen(whole)
+    seen = np.array([i for i in range(len(T_base_flange)) if i not in unseen], dtype=np.int64)
+    state = MountState(T_flange_sensor, (place,))
+    k = 6 + len(whole.model.names)
+    rank, words = 0, ["no pose sees the target"]
+    covariance: Array | None = None
+    information = np.zeros((k, k))
+    if len(seen):
+        J = _rows(whole.take(np.isin(whole.sightings.pose, seen)), state, noise)
+        information = J.T @ J + _prior(whole)
+        found = observability(np.vstack([J, np.sqrt(_prior(whole))]))
+        rank = found.rank
+        poses = T_base_flange[seen]
+        words = [
+            describe_motion(d[:6], poses) for d in found.null.T if np.any(np.abs(d[:6]) > 1e-9)
+        ]
+        if rank == k:
+            covariance = np.asarray(np.linalg.inv(information))
+            words = _vague(covariance, sensor, poses)
+    points = sensor.working_points
+    error = None if covariance is None else expected_error_m(covariance[:6, :6], points)
+    verdict = _verdict(len(seen), target.fewest, words, error, limit_m)
+    proposed, better = np.empty((0, 4, 4)), None
+    if not verdict.accept:
+        proposed, better = _propose(
+            target, T_base_flange, state, (information, noise, sensor, limit_m)
+        )
+    return PlanReport(
+        rank,
+        k,
+        tuple(words),
+        None if covariance is None else np.sqrt(np.diag(covariance)[:6]),
+        error,
+        unseen,
+        proposed,
+        better,
+        verdict,
+    )
+
+
+def _rows(view: View, state: MountState, noise: PoseNoise) -> Array:
+    """Whitened Jacobian (N, k) of sightings."""
+    _, jacobian = MountProblem((view,), noise).linearise(state)
+    return jacobian.reshape(-1, jacobian.shape[2])
+
+
+def _prior(view: View) -> Array:
+    """Information (k, k) about the target beforehand."""
+    k = len(view.model.names)
+    prior = np.zeros((6 + k, 6 + k))
+    prior[6:, 6:] = view.model.prior
+    return prior
+
+
+def _vague(covariance: Array, sensor: SensorRange, T_base_flange: Array) -> list[str]:
+    """Directions that are as good as open, in words."""
+    size = np.repeat([1.0, sensor.middle_m], 3)
+    values, vectors = np.linalg.eigh(covariance[:6, :6] * np.outer(size, size))
+    open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > OPEN_M]
+    return [describe_motion(direction / size, T_base_flange) for direction in open_ones.T]
+
+
+def _verdict(
+    seen: int, fewest: int, words: Sequence[str], error: float | None, limit_m: float
+) -> Verdict:
+    if seen < fewest:
+        return Verdict(
+            Code.TOO_FEW_SAMPLES, f"{seen} poses see the target, at least {fewest} are needed"
+        )
+    if words or error is None:
+        return Verdict(Code.RANK_DEFICIENT, f"not determined: {'; '.join(words)}")
+    figures = f"a point at the working distance is to be expected off by {error * 1e3:.3f} mm rms"
+    if error > limit_m:
+        return Verdict(
+            Code.POSES_NOT_INFORMATIVE,
+            f"{figures} (allowed {limit_m * 1e3:g} mm): add the proposed poses",
+        )
+    return Verdict(Code.ACCEPT, figures)
+
+
+def _propose(
+    target: PlannedTarget,
+    T_base_flange: Array,
+    state: MountState,
+    known: tuple[Array, PoseNoise, SensorRange, float],
+) -> tuple[Array, float]:
+    """Add, one by one, the candidate that lowers the expected error most, until it will do."""
+    information, noise, sensor, limit_m = known
+    X, place = state.T_flange_sensor, state.places[0]
+    candidates = target.candidates(T_base_flange @ X, place)
+    view = target.view(candidates @ frames.invert(X), X, place)
+    problem = MountProblem((view,), noise)
+    _, J = problem.linearise(state)
+    gain = np.zeros((len(candidates), *information.shape))
+    gain[problem.poses] = np.swapaxes(J, 1, 2) @ J
+    gain[list(target.unseen(view))] = 0.0
+    vague = np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0
+    total = information + np.diag(np.concatenate([vague, np.full(len(information) - 6, 1.0)]))
+    chosen: list[int] = []
+    error = np.inf
+    while len(chosen) < MOST_PROPOSED and error > limit_m:
+        covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
+        errors = _errors(covariance, sensor.working_points)
+        best = int(np.argmin(errors))
+        error = float(errors[best])
+        total = total + gain[best]
+        chosen.append(best)
+    return candidates[chosen] @ frames.invert(X), error
+
+
+def _errors(covariance: Array, points: Array) -> Array:
+    """`expected_error_m` for many covariances (n, 6, 6)."""
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
+    spread = np.einsum("pij,njk,pik->np", J, covariance, J)
+    return np.asarray(np.sqrt(spread.mean(axis=1)))

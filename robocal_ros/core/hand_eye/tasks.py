@@ -1,0 +1,198 @@
+"""One task per target: read its features from profiles, start, solve in the classic way."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import RobocalError, TooFewSamplesError
+from robocal_ros.core.fitting.arc import ArcRule, fit_arc
+from robocal_ros.core.fitting.edge import EdgeRule, fit_edge
+from robocal_ros.core.hand_eye.edge_start import line_starts
+from robocal_ros.core.hand_eye.mount_problem import MountState, View
+from robocal_ros.core.hand_eye.profile import Profile
+from robocal_ros.core.hand_eye.result import TargetKind
+from robocal_ros.core.hand_eye.sightings import Sightings
+from robocal_ros.core.hand_eye.sphere_start import classic_sphere, sphere_starts
+from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
+from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class HandEyeData:
+    """Shots of one target.
+
+    Attributes
+    ----------
+    names : (m) of the shots; T_base_flange : (m, 4, 4) as the robot reports them.
+    profiles : (m) what the sensor saw, or why that cannot be used.
+    marks : (m) mark of a staircase that each laser plane was laid through, or None.
+    """
+
+    names: tuple[str, ...]
+    T_base_flange: Array
+    profiles: Sequence[Profile | RobocalError]
+    marks: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Read:
+    """Features of a data set: ``view``, and which shots gave none and why."""
+
+    view: View
+    rejected: Mapping[str, str]
+
+
+class Task(Protocol):
+    """A kind of target."""
+
+    @property
+    def kind(self) -> TargetKind:
+        """Its name."""
+
+    @property
+    def fewest(self) -> int:
+        """Profiles without which nothing is solved."""
+
+    def read(self, data: HandEyeData) -> Read:
+        """Features of profiles. Raises `RobocalError` when too few give any."""
+
+    def starts(self, view: View) -> list[MountState]:
+        """First states, best first."""
+
+    def classic(self, view: View, near: MountState) -> MountState:
+        """The classic estimate; ``near`` is a state near the solution."""
+
+    def found(self, place: Array) -> Document:
+        """What was found of the target."""
+
+
+def usable(rows: Mapping[str, object], rejected: Mapping[str, str], fewest: int, what: str) -> None:
+    """Refuse when fewer than ``fewest`` shots gave a feature.
+
+    Raises
+    ------
+    TooFewSamplesError
+        With the commonest reason.
+    """
+    if len(rows) >= fewest:
+        return
+    reasons = list(rejected.values())
+    most = max(reasons, key=reasons.count, default="")
+    because = f"; {len(reasons)} show none, most often because: {most}" if reasons else ""
+    raise TooFewSamplesError(
+        f"{len(rows)} profiles show {what}, at least {fewest} are needed{because}"
+    )
+
+
+@dataclass(frozen=True)
+class SphereTask:
+    """A sphere that stands still, somewhere."""
+
+    target: SphereTarget
+    kind: Literal["sphere"] = field(default="sphere", init=False)
+    fewest: int = field(default=5, init=False)
+
+    def read(self, data: HandEyeData) -> Read:
+        """Circles."""
+        rule = ArcRule(self.target.radius_m)
+        found: dict[str, tuple[int, Array, Array]] = {}
+        rejected = {}
+        for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
+            try:
+                arc = fit_arc(seen(profile), rule)
+            except RobocalError as error:
+                rejected[name] = str(error)
+                continue
+            found[name] = i, np.array([*arc.centre, arc.radius_m]), arc.covariance
+        usable(found, rejected, self.fewest, "the sphere")
+        return Read(View(SphereModel(self.target.radius_m), _gathered(data, found)), rejected)
+
+    def starts(self, view: View) -> list[MountState]:
+        """All sides of the laser plane are tried."""
+        return sphere_starts(view.sightings, self.target.radius_m)
+
+    def classic(self, view: View, near: MountState) -> MountState:
+        """Linear differences."""
+        return classic_sphere(view.sightings, self.target.radius_m, near)
+
+    def found(self, place: Array) -> Document:
+        """Its centre in base."""
+        return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
+
+
+@dataclass(frozen=True, eq=False)
+class LineTask:
+    """A straight edge or groove; ``target`` None where its place is unknown."""
+
+    target: LineTarget | None
+    rule: EdgeRule
+    kind: Literal["line"] = field(default="line", init=False)
+
+    @property
+    def fewest(self) -> int:
+        """Two equations each."""
+        return 5 if self.target is None else 3
+
+    def read(self, data: HandEyeData) -> Read:
+        """Points of the edge."""
+        found: dict[str, tuple[int, Array, Array]] = {}
+        rejected = {}
+        for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
+            try:
+                edge = fit_edge(seen(profile), self.rule)
+            except RobocalError as error:
+                rejected[name] = str(error)
+                continue
+            covariance = np.eye(3)
+            covariance[:2, :2] = edge.covariance
+            found[name] = i, np.array([*edge.point, 0.0]), covariance
+        usable(found, rejected, self.fewest, "the line")
+        return Read(View(LineModel(self.target is not None), _gathered(data, found)), rejected)
+
+    def starts(self, view: View) -> list[MountState]:
+        """Rotations, and directions of an unknown line, are tried."""
+        line = None
+        if self.target is not None:
+            line = np.stack([self.target.point_base, self.target.direction_base])
+        return line_starts(view.sightings, line)
+
+    def classic(self, view: View, near: MountState) -> MountState:
+        """Least squares of the distances from the line, all alike."""
+        from robocal_ros.core.hand_eye.edge_start import least_distances
+
+        return least_distances(view, near)
+
+    def found(self, place: Array) -> Document:
+        """A point of it and its direction in base."""
+        line = {"point_mm": (place[0] * 1e3).tolist(), "direction": place[1].tolist()}
+        return {"line": line, "known": self.target is not None}
+
+
+def seen(profile: Profile | RobocalError) -> Array:
+    """Points (n, 2) of a profile.
+
+    Raises
+    ------
+    RobocalError
+        When there is none.
+    """
+    if isinstance(profile, RobocalError):
+        raise profile
+    return profile.points
+
+
+def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:
+    poses = np.array([i for i, _, _ in found.values()], dtype=np.int64)
+    return Sightings(
+        tuple(found),
+        poses,
+        data.T_base_flange[poses],
+        np.array([value for _, value, _ in found.values()]),
+        np.array([covariance for _, _, covariance in found.values()]),
+    )
