@@ -70,13 +70,13 @@ class HandEyeServices:
 
     async def _start(self, request: Any, response: Any) -> Any:
         kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
-        given = kind, request.target_file, request.method, mount
+        given = kind, request.target_file, request.feature, request.method, mount
         arguments = start_arguments(self._settings, *given)
         return answer(response, await self._ask(Command(START, arguments)))
 
     async def _start_twin(self, request: Any, response: Any) -> Any:
         try:
-            arguments = start_arguments(self._settings, "", "", "", "")
+            arguments = start_arguments(self._settings)
         except RobocalError as error:
             response.message = trigger_text(0, error.code, str(error))
             return response

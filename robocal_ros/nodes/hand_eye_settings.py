@@ -11,7 +11,7 @@ from robocal_ros.core.hand_eye.target_documents import target_document
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_data import TOPIC_OF
+from robocal_ros.sessions.hand_eye_data import FEATURES, TOPIC_OF
 from robocal_ros.sessions.hand_eye_solving import METHODS, MOUNTS, WITHOUT_FILE
 from robocal_ros.storage.hand_eye_targets import read_target
 
@@ -23,6 +23,7 @@ SETTINGS = (
     Setting("sensor_frame", "sensor", "Name of the sensor's frame, in its messages and on tf"),
     Setting("target", "sphere", "Target where a call names none", choices=tuple(TOPIC_OF)),
     Setting("target_file", "", "File of the target where a call names none"),
+    Setting("feature", FEATURES[0], "What a line is in a profile", choices=FEATURES),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
     *STANDSTILL,
@@ -64,7 +65,12 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
 
 
 def start_arguments(
-    settings: Mapping[str, Any], kind: str, file: str, method: str, mount: str
+    settings: Mapping[str, Any],
+    kind: str = "",
+    file: str = "",
+    feature: str = "",
+    method: str = "",
+    mount: str = "",
 ) -> dict[str, Any]:
     """Arguments of the command that begins a data set; what is empty comes from the settings.
 
@@ -79,6 +85,7 @@ def start_arguments(
     target = read_target(Path(name)) if name else None
     return {
         "target": target_document(kind, target),
+        "feature": feature or settings["feature"],
         "method": method or settings["method"],
         "mount": mount or settings["mount"],
     }

@@ -21,7 +21,13 @@ from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import Commanded, Handler
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_data import Capture, DataSet, HandEyeSample, data_set_of
+from robocal_ros.sessions.hand_eye_data import (
+    Capture,
+    DataSet,
+    HandEyeSample,
+    data_set_begun,
+    data_set_of,
+)
 from robocal_ros.sessions.hand_eye_in_force import HandEyeInForce
 from robocal_ros.sessions.hand_eye_results import HandEyeResults
 from robocal_ros.sessions.hand_eye_shots import Shot, ShotLog
@@ -141,9 +147,8 @@ class HandEyeSession(Commanded):
         return self.data
 
     def _start(self, command: Command, wall_ns: int) -> Outcome:
-        arguments = command.arguments
-        data = DataSet(dict(arguments["target"]), str(arguments["method"]), str(arguments["mount"]))
-        require_known(data.kind, data.method, data.mount)
+        data = data_set_begun(command.arguments)
+        require_known(data, data.method)
         self.data, self._found = data, None
         return Outcome(command, Code.ACCEPT, f"data set of a {data.kind} ({data.method}) begun")
 
@@ -218,7 +223,7 @@ class HandEyeSession(Commanded):
     def _load(self, command: Command, wall_ns: int) -> Outcome:
         arguments = command.arguments
         data = data_set_of(arguments["set"], self.current.arm)
-        require_known(data.kind, data.method, data.mount)
+        require_known(data, data.method)
         self.data, self._found = data, None
         self._handle = max(self._handle, *data.samples, 0)
         count = len(data.samples)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,12 @@ from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
-IN_HAND, TO_HAND = "in-hand", "to-hand"
+Mount = Literal["in-hand", "to-hand"]
+Feature = Literal["edge", "groove"]
+
+IN_HAND: Mount = "in-hand"
+TO_HAND: Mount = "to-hand"
+FEATURES: tuple[Feature, ...] = ("edge", "groove")
 TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
 
 
@@ -60,14 +65,15 @@ class DataSet:
     Attributes
     ----------
     target : document of the target, with its ``kind``.
-    method : best or classic; ``mount`` in-hand or to-hand.
+    method : best or classic; ``mount`` in-hand or to-hand; ``feature`` of a line, in a profile.
     captures, samples : by handle; a capture that failed or waits has no sample.
     candidate : the last calibration in the history; 0 without.
     """
 
     target: Document
     method: str
-    mount: str
+    mount: Mount
+    feature: Feature
     captures: dict[int, Capture] = field(default_factory=dict)
     samples: dict[int, HandEyeSample] = field(default_factory=dict)
     candidate: int = 0
@@ -121,6 +127,7 @@ class DataSet:
             "target": self.target,
             "method": self.method,
             "mount": self.mount,
+            "feature": self.feature,
             "samples": [
                 {
                     "handle": sample.handle,
@@ -134,6 +141,16 @@ class DataSet:
         }
 
 
+def data_set_begun(document: Mapping[str, Any]) -> DataSet:
+    """A data set without samples; its names are not checked."""
+    return DataSet(
+        dict(document["target"]),
+        str(document["method"]),
+        cast(Mount, document["mount"]),
+        cast(Feature, document["feature"]),
+    )
+
+
 def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
     """Read what `DataSet.document` gave, also after JSON; flange poses are those of ``arm``.
 
@@ -143,7 +160,7 @@ def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
         When it is no such document.
     """
     try:
-        found = DataSet(dict(document["target"]), str(document["method"]), str(document["mount"]))
+        found = data_set_begun(document)
         columns = 7 if found.topic == TARGET_POSE else 2
         for row in document["samples"]:
             q = np.array(row["q"], dtype=np.float64)
