@@ -6,6 +6,7 @@ import pytest
 from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
+from hand_eye_bag import hand_eye_bag
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
 from tool_tables import tool_tables
@@ -71,6 +72,12 @@ CASES = {
         "replay.tool.json",
         ["replay", TOOL_BAG],
         ["replay", TOOL_BAG, "--robot", "kr150_r3100"],
+        (2, "WRONG_ROBOT"),
+    ),
+    "replay hand-eye": (
+        "replay.hand_eye.json",
+        ["replay", "hand_eye.mcap"],
+        ["replay", "hand_eye.mcap", "--robot", "kr150_r3100"],
         (2, "WRONG_ROBOT"),
     ),
     "history list": (
@@ -174,6 +181,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     visits = shift()
     plain_bag(folder / "plain.mcap", visits)
     recorded_bag(folder / "live.mcap", folder / "state", visits)
+    hand_eye_bag(folder / "hand_eye.mcap")
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
