@@ -20,6 +20,7 @@ from robocal_ros.nodes.conversions import transform_message, trigger_text
 from robocal_ros.nodes.decision_services import answer, twin
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
 from robocal_ros.nodes.hand_eye_outputs import MOUNTS, TARGETS
+from robocal_ros.nodes.hand_eye_plan import HandEyePlan
 from robocal_ros.nodes.hand_eye_settings import start_arguments
 from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
@@ -60,6 +61,7 @@ class HandEyeServices:
         add(Trigger, "~/calibrate_trigger", twin(ask, CALIBRATE, {}))
         add(HandEyeFile, "~/load", self._load)
         add(HandEyeFile, "~/save", self._save)
+        HandEyePlan(node, settings, lambda: self._session, history)
 
     @property
     def _session(self) -> HandEyeSession:

@@ -9,11 +9,19 @@ import numpy as np
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.hand_eye.target_documents import target_document
 from robocal_ros.nodes.parameters import Setting, length
+from robocal_ros.nodes.pose_settings import pose_settings
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import FEATURES, TOPIC_OF
 from robocal_ros.sessions.hand_eye_solving import METHODS, MOUNTS, WITHOUT_FILE
 from robocal_ros.storage.hand_eye_targets import read_target
+
+
+def _range_fault(values: list[float]) -> str | None:
+    if len(values) != 3:
+        return "three lengths are wanted"
+    return None if values[0] < values[1] else "the nearest distance must be below the farthest"
+
 
 SETTINGS = (
     Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
@@ -47,6 +55,21 @@ SETTINGS = (
         high=1.0,
     ),
     length("limit_mm", 0.5, "Largest expected error at the working distance", 1e-3, 100.0),
+    *pose_settings(
+        "rough",
+        "About where the sensor sits on the flange, for check_plan before any calibration",
+        "Its orientation: x along the laser line, z along the beam",
+    ),
+    Setting(
+        "sensor_range_mm",
+        [190.0, 210.0, 60.0],
+        "Nearest and farthest distance of the sensor, and its width; for check_plan",
+        unit="mm",
+        low=1.0,
+        high=20000.0,
+        check=_range_fault,
+    ),
+    length("sensor_noise_mm", 0.037, "Noise of a point along the beam; for check_plan", 1e-4, 10.0),
 )
 
 
