@@ -1,7 +1,7 @@
 """The service of the hand-eye node that judges planned poses."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,6 @@ from robocal_msgs.srv import CheckHandEyePlan
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import ConflictError, InputError, LimitError
-from robocal_ros.core.hand_eye.planning import PlanReport, SensorRange
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.pose_settings import given_pose
@@ -17,6 +16,9 @@ from robocal_ros.nodes.tool_messages import pose_message
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_planning import judged_plan
 from robocal_ros.storage.calibrations import CalibrationHistory
+
+if TYPE_CHECKING:
+    from robocal_ros.core.hand_eye.planning import PlanReport
 
 Array = NDArray[np.float64]
 
@@ -43,6 +45,8 @@ class HandEyePlan:
         node.add_service(CheckHandEyePlan, "~/check_plan", self._check)
 
     def _check(self, request: Any, response: Any) -> Any:
+        from robocal_ros.core.hand_eye.planning import SensorRange  # heavy: not at a node's start
+
         session = self._session()
         if session.data is None:
             raise ConflictError("no data set is open: call start, so that the target is known")
@@ -91,7 +95,7 @@ def _matrix(pose: Any, number: int) -> Array:
     return frames.transform_from_quat([p.x, p.y, p.z], quat / norm)
 
 
-def _answered(response: Any, found: PlanReport) -> Any:
+def _answered(response: Any, found: "PlanReport") -> Any:
     response.success, response.status = found.verdict.accept, int(found.verdict.code)
     response.message = found.verdict.reason
     response.rank, response.unknowns = found.rank, found.unknowns
