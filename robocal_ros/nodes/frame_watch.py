@@ -11,6 +11,8 @@ MANY_LATCHED = QoSProfile(
     depth=100, reliability=qos.LATCHED.reliability, durability=qos.LATCHED.durability
 )
 
+TOPICS = {"/tf_static": MANY_LATCHED, "/tf": qos.SENSOR}
+
 
 class FrameWatch:
     """Listens to ``/tf`` and ``/tf_static`` for one child frame; without tf2_msgs it hears nothing.
@@ -22,14 +24,27 @@ class FrameWatch:
         self._node, self._child = node, child
         self._seen: set[str] = set()
         self.own: set[str] = set()
+        self._publishers = 0
         self._subscriptions: list[Any] = []
+        self._listen()
+
+    def _listen(self) -> None:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError:
             return
-        for topic, profile in (("/tf_static", MANY_LATCHED), ("/tf", qos.SENSOR)):
-            made = node.create_subscription(TFMessage, topic, self._take, qos.own(profile))
+        for topic, profile in TOPICS.items():
+            made = self._node.create_subscription(TFMessage, topic, self._take, qos.own(profile))
             self._subscriptions.append(made)
+
+    def look(self) -> None:
+        """Listen anew when a publisher has gone: what it said holds no more."""
+        publishers = sum(self._node.count_publishers(topic) for topic in TOPICS)
+        if publishers < self._publishers:
+            self.close()
+            self._seen.clear()
+            self._listen()
+        self._publishers = publishers
 
     def _take(self, message: Any) -> None:
         for transform in message.transforms:

@@ -11,7 +11,6 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
-from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import hand_eye_kind
 from robocal_ros.nodes import qos
@@ -149,15 +148,14 @@ class HandEyeNode(HouseNode):
         if session is None:
             return
         silent_s = self._silence.look(time.monotonic())
-        if silent_s > self._config.capture_timeout_s:
-            words = f"joint states are silent for {silent_s:.1f} s: check the robot's driver"
-            if (command := session.broken_off(Code.TOO_FEW_SAMPLES, words)) is not None:
-                self._desk.ask(command)
+        if (command := session.silent(silent_s)) is not None:
+            self._desk.ask(command)
 
     def _poll(self) -> None:
         self._guard.look()
         if self._session is None:
             return
+        self._frames.look()
         for outcome in self._session.poll():
             self._show(outcome)
         self._show_in_force()

@@ -25,7 +25,6 @@ from robocal_ros.nodes.hand_eye_settings import start_arguments
 from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.hand_eye_bags import read_data_set, write_data_set
 
 Ask = Callable[[Command], Awaitable[Outcome]]
 
@@ -137,12 +136,16 @@ class HandEyeServices:
         return answer(response, outcome)
 
     async def _load(self, request: Any, response: Any) -> Any:
+        from robocal_ros.storage.hand_eye_bags import read_data_set  # heavy: not at a node's start
+
         document = read_data_set(_path(request), self._session.nominal)
         outcome = await self._ask(Command(LOAD, {"path": request.path, "set": document}))
         response.samples = outcome.samples
         return answer(response, outcome)
 
     def _save(self, request: Any, response: Any) -> Any:
+        from robocal_ros.storage.hand_eye_bags import write_data_set
+
         session, path = self._session, _path(request)
         data = session.data
         if data is None or not data.samples:

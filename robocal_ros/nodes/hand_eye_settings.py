@@ -49,7 +49,7 @@ SETTINGS = (
     Setting(
         "robot_sigma_deg",
         0.0,
-        "Error of its turn about each axis; 0: from the data",
+        "And of its turn about each axis, where robot_sigma_mm is given",
         unit="deg",
         low=0.0,
         high=1.0,

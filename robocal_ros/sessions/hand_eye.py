@@ -59,7 +59,7 @@ class HandEyeSession(Commanded):
         self._results = HandEyeResults(nominal, history, config, software, self.current)
         self._shots = ShotLog()
         self._handle = 0
-        self._why: RobocalError | None = None  # the latest message was of no use
+        self._why: RobocalError | None = None  # why the latest shot was of no use
         self._seen_ns = 0  # shots before it were looked at
         self._found: Command | None = None
         self.data: DataSet | None = None
@@ -83,13 +83,13 @@ class HandEyeSession(Commanded):
             self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
         elif self._take_joints(sample):
             self._shots.clear()
-            self._found = self.broken_off(Code.CONFLICT, "the clock jumped back: capture again")
+            self._found = self._broken_off(Code.CONFLICT, "the clock jumped back: capture again")
         self._look()
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""
         self.ignored.add(kind, str(error))
-        if self.data is not None and kind in (JOINTS, self.data.topic):
+        if self.data is not None and kind == self.data.topic:
             self._why = error
 
     def _look(self) -> None:
@@ -113,10 +113,17 @@ class HandEyeSession(Commanded):
             words = f"no {self.data.topic} with the robot at standstill within {limit_s:g} s"
             hint = "does the sensor publish it, is it triggered?"
             code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
-            self._found = self.broken_off(code, f"{words}: {self._why or hint}")
+            self._found = self._broken_off(code, f"{words}: {self._why or hint}")
 
-    def broken_off(self, code: Code, reason: str) -> Command | None:
-        """The command by which the capture that waits fails; None while none does."""
+    def silent(self, seconds: float) -> Command | None:
+        """The command by which a capture fails when no usable joint reading comes any more."""
+        if seconds <= self.config.capture_timeout_s:
+            return None
+        told = self.ignored.words() or "check the robot's driver"
+        words = f"joint states are silent for {seconds:.1f} s: {told}"
+        return self._broken_off(Code.TOO_FEW_SAMPLES, words)
+
+    def _broken_off(self, code: Code, reason: str) -> Command | None:
         capture = None if self.data is None else self.data.waiting
         if capture is None:
             return None

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RankDeficientError
+from robocal_ros.core.errors import RankDeficientError, ResidualError
 from robocal_ros.core.hand_eye.result import HandEyeResult, hand_eye_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Proposal, hand_eye_kind
@@ -54,7 +53,9 @@ class HandEyeResults:
             result = solved(data, samples, method, self._config)
         except RankDeficientError as error:
             told = {"unobservable": list(error.directions)}
-            return Outcome(command, Code.RANK_DEFICIENT, str(error), told, samples=len(samples))
+            return Outcome(command, error.code, str(error), told, samples=len(samples))
+        except np.linalg.LinAlgError as error:
+            raise ResidualError(f"no pose of the sensor explains the samples: {error}") from error
         document = hand_eye_document(result)
         kept = self._keep(data, samples, result, document, command, wall_ns)
         verdict, used = result.verdict, len(result.samples)

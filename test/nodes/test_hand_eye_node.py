@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from command import robocal_json
 from geometry_msgs.msg import TransformStamped
-from hand_eye_driver import ARM, FRAME, TYPE, Recorded, profile, sphere_set
+from hand_eye_driver import ARM, FRAME, TYPE, Recorded, joints, profile, sphere_set
 from hand_eye_live import NAME, SHOTS, LiveSensor, settings_of
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import (
@@ -211,6 +211,22 @@ def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSen
     assert twin.message.startswith("0 BAD_INPUT tf shows")
     listed = graph.call(ListCalibrations, f"{NAME}/list").calibrations
     assert [entry.state for entry in listed] == ["pending"]
+    # Once the other publisher has gone, nothing stands in the way.
+    graph.probe.destroy_publisher(others)
+    graph.spin_until(lambda: not sensor.node._frames.conflict("tool0"), "it is forgotten")
+    assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
+
+
+def test_what_another_process_accepts_is_not_put_below_two_parents(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    sensor.sphere(8)
+    result = sensor.calibrate()
+    others = graph.publisher(TFMessage, "/tf", qos.RELIABLE)
+    wrong = TransformStamped(child_frame_id=FRAME)
+    wrong.header.frame_id = "camera_rail"
+    others.publish(TFMessage(transforms=[wrong]))
+    graph.spin_until(lambda: sensor.node._frames.conflict("tool0"), "the transform is seen")
     # Accepted elsewhere it is in force, but not put onto tf, and that is said.
     tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
     sensor.node._history.accept(result.candidate_id, by="cli", reason="", wall_ns=1)
@@ -265,6 +281,14 @@ def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> Non
     failed = sensor.ended(1)
     assert failed.status == Code.TOO_FEW_SAMPLES
     assert "joint states are silent" in failed.reason
+    # A gripper on the same topic is no reading of this arm, and the reason says so.
+    assert sensor.ask_capture().success
+    for i in range(60):
+        gripper = joints(sensor.robot.now_ns + i * 10**7, np.zeros(1))
+        gripper.fields["name"] = ["finger"]
+        sensor.give(gripper)
+        graph.spin_for(0.02)
+    assert "joint state lacks" in sensor.ended(2).reason
 
 
 def test_nothing_is_left_of_an_earlier_session(graph: Any, sensor: LiveSensor) -> None:
