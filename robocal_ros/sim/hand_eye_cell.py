@@ -60,7 +60,7 @@ class PoseRobot:
         away = self.position_m * rng.standard_normal(3)
         about = self.rotation_rad * rng.standard_normal(3)
         reported = T_base_flange.copy()
-        reported[:3, :3] @= _turns(about)
+        reported[:3, :3] = reported[:3, :3] @ _turns(about)
         reported[:3, 3] += away
         return Standstill(T_base_flange, reported)
 

@@ -60,3 +60,33 @@ def polyline_profile(
     seen = x[(x > vertices[0, 0]) & (x < vertices[-1, 0])]
     z = np.interp(seen, vertices[:, 0], vertices[:, 1])
     return np.column_stack([seen, z + rng.normal(scale=noise, size=len(seen))])
+
+
+def contaminated(
+    points: Array, rng: np.random.Generator, *, spikes: float = 0.03, gaps: int = 4
+) -> tuple[Array, NDArray[np.int64]]:
+    """Points with spikes of up to 10 mm and gaps of 25 columns, and which rows are left."""
+    points = points.copy()
+    spiked = rng.random(len(points)) < spikes
+    points[spiked, 1] += rng.uniform(-0.01, 0.01, np.sum(spiked))
+    keep = np.ones(len(points), dtype=np.bool_)
+    for start in rng.integers(len(points), size=gaps):
+        keep[start : start + 25] = False
+    return points[keep], np.flatnonzero(keep)
+
+
+def turned(vertices: Array, angle: float) -> Array:
+    """Vertices (v, 2) turned about (0, 0.2)."""
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    middle = np.array([0.0, 0.2])
+    return np.asarray((vertices - middle) @ turn.T + middle)
+
+
+def mean_squares_agree(squares: Array, dof: int) -> bool:
+    """Whether the mean of squared, normalised errors (m,) is that of chi-square with dof.
+
+    Within 5 % (2.5 % of the standard deviation) and 3.5 standard deviations of the mean.
+    """
+    mean = float(np.mean(squares)) / dof
+    scatter = 3.5 * float(np.sqrt(2.0 / (dof * len(squares))))
+    return abs(mean - 1.0) < 0.05 + scatter

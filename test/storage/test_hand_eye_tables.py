@@ -1,5 +1,7 @@
 """Tables and target files of a hand-eye calibration: read, written, and refused by name."""
 
+import re
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -314,3 +316,28 @@ def test_corners_in_full(tmp_path):
     document["corners_mm"] = {"left": [[1, 2, 3], [4, 5]]}
     with pytest.raises(InputError, match="corners_mm, left, corner 2 must be a list of 3 numbers"):
         target(tmp_path, document)
+
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.mark.parametrize("kind", ["sphere", "step", "line"])
+def test_the_files_in_the_docs_are_read(tmp_path, kind):
+    text = (DOCS / f"hand_eye_{kind}.md").read_text()
+    files = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    for file in files:
+        (tmp_path / "target.yaml").write_text(file)
+        found = read_target(tmp_path / "target.yaml")
+        assert isinstance(
+            found, {"sphere": SphereTarget, "step": StepTarget, "line": LineTarget}[kind]
+        )
+    assert len(files) == (2 if kind == "step" else 1)
+    for table in re.findall(r"((?:    \S+,profile,.*\n)(?:    \S.*\n)+)", text):
+        (tmp_path / "poses.csv").write_text(textwrap.dedent(table))
+        assert read_pose_table(tmp_path / "poses.csv").files == ("shot_01.csv", "shot_02.csv")
+    for table in re.findall(r"(    x_mm,z_mm\n(?:    \S.*\n)+)", text):
+        (tmp_path / "a.csv").write_text(textwrap.dedent(table))
+        with pytest.raises(
+            TooFewSamplesError, match="has 2 points"
+        ):  # three rows, one of them a gap
+            read_profile(tmp_path / "a.csv", "a")

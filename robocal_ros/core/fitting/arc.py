@@ -7,7 +7,7 @@ is estimated with it: sensors err along the beam, along the surface's normal, or
 Source of the use: methods of the fixed sphere, where y = +-sqrt(R^2 - r^2).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.core.errors import ResidualError, RobocalError, TooFewSamplesError
 from robocal_ros.core.fitting.arc_search import find_circle, linearised, step
+from robocal_ros.core.fitting.neighbours import on_curve
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
 
 Array = NDArray[np.float64]
@@ -24,9 +25,7 @@ FEWEST_POINTS = 20
 _NEAR = 3.5  # standard deviations of a point near a start
 _NEAR_M = 2e-5
 _ROUNDS = 25
-_NEIGHBOURS = 9  # columns
-_AGREEING = 0.7  # share of a point's neighbours that are on the arc too
-_PIECE = 0.2  # smallest piece of an arc, of its largest
+_GRANTED = 1.5  # of the largest noise allowed, lest the table becomes part of a noisy arc
 _ISOTROPIC = 5.0  # points' worth of belief that noise does not depend on the slope
 _STEEPEST = 0.05  # smallest share of variances of both directions
 _SURE = 4.0  # standard deviations
@@ -94,27 +93,27 @@ def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
             "exposure and that the sphere is in range"
         )
     try:
-        fit = _fitted(rows, rule.radius_m)
+        fit = _fitted(rows, rule)
         _require(fit, rows, rule)
     except RobocalError:
-        _blame_radius(rows, rule.radius_m)
+        _blame_radius(rows, rule)
         raise
     used = np.zeros(len(finite), dtype=np.bool_)
     used[np.flatnonzero(finite)[fit.used]] = True
     return ArcFit(fit.centre, fit.radius_m, fit.covariance, fit.noise_m, used)
 
 
-def _fitted(points: Array, radius: float) -> ArcFit:
+def _fitted(points: Array, rule: ArcRule) -> ArcFit:
     """The arc of a sphere of about this radius, whatever its quality."""
     limit = max(_NEAR * local_noise(points[:, 1]), _NEAR_M)
-    circle = find_circle(points, radius, limit)
+    circle = find_circle(points, rule.radius_m, limit)
     if circle is None:
         raise ResidualError(
-            f"no arc of a sphere of radius {radius * 1e3:.3f} mm is in the profile: check the "
-            "radius, and that the laser line crosses the sphere"
+            f"no arc of a sphere of radius {rule.radius_m * 1e3:.6g} mm is in the profile: check "
+            "the radius, and that the laser line crosses the sphere"
         )
     residual = linearised(circle, points)[1]
-    used = _agreeing((np.abs(residual) < limit) & (points[:, 1] < circle[1]))
+    used = on_curve((residual / limit) ** 2) & (points[:, 1] < circle[1])
     ab = np.full(2, (limit / _NEAR) ** 2)
     for _ in range(_ROUNDS):
         _require_points(used, len(points))
@@ -123,8 +122,8 @@ def _fitted(points: Array, radius: float) -> ArcFit:
         pull = np.einsum("ij,jk,ik->i", J, covariance, J)
         parts = _parts(circle, points)
         ab = _variances(parts[used], residual[used], pull[used] / (parts[used] @ ab))
-        near = _fitting(residual, parts @ ab, np.where(used, -pull, pull))
-        before, used = used, _agreeing(near & (points[:, 1] < circle[1]))
+        excess = _excess(residual, parts @ ab, np.where(used, -pull, pull), rule.noise_m)
+        before, used = used, on_curve(excess) & (points[:, 1] < circle[1])
         if np.array_equal(before, used):
             break
     _require_points(used, len(points))
@@ -179,36 +178,25 @@ def _improved(circle: Array, points: Array, ab: Array) -> tuple[Array, Array]:
     return circle + increment, np.asarray(np.linalg.pinv(information, hermitian=True))
 
 
-def _fitting(residual: Array, variance: Array, pull: Array) -> Mask:
-    """Points (n,) whose residual fits its predicted variance.
+def _excess(residual: Array, variance: Array, pull: Array, noise: float) -> Array:
+    """Squared residual (n,) of points over the largest one that their variance explains.
 
     ``pull`` is the variance of the circle at a point: less than zero where the point, in use,
-    pulled the circle to itself.
+    pulled the circle to itself. No more than the largest noise allowed is granted.
     """
-    expected = variance + np.maximum(pull, -0.5 * variance)
+    expected = np.minimum(variance + np.maximum(pull, -0.5 * variance), (_GRANTED * noise) ** 2)
     limit = chi2_quantile(1.0 - FALSE_REJECTION / len(residual), 1.0)
-    return np.asarray(residual**2 < limit * expected)
-
-
-def _agreeing(near: Mask) -> Mask:
-    """Those of the points near a circle that are not there by chance: a crossing line's are.
-
-    Most neighbours of a point are near the circle too, and it belongs to a large piece.
-    """
-    window = np.ones(_NEIGHBOURS)
-    votes = np.convolve(near.astype(np.float64), window, mode="same")
-    votes /= np.convolve(np.ones(len(near)), window, mode="same")
-    agreeing = np.flatnonzero(near & (votes > _AGREEING))
-    piece = np.cumsum(np.diff(agreeing, prepend=agreeing[:1]) > _NEIGHBOURS)
-    size = np.bincount(piece, minlength=1)
-    kept = np.zeros(len(near), dtype=np.bool_)
-    kept[agreeing[size[piece] >= _PIECE * size.max()]] = True
-    return kept
+    return np.asarray(residual**2 / (limit * expected))
 
 
 def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:
     r, R = fit.radius_m, rule.radius_m
     sigma = float(np.sqrt(fit.covariance[2, 2]))
+    if fit.noise_m > rule.noise_m:
+        raise ResidualError(
+            f"the points scatter by {fit.noise_m * 1e3:.3f} mm about the arc (allowed "
+            f"{rule.noise_m * 1e3:.3f} mm): clean the sphere and check the exposure"
+        )
     if sigma > rule.radius_sigma_m or r < _SURE * sigma:
         raise ResidualError(
             f"the arc is too short: its radius of {r * 1e3:.3f} mm is known to {sigma * 1e3:.3f} "
@@ -216,11 +204,6 @@ def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:
         )
     if r - R > max(rule.radius_tolerance_m, _SURE * sigma):
         raise ResidualError(_larger(r, R))
-    if fit.noise_m > rule.noise_m:
-        raise ResidualError(
-            f"the points scatter by {fit.noise_m * 1e3:.3f} mm about the arc (allowed "
-            f"{rule.noise_m * 1e3:.3f} mm): clean the sphere and check the exposure"
-        )
     form = _form(fit, points[fit.used])
     if form > max(_FORM_M, np.sqrt(0.5) * fit.noise_m):
         raise ResidualError(
@@ -246,17 +229,17 @@ def _form(fit: ArcFit, points: Array) -> float:
     return float(np.sqrt(np.mean(smooth**2)))
 
 
-def _blame_radius(points: Array, radius: float) -> None:
+def _blame_radius(points: Array, rule: ArcRule) -> None:
     """Raise when a sphere of a radius a thousand times smaller or larger is there instead."""
-    for factor in (1e-3, 1e3):
-        other = radius * factor
+    for factor, word in ((1e-3, "large"), (1e3, "small")):
+        other = replace(rule, radius_m=rule.radius_m * factor)
         try:
             fit = _fitted(points, other)
-            _require(fit, points, ArcRule(other))
+            _require(fit, points, other)
         except RobocalError:
             continue
         raise ResidualError(
             f"the profile shows an arc of radius {fit.radius_m * 1e3:.3f} mm, the sphere's radius "
-            f"is given as {radius * 1e3:.6g} mm: it is about {1.0 / factor:g} times too "
-            f"{'large' if factor < 1.0 else 'small'}; give it in metres"
+            f"is given as {rule.radius_m * 1e3:.6g} mm: it is about 1000 times too {word}; give it "
+            "in metres"
         )

@@ -19,6 +19,7 @@ _PLACES, _JUDGES = 128, 320
 _SMOOTHED = 5  # columns
 _BEST = 4
 _REACHES = (2.0, 1.4, 1.0)  # limits, one after the other
+_RIDGE = 1e-12  # keeps a flat piece solvable; where steps end it does not matter
 _FEWEST = 8  # points that improve a start
 
 
@@ -50,7 +51,7 @@ def step(J: Array, residual: Array, weight: Array | float = 1.0) -> tuple[Array,
     """Least-squares increment (3,) of a circle and the normal matrix (3, 3) it comes from."""
     weighted = J.T * weight
     normal = weighted @ J
-    ridge = np.finfo(float).eps * np.trace(normal) * np.eye(3)
+    ridge = _RIDGE * np.trace(normal) * np.eye(3)
     return -np.linalg.solve(normal + ridge, weighted @ residual), normal
 
 

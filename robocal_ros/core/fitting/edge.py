@@ -27,6 +27,7 @@ FEWEST_POINTS = 20
 _WINDOW = 21  # columns of the smoothing
 _DEGREE = 3
 _SMOOTHED = 5  # columns
+_WIDEST = 5.0  # columns without a return beyond the end of a surface
 _RIVAL = 0.8  # share of the sharpest turn at which another one could be meant as well
 
 
@@ -94,8 +95,7 @@ def _best(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
         corners = [c for c in corners if abs(c.turn_rad) >= _RIVAL * sharpest]
         candidates = [EdgeFit(corner.point, corner.covariance) for corner in corners]
     elif rule.kind == "edge":
-        spacing = float(np.median(np.diff(profile[:, 0])))
-        candidates = _ends(found, spacing)
+        candidates = _ends(found, profile)
     else:
         candidates = []
     if len(candidates) != 1:
@@ -108,31 +108,42 @@ def _best(profile: Array, noise: float, rule: EdgeRule) -> EdgeFit:
     return candidates[0]
 
 
-def _ends(found: Surfaces, spacing: float) -> list[EdgeFit]:
-    """Where a surface ends before a farther one: within the column after its last point."""
+def _ends(found: Surfaces, profile: Array) -> list[EdgeFit]:
+    """Where a surface ends before a farther one: between its last point and the next one seen.
+
+    Where the sensor saw nothing for several columns nobody knows where the surface ends.
+    """
+    x = profile[:, 0]
+    widest = _WIDEST * float(np.median(np.diff(x)))
     ends = []
     for a, b, corner in zip(found.flanks[:-1], found.flanks[1:], found.corners, strict=True):
         if corner is not None:
             continue
-        last, first = a.at(a.end_m), b.at(b.start_m)
-        flank, end, way = (a, a.end_m, 1.0) if last[1] < first[1] else (b, b.start_m, -1.0)
-        column = spacing / float(flank.direction[0])
+        if a.at(a.end_m)[1] < b.at(b.start_m)[1]:
+            flank, row, beyond = a, int(a.rows[-1]), int(a.rows[-1]) + 1
+        else:
+            flank, row, beyond = b, int(b.rows[0]), int(b.rows[0]) - 1
+        gap = float(x[beyond] - x[row])
+        if abs(gap) > widest:
+            continue
+        column = gap / float(flank.direction[0])
+        end = flank.along(profile[row]) + 0.5 * column
         axes = np.array([flank.direction, flank.normal])
         variances = np.array([column**2 / 12.0, flank.variance(end)])
-        ends.append(EdgeFit(flank.at(end + way * 0.5 * column), (axes.T * variances) @ axes))
+        ends.append(EdgeFit(flank.at(end), (axes.T * variances) @ axes))
     return ends
 
 
 def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
     """Extremum of the second derivative of the smoothed profile, refined by a parabola."""
     x, first = np.unique(profile[:, 0], return_index=True)
-    spacing = float(np.median(np.diff(x)))
-    grid = np.arange(x[0], x[-1], spacing)
-    height = median_filter(np.interp(grid, x, profile[first, 1]), _SMOOTHED, mode="nearest")
-    if len(grid) < 2 * _WINDOW:
+    if len(x) < 2 * _WINDOW:
         raise TooFewSamplesError(
-            f"{len(grid)} columns give no {kind}: at least {2 * _WINDOW} are needed"
+            f"{len(x)} columns give no {kind}: at least {2 * _WINDOW} are needed; check the "
+            "exposure and that the target is in range"
         )
+    grid, spacing = np.linspace(x[0], x[-1], len(x), retstep=True)
+    height = median_filter(np.interp(grid, x, profile[first, 1]), _SMOOTHED, mode="nearest")
     curvature = savgol_filter(height, _WINDOW, _DEGREE, deriv=2, delta=spacing)
     curvature *= 1.0 if kind == "edge" else -1.0
     inner = slice(_WINDOW // 2 + 1, -_WINDOW // 2 - 1)
@@ -149,8 +160,10 @@ def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
     difference = np.pad(kernel, (2, 0)) - np.pad(kernel, (0, 2))
     sigma = spacing * noise * float(np.linalg.norm(difference)) / (2.0 * abs(bend))
     at = float(grid[top] + shift * spacing)
-    smooth = savgol_filter(height, _WINDOW, _DEGREE)
+    near = height[top - _SMOOTHED : top + _SMOOTHED + 1]
+    x_variance = sigma**2 + spacing**2 / 12.0
+    steepness = float(np.mean((np.diff(near) / spacing) ** 2))
     return EdgeFit(
-        point=np.array([at, float(np.interp(at, grid, smooth))]),
-        covariance=np.diag([sigma**2, noise**2 / _WINDOW]),
+        point=np.array([at, float(np.interp(at, grid, height))]),
+        covariance=np.diag([x_variance, noise**2 + steepness * x_variance]),
     )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.core.fitting.neighbours import on_curve
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M
 
 Array = NDArray[np.float64]
@@ -56,25 +57,27 @@ class Flank:
         return self.noise_m**2 * (1.0 / len(self.rows) + along_m**2 / self.spread_m2)
 
 
-def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
+def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None) -> Flank | None:
     """Line through the points of a profile (m, 2) with these row numbers (n,), ascending in x.
 
-    The start is the median of the directions between points half of the piece apart; total least
-    squares over the points whose residual fits its predicted variance is the answer. None where
-    fewer than six points, or fewer than half of them, lie on a line.
+    Where no start is given it is the median of the directions between points half of the piece
+    apart; total least squares over the points whose residual fits its predicted variance is the
+    answer. None where fewer than six points, or fewer than half of them, lie on a line.
     """
     cloud = points[rows]
     count = len(rows)
     if count < FEWEST_POINTS:
         return None
-    half = count // 2
-    step = cloud[half:] - cloud[: count - half]
-    angle = float(np.median(np.arctan2(step[:, 1], step[:, 0])))
-    direction = np.array([np.cos(angle), np.sin(angle)])
-    residual = cloud @ np.array([-direction[1], direction[0]])
-    residual = residual - np.median(residual)
     factor = chi2_quantile(1.0 - FALSE_REJECTION / count, 1.0) ** 0.5
-    near = np.abs(residual) <= factor * _scatter(residual)
+    if start is None:
+        direction, residual = _first_line(cloud)
+        scatter = np.full(count, MAD * float(np.median(np.abs(residual))) + SMALLEST_M)
+    else:
+        direction = start.direction
+        residual = (cloud - start.middle) @ start.normal
+        along = (cloud - start.middle) @ direction
+        scatter = start.noise_m * np.sqrt(1.0 + along**2 / start.spread_m2)
+    near = np.abs(residual) <= factor * scatter
     for _ in range(_ROUNDS):
         if np.sum(near) < max(FEWEST_POINTS, _WORST * count):
             return None
@@ -88,7 +91,7 @@ def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
         noise = float(np.sqrt(np.sum(residual[near] ** 2) / (np.sum(near) - 2))) + SMALLEST_M
         # A point in use pulled the line to itself, any other did not.
         expected = 1.0 + np.where(near, -1.0, 1.0) * np.minimum(leverage, 0.5)
-        before, near = near, residual**2 < (factor * noise) ** 2 * expected
+        before, near = near, on_curve((residual / (factor * noise)) ** 2 / expected)
         if np.array_equal(before, near):
             break
     return Flank(
@@ -102,14 +105,21 @@ def fit_flank(points: Array, rows: NDArray[np.int64]) -> Flank | None:
     )
 
 
-def _scatter(residual: Array) -> float:
-    return MAD * float(np.median(np.abs(residual))) + SMALLEST_M
+def _first_line(cloud: Array) -> tuple[Array, Array]:
+    """Direction (2,) of points (n, 2) ascending in x, and their distances (n,) from the line."""
+    half = len(cloud) // 2
+    step = cloud[half:] - cloud[: len(cloud) - half]
+    angle = float(np.median(np.arctan2(step[:, 1], step[:, 0])))
+    residual = cloud @ np.array([-np.sin(angle), np.cos(angle)])
+    return np.array([np.cos(angle), np.sin(angle)]), residual - np.median(residual)
 
 
 def _main_direction(away: Array, towards: Array) -> Array:
     """Direction (2,) of largest extent of points (n, 2) about their mean."""
-    main = np.linalg.eigh(away.T @ away)[1][:, 1]
-    return np.asarray(main if main @ towards > 0.0 else -main)
+    (xx, xz), (_, zz) = (away.T @ away).tolist()
+    angle = 0.5 * np.arctan2(2.0 * xz, xx - zz)
+    main = np.array([np.cos(angle), np.sin(angle)])
+    return main if main @ towards > 0.0 else -main
 
 
 def angle_between(a: Flank, b: Flank) -> float:
@@ -120,8 +130,12 @@ def angle_between(a: Flank, b: Flank) -> float:
 
 def intersection(a: Flank, b: Flank) -> tuple[Array, Array]:
     """Point (2,) where two lines meet and its covariance (2, 2), m^2; they are not parallel."""
-    normals = np.array([a.normal, b.normal])
-    point = np.linalg.solve(normals, np.array([a.normal @ a.middle, b.normal @ b.middle]))
-    inverse = np.linalg.inv(normals)
-    variances = np.array([a.variance(a.along(point)), b.variance(b.along(point))])
-    return point, np.asarray((inverse * variances) @ inverse.T)
+    # Along a line of direction u to where it meets another: cross(b - a, v) / cross(u, v).
+    sine = np.sin(angle_between(a, b))
+    between = b.middle - a.middle
+    along_a = (between[0] * b.direction[1] - between[1] * b.direction[0]) / sine
+    along_b = (between[0] * a.direction[1] - between[1] * a.direction[0]) / sine
+    # An error of one line along its normal moves the point along the other.
+    moved = np.array([b.direction, a.direction]) / sine
+    variances = np.array([a.variance(along_a), b.variance(along_b)])
+    return a.at(along_a), np.asarray((moved.T * variances) @ moved)

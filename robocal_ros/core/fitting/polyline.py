@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import ResidualError, TooFewSamplesError
 from robocal_ros.core.fitting.profile_noise import local_noise
-from robocal_ros.core.fitting.surfaces import SurfaceRule, split, surfaces
+from robocal_ros.core.fitting.surfaces import SurfaceRule, off_chord, split, surfaces
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -117,12 +117,13 @@ def _best(profile: Array, noise: float, rule: CornerRule) -> CornerFit:
 
 def _classic(profile: Array, noise: float, rule: CornerRule) -> CornerFit:
     """The farthest points; their covariance is that of a column more or less."""
-    vertices = profile[split(profile, noise)]
+    spacing = float(np.median(np.diff(profile[:, 0])))
+    vertices = profile[split(profile, off_chord(noise, spacing))]
     steps = np.diff(vertices, axis=0)
     points = vertices[1:-1]
     turn = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
     column = steps / np.maximum(steps[:, :1], np.finfo(float).tiny)
-    column *= float(np.median(np.diff(profile[:, 0])))
+    column *= spacing
     spread = np.einsum("ki,kj->kij", column, column)
     covariance = 0.5 * (spread[:-1] + spread[1:]) + noise**2 * np.eye(2)
     repaired = np.zeros(len(points), dtype=np.bool_)

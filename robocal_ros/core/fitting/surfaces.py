@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _SPLIT = 8.0  # standard deviations of a point
-_SPLIT_M = 2e-5
+_SPLIT_COLUMNS = 3.0  # a corner lies between two columns
 _SMOOTHED = 5  # columns
 _OVERLAP = 5.0  # columns by which pieces may pass their corner
 _GAP = 5.0  # columns
@@ -25,6 +25,8 @@ _ON_LINE = 0.8  # share of the points of two pieces that are one
 _SAME_DIRECTION_RAD = 0.2  # between pieces that may be one
 _NOISIER = 1.5  # the points of two pieces that are one scatter no more than each
 _GHOSTS = 2  # pieces back that a surface may go on
+_HOLE = 0.5  # largest part of a surface that may be missing
+_MEETING, _BREAK = 0.25, -0.9  # worth of a corner, of none, in points of the smaller neighbour
 _REFINEMENTS = 2
 
 
@@ -76,21 +78,28 @@ class Surfaces:
 def surfaces(profile: Array, noise: float, rule: SurfaceRule) -> Surfaces:
     """Straight surfaces in points (n, 2) of a profile, ascending in x; noise is that of z, m."""
     spacing = float(np.median(np.diff(profile[:, 0])))
-    slack = _OVERLAP * spacing + _SPLIT * noise
+    slack = _OVERLAP * spacing + rule.margin_m
+    threshold = off_chord(noise, spacing)
     flanks = [
         flank
-        for flank in _merged(profile, _pieces(profile, _GAP * spacing, noise))
+        for flank in _merged(profile, _pieces(profile, _GAP * spacing, threshold))
         if flank.end_m - flank.start_m > rule.shortest_m
     ]
-    flanks = _without_ghosts(flanks, slack, rule)
+    if not flanks:
+        return Surfaces([], [])
+    flanks = _chain(flanks, slack, rule)
     for _ in range(_REFINEMENTS):
         flanks = _refined(profile, flanks, slack, rule)
     return Surfaces(flanks, _corners(flanks, slack, rule))
 
 
-def split(profile: Array, noise: float) -> Rows:
+def off_chord(noise: float, spacing: float) -> float:
+    """How far from a chord a point of a straight surface may be, m."""
+    return max(_SPLIT * noise, _SPLIT_COLUMNS * spacing)
+
+
+def split(profile: Array, threshold: float) -> Rows:
     """Rows (v,) at which a profile (n, 2), ascending in x, is split; its ends are among them."""
-    threshold = max(_SPLIT * noise, _SPLIT_M)
     smooth = np.column_stack(
         [profile[:, 0], median_filter(profile[:, 1], _SMOOTHED, mode="nearest")]
     )
@@ -109,15 +118,16 @@ def split(profile: Array, noise: float) -> Rows:
     return np.sort(np.array(vertices, dtype=np.int64))
 
 
-def _pieces(profile: Array, gap: float, noise: float) -> list[Flank]:
+def _pieces(profile: Array, gap: float, threshold: float) -> list[Flank]:
     """Straight pieces of a profile, none across a gap in x."""
     pieces = []
     ends = np.flatnonzero(np.diff(profile[:, 0]) > gap) + 1
     for first, last in zip([0, *ends], [*ends, len(profile)], strict=True):
-        vertices = first + split(profile[first:last], noise)
+        vertices = first + split(profile[first:last], threshold)
         for start, end in itertools.pairwise(vertices):
             piece = fit_flank(profile, np.arange(start, end + 1))
-            pieces += [piece] if piece is not None else []
+            if piece is not None and _whole(profile, piece):
+                pieces.append(piece)
     return pieces
 
 
@@ -147,20 +157,33 @@ def _united(profile: Array, a: Flank, b: Flank) -> Flank | None:
     return both if on_it else None
 
 
-def _without_ghosts(flanks: list[Flank], slack: float, rule: SurfaceRule) -> list[Flank]:
-    """Flanks less those that meet no neighbour but stand between two that meet each other."""
-    kept = list(flanks)
-    middle = 1
-    while middle < len(kept) - 1:
-        before, ghost, after = kept[middle - 1 : middle + 2]
-        alone = _corner(before, ghost, slack, rule) is None
-        alone &= _corner(ghost, after, slack, rule) is None
-        if alone and _corner(before, after, slack, rule) is not None:
-            del kept[middle]
-            middle = max(middle - 1, 1)
-        else:
-            middle += 1
-    return kept
+def _whole(profile: Array, flank: Flank) -> bool:
+    """Whether points cover a flank: those on both sides of a jump in z do not."""
+    along = np.sort(profile[flank.rows] @ flank.direction)
+    return float(np.max(np.diff(along))) < _HOLE * (flank.end_m - flank.start_m)
+
+
+def _chain(flanks: list[Flank], slack: float, rule: SurfaceRule) -> list[Flank]:
+    """The sequence of flanks that holds most points and meets at most corners.
+
+    A double reflection meets no neighbour, or one by chance, but stands between two that meet.
+    """
+    value = [float(len(flank.rows)) for flank in flanks]
+    before = [-1] * len(flanks)
+    for j, flank in enumerate(flanks):
+        alone = value[j]
+        for i in range(max(j - 1 - _GHOSTS, 0), j):
+            smaller = min(len(flanks[i].rows), len(flank.rows))
+            meets = _corner(flanks[i], flank, slack, rule) is not None
+            worth = value[i] + alone + (_MEETING if meets else _BREAK) * smaller
+            if worth > value[j]:
+                value[j], before[j] = worth, i
+    chain = []
+    at = int(np.argmax(value))
+    while at >= 0:
+        chain.append(flanks[at])
+        at = before[at]
+    return chain[::-1]
 
 
 def _refined(profile: Array, flanks: list[Flank], slack: float, rule: SurfaceRule) -> list[Flank]:
@@ -175,7 +198,7 @@ def _refined(profile: Array, flanks: list[Flank], slack: float, rule: SurfaceRul
             first = left.point[0] + margin
         if right is not None:
             last = right.point[0] - margin
-        again = fit_flank(profile, np.flatnonzero((x >= first) & (x <= last)))
+        again = fit_flank(profile, np.flatnonzero((x >= first) & (x <= last)), flank)
         refined.append(flank if again is None else again)
     return refined
 
@@ -185,13 +208,16 @@ def _corners(flanks: list[Flank], slack: float, rule: SurfaceRule) -> list[Corne
 
 
 def _corner(a: Flank, b: Flank, slack: float, rule: SurfaceRule) -> Corner | None:
-    """Corner of two neighbours: where both end, or not much farther away."""
+    """Corner of two neighbours: in x between the end of one and the start of the other."""
     turn = angle_between(a, b)
     if abs(turn) < rule.least_turn_rad:
         return None
     point, covariance = intersection(a, b)
+    end, start = a.at(a.end_m), b.at(b.start_m)
+    if not end[0] - slack < point[0] < start[0] + slack:
+        return None
     for ahead, flank in ((a.along(point) - a.end_m, a), (b.start_m - b.along(point), b)):
-        if not -slack < ahead < max(rule.reach * (flank.end_m - flank.start_m), slack):
+        if ahead > max(rule.reach * (flank.end_m - flank.start_m), slack):
             return None
     if float(np.linalg.eigvalsh(covariance)[-1]) > rule.sigma_m**2:
         return None

@@ -127,5 +127,5 @@ def least_distances(view: View, near: MountState) -> MountState:
     """Classic: the sum of squared distances from the line, every feature alike."""
     plain = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
     alike = View(view.model, replace(view.sightings, covariance=plain))
-    problem = MountProblem((alike,), PoseNoise(0.0, 0.0))
+    problem = MountProblem((alike,), PoseNoise(0.0, 0.0), near)
     return solve(problem, near, robust=False, sizes=problem.sizes).state

@@ -1,10 +1,6 @@
-"""Maximum likelihood of a mount: robust, with the robot's own error estimated where none is given.
+"""Maximum likelihood of a mount: robust, with the robot's own error found where none is given."""
 
-The error of poses is one unknown scale, found by restricted maximum likelihood (Patterson and
-Thompson 1971): the likelihood of what is left after the unknowns are fitted.
-"""
-
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,15 +8,22 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import RankDeficientError, RobocalError
 from robocal_ros.core.estimation import Estimate, solve
-from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.mount_problem import (
+    MountProblem,
+    MountState,
+    PoseNoise,
+    View,
+    pivot_of,
+)
 from robocal_ros.core.hand_eye.naming import describe_motion
+from robocal_ros.core.hand_eye.restricted_noise import FIRST_NOISE, restricted_noise
+from robocal_ros.core.hand_eye.result import at_origin, increment, moved_origin
+from robocal_ros.core.observability import observability
 
 Array = NDArray[np.float64]
 
-FIRST_NOISE = PoseNoise(5e-5, 5e-5)
-NOISE_RANGE_M = (1e-6, 1e-2)
 ROUNDS = 8
-SETTLED = 0.02  # relative change of the noise
+SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 
 
@@ -49,11 +52,15 @@ class MountFit:
         """Of the sightings that were used."""
         return tuple(name for view in self.views for name in view.sightings.names)
 
-    def distances(self, state: MountState | None = None) -> Array:
+    def distances(self) -> Array:
         """Distance of each sighting that was used from its target, m."""
-        state = state or self.state
-        pairs = zip(self.views, state.places, strict=True)
-        return np.concatenate([_distance(view, state, place) for view, place in pairs])
+        return distances(self.views, self.state)
+
+
+def distances(views: tuple[View, ...], state: MountState) -> Array:
+    """Distance of each sighting from its target, m."""
+    pairs = zip(views, state.places, strict=True)
+    return np.concatenate([_distance(view, state, place) for view, place in pairs])
 
 
 def _distance(view: View, state: MountState, place: Array) -> Array:
@@ -78,15 +85,15 @@ def fit_mount(
         When poses leave a direction open; its words say which motion is missing.
     """
     rejected: dict[str, str] = {}
-    state, found = start, noise or FIRST_NOISE
-    alone = MountProblem(views, found, together=False)
-    if len(alone.poses) > len(MountProblem(views, found).poses):
-        estimate, found = _settle(alone, state, noise)
+    state = start
+    found = FIRST_NOISE if noise is None else replace(noise, aim_m=FIRST_NOISE.aim_m)
+    poses = np.concatenate([view.sightings.pose for view in views])
+    if len(np.unique(poses)) < len(poses):  # one sighting of a profile may be wrong, not all of it
+        estimate, wrong, found = _settle(views, state, found, noise, together=False)
         state = estimate.state
-        views = _without(views, estimate.rejected[alone.sample], rejected)
-    problem = MountProblem(views, found)
-    estimate, found = _settle(problem, state, noise)
-    views = _without(views, estimate.rejected[problem.sample], rejected)
+        views = _without(views, wrong, rejected)
+    estimate, wrong, found = _settle(views, state, found, noise, together=True)
+    views = _without(views, wrong, rejected)
     return MountFit(
         views,
         estimate.state,
@@ -98,21 +105,39 @@ def fit_mount(
     )
 
 
+def first_look(views: tuple[View, ...], start: MountState, noise: PoseNoise | None) -> MountState:
+    """Where a start leads, robustly and before the noise is known. Raises as `fit_mount`."""
+    state = start
+    for _ in range(2):  # the first weights are taken at the start, which may be far off
+        problem = MountProblem(views, noise or FIRST_NOISE, state, together=False)
+        state = _solved(problem, state).state
+    return state
+
+
 def _settle(
-    problem: MountProblem, state: MountState, given: PoseNoise | None
-) -> tuple[Estimate[MountState], PoseNoise]:
-    """Solve, and estimate the noise of poses from what is left, until both stay."""
-    noise = problem.noise
+    views: tuple[View, ...],
+    state: MountState,
+    noise: PoseNoise,
+    given: PoseNoise | None,
+    together: bool,
+) -> tuple[Estimate[MountState], NDArray[np.bool_], PoseNoise]:
+    """Solve, take weights and noise anew, until both stay: which sightings (m,) are wrong, too."""
     for _ in range(ROUNDS):
-        problem.noise = noise
+        problem = MountProblem(views, noise, state, together)
         estimate = _solved(problem, state)
-        state = estimate.state
-        if given is not None:
+        away = _away(problem.pivot, state, estimate)
+        state, before = estimate.state, noise
+        noise = restricted_noise(problem, state, ~estimate.rejected, given)
+        change = np.log([noise.sigma_m / before.sigma_m, noise.aim_m / before.aim_m])
+        if away < SETTLED and np.max(np.abs(change)) < SETTLED:
             break
-        before, noise = noise, _restricted_noise(problem, estimate)
-        if abs(noise.sigma_m / before.sigma_m - 1.0) < SETTLED:
-            break
-    return estimate, noise
+    return estimate, estimate.rejected[problem.sample], noise
+
+
+def _away(pivot: Array, before: MountState, estimate: Estimate[MountState]) -> float:
+    """How far the sensor has moved, in standard deviations."""
+    step = increment(before.T_flange_sensor, estimate.state.T_flange_sensor, pivot)
+    return float(np.sqrt(step @ np.linalg.solve(estimate.covariance[:6, :6], step)))
 
 
 def _solved(problem: MountProblem, state: MountState) -> Estimate[MountState]:
@@ -125,12 +150,14 @@ def _solved(problem: MountProblem, state: MountState) -> Estimate[MountState]:
 
 def _in_words(problem: MountProblem, state: MountState) -> RankDeficientError | None:
     """The refusal with the sensor's own open directions; None where it is another unknown's."""
-    from robocal_ros.core.observability import observability
-
     _, jacobian = problem.linearise(state)
     null = observability(jacobian.reshape(-1, jacobian.shape[2])).null[:6]
     T = np.concatenate([view.sightings.T_base_flange for view in problem.views])
-    words = [describe_motion(d, T) for d in null.T if np.linalg.norm(d) > 1e-9]
+    words = [
+        describe_motion(moved_origin(d, problem.pivot), T)
+        for d in null.T
+        if np.linalg.norm(d) > 1e-9
+    ]
     return refuse_open(words) if words else None
 
 
@@ -149,13 +176,22 @@ def require_seen(fit: MountFit, reach_m: float) -> None:
     RankDeficientError
         Naming it, with the missing motion.
     """
-    size = np.repeat([1.0, reach_m], 3)
-    values, vectors = np.linalg.eigh(fit.covariance[:6, :6] * np.outer(size, size))
     T = np.concatenate([view.sightings.T_base_flange for view in fit.views])
-    open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > OPEN_M]
-    words = [describe_motion(direction / size, T) for direction in open_ones.T]
+    covariance = at_origin(fit.covariance[:6, :6], pivot_of(fit.views))
+    words = open_directions(covariance, reach_m, T)
     if words:
         raise refuse_open(words)
+
+
+def open_directions(covariance: Array, reach_m: float, T_base_flange: Array) -> list[str]:
+    """Directions in words that a covariance (6, 6) at the sensor's origin leaves as good as open.
+
+    ``reach_m``: distance at which turns count.
+    """
+    size = np.repeat([1.0, reach_m], 3)
+    values, vectors = np.linalg.eigh(covariance * np.outer(size, size))
+    open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > OPEN_M]
+    return [describe_motion(direction / size, T_base_flange) for direction in open_ones.T]
 
 
 def _without(
@@ -174,49 +210,34 @@ def _without(
     return tuple(kept)
 
 
-def _restricted_noise(problem: MountProblem, estimate: Estimate[MountState]) -> PoseNoise:
-    """Scale of the poses' error at which what is left is most likely."""
-    from scipy.optimize import minimize_scalar
+def solved_again(fit: MountFit) -> Callable[[tuple[View, ...]], MountState]:
+    """How the mount is found from part of the views of a fit: nothing is rejected any more."""
 
-    keep = ~estimate.rejected
-    r, J, G, C = (part[keep] for part in problem.grouped(problem.linear(estimate.state)))
-    ratio = FIRST_NOISE.sigma_rad / FIRST_NOISE.sigma_m
-    prior = problem.prior()
-    known = np.zeros((J.shape[2], J.shape[2])) if prior is None else prior
-    unit = G @ PoseNoise(1.0, ratio).covariance() @ np.swapaxes(G, 1, 2)
-    both = np.concatenate([r[..., None], J], axis=2)
+    def again(views: tuple[View, ...]) -> MountState:
+        part = MountProblem(views, fit.noise, fit.state)
+        return solve(
+            part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
+        ).state
 
-    def cost(log_sigma: float) -> float:
-        L = np.linalg.cholesky(C + np.exp(2.0 * log_sigma) * unit)
-        white = np.linalg.solve(L, both)
-        r_white, J_white = white[..., 0], white[..., 1:].reshape(-1, J.shape[2])
-        normal = J_white.T @ J_white + known
-        gradient = J_white.T @ r_white.ravel()
-        misfit = np.sum(r_white**2) - gradient @ np.linalg.solve(normal, gradient)
-        spread = 2.0 * np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)))
-        return float(misfit + spread + np.linalg.slogdet(normal)[1])
-
-    bounds = tuple(np.log(NOISE_RANGE_M))
-    best = minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": SETTLED / 2})
-    sigma_m = float(np.exp(best.x))
-    return PoseNoise(sigma_m, ratio * sigma_m)
+    return again
 
 
-def leave_one_out(fit: MountFit) -> Array | None:
-    """Distance of each sighting from the solution without its pose, m; None where none is left."""
-    problem = MountProblem(fit.views, fit.noise)
-    own = fit.distances()
-    for group in range(len(problem.poses)):
-        out = problem.sample == group
-        rest = _without(fit.views, out, {})
+def leave_one_out(
+    views: tuple[View, ...], solved: Callable[[tuple[View, ...]], MountState]
+) -> Array | None:
+    """Distance of each sighting from what is ``solved`` without its pose, m.
+
+    None where the rest does not suffice.
+    """
+    sample = np.concatenate([view.sightings.pose for view in views])
+    own = np.zeros(len(sample))
+    for pose in np.unique(sample):
+        out = sample == pose
+        rest = _without(views, out, {})
         if any(len(view.sightings.names) == 0 for view in rest):
             return None  # a target that only this pose saw
         try:
-            part = MountProblem(rest, fit.noise)
-            found = solve(
-                part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
-            )
+            own[out] = distances(views, solved(rest))[out]
         except RobocalError:
             return None
-        own[out] = replace(fit, state=found.state).distances()[out]
     return own

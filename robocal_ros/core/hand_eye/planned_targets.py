@@ -1,4 +1,4 @@
-"""How a sphere and a straight edge would be seen from planned poses, and from where they could be."""
+"""How a sphere and a straight edge would be seen from planned poses, and from which others."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -108,7 +108,7 @@ class PlannedSphere:
 
 @dataclass(frozen=True, eq=False)
 class PlannedLine:
-    """A straight edge; ``line`` (2, 3), a point and the unit direction, or None: across the poses."""
+    """A straight edge; ``line`` (2, 3), a point and the direction, or None: across the poses."""
 
     sensor: SensorRange
     line: Array | None = None

@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.mount_fit import open_directions
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
 from robocal_ros.core.hand_eye.naming import describe_motion
 from robocal_ros.core.hand_eye.quality import expected_error_m
+from robocal_ros.core.hand_eye.result import at_origin, moved_origin
 from robocal_ros.core.observability import observability
 
 Array = NDArray[np.float64]
 
-OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 VAGUE_M, VAGUE_RAD = 1.0, 1.0  # what is known of a mount without any measurement
 MOST_PROPOSED = 12
 
@@ -42,10 +43,16 @@ class SensorRange:
         return 0.5 * (self.near_m + self.far_m)
 
     @property
-    def working_points(self) -> Array:
-        """Middle and ends (3, 3) of the line at the working distance, sensor frame, m."""
-        x = 0.5 * self.width_m * np.array([-1.0, 0.0, 1.0])
-        return np.column_stack([x, np.zeros(3), np.full(3, self.middle_m)])
+    def pivot(self) -> Array:
+        """The middle (3,) of its field, sensor frame, m."""
+        return np.array([0.0, 0.0, self.middle_m])
+
+    @property
+    def field_points(self) -> Array:
+        """Middle and corners (5, 3) of its field, sensor frame, m."""
+        half = 0.5 * self.width_m
+        corners = [[x, 0.0, z] for x in (-half, half) for z in (self.near_m, self.far_m)]
+        return np.array([self.pivot, *corners])
 
 
 class PlannedTarget(Protocol):
@@ -113,19 +120,20 @@ def check_plan(
     covariance: Array | None = None
     information = np.zeros((k, k))
     if len(seen):
-        J = _rows(whole.take(np.isin(whole.sightings.pose, seen)), state, noise)
+        part = whole.take(np.isin(whole.sightings.pose, seen))
+        J = _samples(part, state, noise, sensor)[1].reshape(-1, k)
         information = J.T @ J + _prior(whole)
         found = observability(np.vstack([J, np.sqrt(_prior(whole))]))
         rank = found.rank
         poses = T_base_flange[seen]
-        words = [
-            describe_motion(d[:6], poses) for d in found.null.T if np.any(np.abs(d[:6]) > 1e-9)
-        ]
+        open_ones = [moved_origin(d[:6], sensor.pivot) for d in found.null.T]
+        words = [describe_motion(d, poses) for d in open_ones if np.linalg.norm(d) > 1e-9]
         if rank == k:
             covariance = np.asarray(np.linalg.inv(information))
-            words = _vague(covariance, sensor, poses)
-    points = sensor.working_points
-    error = None if covariance is None else expected_error_m(covariance[:6, :6], points)
+            at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
+            words = open_directions(at_sensor, sensor.middle_m, poses)
+    field = sensor.field_points - sensor.pivot
+    error = None if covariance is None else expected_error_m(covariance[:6, :6], field)
     verdict = _verdict(len(seen), target.fewest, words, error, limit_m)
     proposed, better = np.empty((0, 4, 4)), None
     if not verdict.accept:
@@ -136,7 +144,7 @@ def check_plan(
         rank,
         k,
         tuple(words),
-        None if covariance is None else np.sqrt(np.diag(covariance)[:6]),
+        None if covariance is None else np.sqrt(np.diag(at_sensor)),
         error,
         unseen,
         proposed,
@@ -145,10 +153,12 @@ def check_plan(
     )
 
 
-def _rows(view: View, state: MountState, noise: PoseNoise) -> Array:
-    """Whitened Jacobian (N, k) of sightings."""
-    _, jacobian = MountProblem((view,), noise).linearise(state)
-    return jacobian.reshape(-1, jacobian.shape[2])
+def _samples(
+    view: View, state: MountState, noise: PoseNoise, sensor: SensorRange
+) -> tuple[NDArray[np.int64], Array]:
+    """Poses (g,) that have sightings, and the whitened Jacobian (g, c, k) of each."""
+    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
+    return problem.poses, problem.linearise(state)[1]
 
 
 def _prior(view: View) -> Array:
@@ -157,14 +167,6 @@ def _prior(view: View) -> Array:
     prior = np.zeros((6 + k, 6 + k))
     prior[6:, 6:] = view.model.prior
     return prior
-
-
-def _vague(covariance: Array, sensor: SensorRange, T_base_flange: Array) -> list[str]:
-    """Directions that are as good as open, in words."""
-    size = np.repeat([1.0, sensor.middle_m], 3)
-    values, vectors = np.linalg.eigh(covariance[:6, :6] * np.outer(size, size))
-    open_ones = vectors[:, np.sqrt(np.maximum(values, 0.0)) > OPEN_M]
-    return [describe_motion(direction / size, T_base_flange) for direction in open_ones.T]
 
 
 def _verdict(
@@ -176,7 +178,7 @@ def _verdict(
         )
     if words or error is None:
         return Verdict(Code.RANK_DEFICIENT, f"not determined: {'; '.join(words)}")
-    figures = f"a point at the working distance is to be expected off by {error * 1e3:.3f} mm rms"
+    figures = f"a point in the field of view is to be expected off by {error * 1e3:.3f} mm rms"
     if error > limit_m:
         return Verdict(
             Code.POSES_NOT_INFORMATIVE,
@@ -196,10 +198,9 @@ def _propose(
     X, place = state.T_flange_sensor, state.places[0]
     candidates = target.candidates(T_base_flange @ X, place)
     view = target.view(candidates @ frames.invert(X), X, place)
-    problem = MountProblem((view,), noise)
-    _, J = problem.linearise(state)
+    poses, J = _samples(view, state, noise, sensor)
     gain = np.zeros((len(candidates), *information.shape))
-    gain[problem.poses] = np.swapaxes(J, 1, 2) @ J
+    gain[poses] = np.swapaxes(J, 1, 2) @ J
     gain[list(target.unseen(view))] = 0.0
     vague = np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0
     total = information + np.diag(np.concatenate([vague, np.full(len(information) - 6, 1.0)]))
@@ -207,7 +208,7 @@ def _propose(
     error = np.inf
     while len(chosen) < MOST_PROPOSED and error > limit_m:
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
-        errors = _errors(covariance, sensor.working_points)
+        errors = _errors(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
         error = float(errors[best])
         total = total + gain[best]

@@ -1,5 +1,6 @@
 """Is a mount good, in mm? Its errors, its expected error at the working distance, the verdict."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from robocal_ros.core.hand_eye.mount_problem import MountProblem, PoseNoise
 Array = NDArray[np.float64]
 
 MOST_REJECTED = 1.0 / 3.0
+STRIDE = 8  # of the points that tell the field of view
+OUTSIDE = 0.02  # share of points beyond it on each side: spikes
 FEWEST_SPARE = 3  # measured numbers beyond the unknowns, without which nothing is judged
 
 
@@ -25,13 +28,13 @@ class HandEyeSettings:
     ----------
     robot_sigma_m, robot_sigma_rad : standard deviation of a reported pose about each axis; None
         to estimate both from the profiles.
-    limit_m : largest expected error (rms) of a point at the working distance.
+    limit_m : largest expected error (rms) of a point in the field that the profiles cover.
     residual_m : largest distance (rms) of samples from the target.
     """
 
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
-    limit_m: float = 5e-4
+    limit_m: float = 1e-3
     residual_m: float = 2e-3
 
     def noise(self) -> PoseNoise | None:
@@ -41,42 +44,55 @@ class HandEyeSettings:
         return PoseNoise(self.robot_sigma_m, self.robot_sigma_rad or 0.0)
 
 
-def working_points(fit: MountFit) -> Array:
-    """Points (3, 3) where the sensor measures: middle and ends of its line, sensor frame, m."""
-    value = np.concatenate([view.sightings.value for view in fit.views])
-    x = [value[:, 0].min(), value[:, 0].mean(), value[:, 0].max()]
-    return np.column_stack([x, np.zeros(3), np.full(3, value[:, 1].mean())])
+def field_points(profiles: Sequence[Array]) -> Array:
+    """Middle and corners (5, 3) of the field that profiles (n, 2) cover, sensor frame, m."""
+    points = np.concatenate([profile[::STRIDE] for profile in profiles])
+    low, high = np.quantile(points, [OUTSIDE, 1.0 - OUTSIDE], axis=0)
+    x, z = np.stack([low, high]).T
+    corners = [[a, 0.0, b] for a in x for b in z]
+    return np.array([[x.mean(), 0.0, z.mean()], *corners])
 
 
 def expected_error_m(covariance: Array, points: Array) -> float:
-    """Root mean square error of sensor points (n, 3) in the flange frame, from a (6, 6)."""
+    """Root mean square error of points (n, 3), counted from the pivot of a covariance (6, 6)."""
     J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
     spread = J @ covariance @ np.swapaxes(J, 1, 2)
     return float(np.sqrt(np.trace(spread, axis1=1, axis2=2).mean()))
 
 
-def judge(
-    fit: MountFit, shots: int, lost: int, error_m: float, settings: HandEyeSettings
-) -> Verdict:
-    """The verdict on a mount; ``lost`` of ``shots`` gave nothing or did not fit."""
-    spare = int(MountProblem(fit.views, fit.noise).sizes.sum()) - len(fit.covariance)
-    rms = float(np.sqrt(np.mean(fit.distances() ** 2)))
-    if spare < FEWEST_SPARE:
-        words = f"only {spare} measured numbers beyond the unknowns: show the target more often"
-        return Verdict(Code.TOO_FEW_SAMPLES, words)
+def judge_residuals(
+    distances_m: Array, shots: int, lost: int, settings: HandEyeSettings
+) -> Verdict | None:
+    """Refuse samples that are too far off, or too few of them; None where they will do."""
+    rms = float(np.sqrt(np.mean(distances_m**2)))
     if rms > settings.residual_m:
         words = f"samples are off by {rms * 1e3:.2f} mm (allowed {settings.residual_m * 1e3:g} mm)"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
     if lost > MOST_REJECTED * shots:
         words = f"{lost} of {shots} samples do not fit the others: see the rejected ones"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    return None
+
+
+def judge(
+    fit: MountFit, shots: int, lost: int, error_m: float, settings: HandEyeSettings
+) -> Verdict:
+    """The verdict on a mount; ``lost`` of ``shots`` gave nothing or did not fit."""
+    spare = int(MountProblem(fit.views, fit.noise, fit.state).sizes.sum()) - len(fit.covariance)
+    if spare < FEWEST_SPARE:
+        words = f"only {spare} measured numbers beyond the unknowns: show the target more often"
+        return Verdict(Code.TOO_FEW_SAMPLES, words)
+    refused = judge_residuals(fit.distances(), shots, lost, settings)
+    if refused is not None:
+        return refused
     if fit.creeping:
         return Verdict(Code.POSES_NOT_INFORMATIVE, fit.creeping)
-    figures = f"a point at the working distance is expected to be off by {error_m * 1e3:.3f} mm rms"
+    figures = f"a point in the field of view is expected to be off by {error_m * 1e3:.3f} mm rms"
     if error_m > settings.limit_m:
         words = (
             f"{figures} (allowed {settings.limit_m * 1e3:g} mm): tilt the flange more, show the "
         )
         words += "target at more distances, or measure more often; check-plan proposes poses"
         return Verdict(Code.POSES_NOT_INFORMATIVE, words)
+    rms = float(np.sqrt(np.mean(fit.distances() ** 2)))
     return Verdict(Code.ACCEPT, f"{figures}; samples are off by {rms * 1e3:.3f} mm rms")

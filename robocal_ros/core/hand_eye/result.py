@@ -26,8 +26,9 @@ class HandEyeResult:
     kind, method : of the target and of the estimator.
     T_flange_sensor : (4, 4), m. For a sensor that does not move (eye-to-hand) ``parent`` is "base"
         and this is T_base_sensor.
-    covariance : (6, 6) of the increment (v, w), m and rad, in the sensor frame: the true pose is
-        ``T_flange_sensor @ [[exp(w), v], [0, 1]]``; None where the method tells none.
+    covariance : (6, 6) of the `increment` (v, w) to the true pose, m and rad, sensor axes: a turn
+        about ``pivot`` (3,), sensor frame, and its shift; None where the method tells none. About
+        the middle of what was seen it is a Gaussian even where the sensor's origin moves far.
     samples : names (n,) of the samples used; ``residual_m`` (n,) their distances, and
         ``residual_rad`` (n,) their angles where the target has any.
     leave_one_out_m : (n,) distance of each sample from the solution without it; None where too few
@@ -53,6 +54,25 @@ class HandEyeResult:
     working_error_m: float | None = None
     more: Document = field(default_factory=dict)
     parent: Literal["flange", "base"] = "flange"
+    pivot: Array = field(default_factory=lambda: np.zeros(3))
+
+
+def increment(T_from: Array, T_to: Array, pivot: Array) -> Array:
+    """(v, w) (6,) from T_from to T_to, along T_from's axes: a pivot moves by v, turned by w."""
+    T = frames.invert(T_from) @ T_to
+    return np.concatenate([T[:3, :3] @ pivot + T[:3, 3] - pivot, frames.log_rotation(T[:3, :3])])
+
+
+def moved_origin(step: Array, pivot: Array) -> Array:
+    """An increment (v, w) (6,) about a pivot as one about the origin, to first order."""
+    return np.concatenate([step[:3] - np.cross(step[3:], pivot), step[3:]])
+
+
+def at_origin(covariance: Array, pivot: Array) -> Array:
+    """Covariance (6, 6) of increments about a pivot as of those about the origin."""
+    move = np.eye(6)
+    move[:3, 3:] = frames.skew(pivot)
+    return np.asarray(move @ covariance @ move.T)
 
 
 def point_covariance(result: HandEyeResult, points: Array) -> Array:
@@ -65,7 +85,8 @@ def point_covariance(result: HandEyeResult, points: Array) -> Array:
     """
     if result.covariance is None:
         raise ValueError("a method without a covariance")
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
+    away = points - result.pivot
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(away)], 2)
     return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
 
 
@@ -74,7 +95,7 @@ def parent_covariance(result: HandEyeResult) -> Array | None:
     if result.covariance is None:
         return None
     turn = np.kron(np.eye(2), result.T_flange_sensor[:3, :3])
-    return np.asarray(turn @ result.covariance @ turn.T)
+    return np.asarray(turn @ at_origin(result.covariance, result.pivot) @ turn.T)
 
 
 def hand_eye_document(result: HandEyeResult) -> Document:

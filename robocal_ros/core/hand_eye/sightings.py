@@ -57,12 +57,15 @@ class Seen:
     point : (m, 3) the point of the target that is seen, sensor frame, m.
     slope : (m, 3, 3) change of the value as that point moves with the target, sensor axes.
     spread : (m, 3, k) displacement of that point, base axes, for each unknown of the target.
+    aim : (m, 3, 2) change of the value with how the light was laid on the target by eye, which all
+        sightings of one pose have in common; None where nothing is laid by eye.
     """
 
     value: Array
     point: Array
     slope: Array
     spread: Array
+    aim: Array | None = None
 
 
 class TargetModel(Protocol):

@@ -10,13 +10,23 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.fitting.edge import EdgeRule
 from robocal_ros.core.hand_eye.mistakes import explain, misfit, swapped
-from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount, leave_one_out, require_seen
-from robocal_ros.core.hand_eye.mount_problem import View
+from robocal_ros.core.hand_eye.mount_fit import (
+    MountFit,
+    distances,
+    first_look,
+    fit_mount,
+    leave_one_out,
+    require_seen,
+    solved_again,
+)
+from robocal_ros.core.hand_eye.mount_problem import MountState, View, pivot_of
+from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.quality import (
     HandEyeSettings,
     expected_error_m,
+    field_points,
     judge,
-    working_points,
+    judge_residuals,
 )
 from robocal_ros.core.hand_eye.result import HandEyeResult, Method
 from robocal_ros.core.hand_eye.sphere_radius import require_radius
@@ -27,7 +37,6 @@ from robocal_ros.core.hand_eye.tasks import HandEyeData, LineTask, Read, SphereT
 Array = NDArray[np.float64]
 
 DOUBTFUL_M = 5e-4  # median distance from which a mistake in the data is looked for
-PROMISING = 3  # starts that are followed to the end
 
 
 def solve_sphere(
@@ -80,34 +89,34 @@ def solve_task(
     require_radius(fit)
     rejected = {**read.rejected, **fit.rejected, **_swapped(read.view, fit)}
     if method == "classic":
-        return _classic(task, read, fit, rejected)
-    return result_of(task, fit, rejected, len(data.names), settings)
+        return _classic(task, read, fit.state, len(data.names), settings)
+    return result_of(task, fit, read, rejected, data, settings)
 
 
 def best_fit(task: Task, view: View, settings: HandEyeSettings) -> MountFit:
-    """The most likely of the fits that the promising starts lead to.
+    """The most likely fit, from the start that leads nearest to the sightings.
 
     Raises
     ------
     TooFewSamplesError, RankDeficientError
         When none leads anywhere.
     """
-    fits: list[MountFit] = []
+    noise = settings.noise()
+    states: list[MountState] = []
     failure: RobocalError | None = None
     for start in task.starts(view):
         try:
-            fits.append(fit_mount((view,), start, settings.noise()))
+            states.append(first_look((view,), start, noise))
         except RobocalError as error:
             failure = failure or error
             if isinstance(error, RankDeficientError):
                 break  # it lies in the poses, not in the start
-        if len(fits) >= PROMISING:
-            break
-    if not fits:
+    if not states:
         raise failure or RobocalError("no start was found")
-    best = min(fits, key=misfit)
-    require_seen(best, float(np.abs(working_points(best)).max()))
-    return best
+    nearest = min(states, key=lambda state: float(np.median(distances((view,), state))))
+    fit = fit_mount((view,), nearest, noise)
+    require_seen(fit, float(np.abs(view.sightings.value[:, 1]).mean()))
+    return fit
 
 
 def _require_no_mistake(
@@ -129,11 +138,18 @@ def _swapped(view: View, fit: MountFit) -> dict[str, str]:
 
 
 def result_of(
-    task: Task, fit: MountFit, rejected: dict[str, str], shots: int, settings: HandEyeSettings
+    task: Task,
+    fit: MountFit,
+    read: Read,
+    rejected: dict[str, str],
+    data: HandEyeData,
+    settings: HandEyeSettings,
 ) -> HandEyeResult:
     """The result of a fit, judged."""
-    error_m = expected_error_m(fit.covariance[:6, :6], working_points(fit))
-    lost = shots - len(np.unique(np.concatenate([v.sightings.pose for v in fit.views])))
+    field = field_of(data)
+    pivot = pivot_of(fit.views)
+    error_m = expected_error_m(fit.covariance[:6, :6], field - pivot)
+    shots = len(data.names)
     return HandEyeResult(
         kind=task.kind,
         method="best",
@@ -141,31 +157,47 @@ def result_of(
         covariance=fit.covariance[:6, :6],
         samples=fit.names,
         residual_m=fit.distances(),
-        leave_one_out_m=leave_one_out(fit),
+        leave_one_out_m=leave_one_out(fit.views, solved_again(fit)),
         rejected=rejected,
         target=task.found(fit.state.places[0]),
         working_error_m=error_m,
-        verdict=judge(fit, shots, lost, error_m, settings),
+        pivot=pivot,
+        verdict=judge(fit, shots, shots - _poses(fit.views), error_m, settings),
         more={
             "robot_sigma_mm": fit.noise.sigma_m * 1e3,
-            "working_distance_mm": float(working_points(fit)[1, 2]) * 1e3,
+            "working_distance_mm": float(field[0, 2]) * 1e3,
+            **task.more(fit, read),
         },
     )
 
 
-def _classic(task: Task, read: Read, fit: MountFit, rejected: dict[str, str]) -> HandEyeResult:
+def field_of(data: HandEyeData) -> Array:
+    """Points (5, 3) of the field that the profiles of a data set cover."""
+    return field_points([p.points for p in data.profiles if isinstance(p, Profile)])
+
+
+def _poses(views: tuple[View, ...]) -> int:
+    return len(np.unique(np.concatenate([view.sightings.pose for view in views])))
+
+
+def _classic(
+    task: Task, read: Read, near: MountState, shots: int, settings: HandEyeSettings
+) -> HandEyeResult:
     """The classic estimate from all profiles that gave a feature; it tells no covariance."""
-    state = task.classic(read.view, fit.state)
-    every = replace(fit, views=(read.view,), state=state)
+    views = (read.view,)
+    state = task.classic(read.view, near)
+    residual = distances(views, state)
+    refused = judge_residuals(residual, shots, shots - _poses(views), settings)
     words = "closed form: no covariance, no outlier is left out; compare with method best"
     return HandEyeResult(
         kind=task.kind,
         method="classic",
         T_flange_sensor=state.T_flange_sensor,
         covariance=None,
-        samples=every.names,
-        residual_m=every.distances(),
+        samples=read.view.sightings.names,
+        residual_m=residual,
+        leave_one_out_m=leave_one_out(views, lambda part: task.classic(part[0], near)),
         rejected=dict(read.rejected),
         target=task.found(state.places[0]),
-        verdict=Verdict(Code.ACCEPT, words),
+        verdict=refused or Verdict(Code.ACCEPT, words),
     )

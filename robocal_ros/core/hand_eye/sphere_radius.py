@@ -19,7 +19,7 @@ def require_radius(fit: MountFit) -> None:
     ResidualError
         Naming the radius that fits.
     """
-    problem = MountProblem(fit.views, fit.noise)
+    problem = MountProblem(fit.views, fit.noise, fit.state)
     linear = problem.linear(fit.state)
     radius = np.concatenate(
         [

@@ -1,5 +1,6 @@
 """The staircase: corners at known places, laid under the laser mark by mark."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -8,9 +9,11 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.documents import transform_document
-from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.errors import InputError, ResidualError, RobocalError
 from robocal_ros.core.fitting.polyline import CornerFit, CornerRule, fit_corners
+from robocal_ros.core.hand_eye.corner_matching import Match, along, nearest
 from robocal_ros.core.hand_eye.edge_start import linear_corners, robust_corners
+from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.sightings import Sightings
 from robocal_ros.core.hand_eye.target_models import CornerModel
@@ -20,82 +23,38 @@ from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, seen, usable
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
+TURNED_M, TURNED = 5e-4, 0.3  # the order of the target file is kept unless it misses by so much
+SMALLEST_SIGMA = 1e-7  # m, rad: of a teaching error that is not zero in the other
+
 
 @dataclass(frozen=True, eq=False)
 class StepTask:
-    """Corners of a staircase."""
+    """Corners of a staircase; ``rule`` says how they are found."""
 
     target: StepTarget
+    rule: CornerRule = field(default_factory=CornerRule)
     kind: Literal["step"] = field(default="step", init=False)
     fewest: int = field(default=1, init=False)
 
     def read(self, data: HandEyeData) -> Read:
         """Corners, each with its mark."""
-        marks = self._marks(data)
-        rejected: dict[str, str] = {}
-        fits: dict[str, tuple[int, CornerFit]] = {}
-        for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
-            try:
-                rule = CornerRule(count=len(self.target.corners[marks[i]]))
-                fits[name] = i, fit_corners(seen(profile), rule)
-            except RobocalError as error:
-                rejected[name] = str(error)
-        usable(fits, rejected, self.fewest, "the corners")
-        views = [self._view(data, marks, fits, order) for order in (1, -1)]
-        start = [self._start(view) for view in views]
-        miss = [float(np.median(_distances(v, X))) for v, X in zip(views, start, strict=True)]
-        return Read(views[int(np.argmin(miss))], rejected)
-
-    def _marks(self, data: HandEyeData) -> tuple[str, ...]:
-        known = tuple(self.target.corners)
-        marks = data.marks or (known[0],) * len(data.names)
-        strange = next((mark for mark in marks if mark not in known), None)
-        if strange is not None:
-            raise InputError(f"mark '{strange}' is not one of {', '.join(known)}")
-        return marks
-
-    def _view(
-        self,
-        data: HandEyeData,
-        marks: tuple[str, ...],
-        fits: dict[str, tuple[int, CornerFit]],
-        order: int,
-    ) -> View:
-        """All corners, numbered along the laser line or (order -1) against it."""
-        names, poses, values, covariances, corners = [], [], [], [], []
-        for name, (i, fit) in fits.items():
-            places = self.target.corners[marks[i]][::order]
-            for k in np.flatnonzero(~fit.repaired):
-                names.append(f"{name}/corner {k + 1}")
-                poses.append(i)
-                values.append([*fit.points[k], 0.0])
-                spread = np.zeros((3, 3))
-                spread[:2, :2] = fit.covariance[k]
-                covariances.append(spread + self.target.sigma_m**2 * np.eye(3))
-                corners.append(places[k])
-        pose = np.array(poses, dtype=np.int64)
-        sightings = Sightings(
-            tuple(names), pose, data.T_base_flange[pose], np.array(values), np.array(covariances)
-        )
-        target = self.target
-        model = CornerModel(
-            np.array(corners), target.edge_user, target.T_base_user, self._information()
-        )
-        return View(model, sightings)
-
-    def _information(self) -> Array | None:
-        """About the teaching error of the user frame; None where it is exact."""
-        sigma = np.repeat([self.target.user_sigma_m, self.target.user_sigma_rad], 3)
-        if not np.any(sigma):
-            return None
-        return np.diag(1.0 / np.maximum(sigma, np.repeat([1e-7, 1e-7], 3)) ** 2)
-
-    def _start(self, view: View) -> Array:
-        return robust_corners(view.sightings.value, _in_flange(view))
+        reader = _Reader(self, data)
+        matches = reader.sure()
+        both = [matches, {name: match.turned for name, match in matches.items()}]
+        views = [reader.view(each) for each in both]
+        starts = [robust_corners(view.sightings.value, _in_flange(view)) for view in views]
+        miss = [float(np.median(_distances(v, X))) for v, X in zip(views, starts, strict=True)]
+        turned = miss[0] > TURNED_M and miss[1] < TURNED * miss[0]
+        start = MountState(starts[int(turned)], (self.target.T_base_user,))
+        near = first_look((views[int(turned)],), start, None)
+        view = reader.view(reader.predicted(near.T_flange_sensor))
+        usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
+        return Read(view, reader.rejected)
 
     def starts(self, view: View) -> list[MountState]:
         """The closed form of the corners that agree."""
-        return [MountState(self._start(view), (self.target.T_base_user,))]
+        X = robust_corners(view.sightings.value, _in_flange(view))
+        return [MountState(X, (self.target.T_base_user,))]
 
     def classic(self, view: View, near: MountState) -> MountState:
         """The closed form of all corners."""
@@ -106,19 +65,106 @@ class StepTask:
         """The user frame."""
         return {"T_base_user": transform_document(place)}
 
+    def more(self, fit: MountFit, read: Read) -> Document:
+        """How well the light was laid on the marks."""
+        return {"aim_sigma_mm": fit.noise.aim_m * 1e3}
+
+    def model(self, corner_user: Array) -> CornerModel:
+        """Corners (m, 3), user frame, with what is known of that frame."""
+        target = self.target
+        sigma = np.repeat([target.user_sigma_m, target.user_sigma_rad], 3)
+        information = None
+        if np.any(sigma):
+            information = np.diag(np.maximum(sigma, SMALLEST_SIGMA) ** -2.0)
+        return CornerModel(corner_user, target.edge_user, target.T_base_user, information)
+
+
+class _Reader:
+    """Corners of all profiles; ``rejected`` collects shots that show none of the target's."""
+
+    def __init__(self, task: StepTask, data: HandEyeData) -> None:
+        self._task, self._data = task, data
+        known = task.target.corners
+        marks = data.marks or (next(iter(known)),) * len(data.names)
+        strange = next((mark for mark in marks if mark not in known), None)
+        if strange is not None:
+            raise InputError(f"mark '{strange}' is not one of {', '.join(known)}")
+        self._corners = {name: known[m] for name, m in zip(data.names, marks, strict=True)}
+        self.rejected: dict[str, str] = {}
+        self._fits: dict[str, CornerFit] = {}
+        for name, profile in zip(data.names, data.profiles, strict=True):
+            try:
+                self._fits[name] = fit_corners(seen(profile), task.rule)
+            except RobocalError as error:
+                self.rejected[name] = str(error)
+        usable(self._fits, self.rejected, task.fewest, "corners")
+
+    def sure(self) -> dict[str, Match]:
+        """Profiles that show the whole target, and only in one way."""
+        found = {name: along(fit, self._corners[name]) for name, fit in self._fits.items()}
+        sure = {name: match for name, match in found.items() if match is not None}
+        if not sure:
+            seen_ones = ", ".join(f"{len(fit.points)}" for fit in self._fits.values())
+            wanted = len(next(iter(self._corners.values())))
+            raise ResidualError(
+                f"no profile shows all {wanted} corners of the target alone (they show {seen_ones} "
+                "corners, concave ones too): check the target file and the field of view"
+            )
+        return sure
+
+    def predicted(self, T_flange_sensor: Array) -> dict[str, Match]:
+        """Corners of all profiles by where the target must be."""
+        matches = {}
+        for name, fit in self._fits.items():
+            corners = self._corners[name]
+            T = self._data.T_base_flange[self._data.names.index(name)] @ T_flange_sensor
+            model = self._task.model(corners)
+            place = self._task.target.T_base_user
+            where = model.see(np.broadcast_to(T, (len(corners), 4, 4)), place).value
+            match = nearest(fit, where[:, :2])
+            if len(match.rows):
+                matches[name] = match
+            else:
+                self.rejected[name] = "shows no corner where the target's must be"
+        return matches
+
+    def view(self, matches: Mapping[str, Match]) -> View:
+        """The matched corners as sightings."""
+        names, poses, values, covariances, corners = [], [], [], [], []
+        for name, match in matches.items():
+            fit = self._fits[name]
+            for row, k in zip(match.rows, match.corners, strict=True):
+                names.append(f"{name}/corner {k + 1}")
+                poses.append(self._data.names.index(name))
+                values.append([*fit.points[row], 0.0])
+                spread = self._task.target.sigma_m**2 * np.eye(3)
+                spread[:2, :2] += fit.covariance[row]
+                covariances.append(spread)
+                corners.append(self._corners[name][k])
+        pose = np.array(poses, dtype=np.int64)
+        sightings = Sightings(
+            tuple(names),
+            pose,
+            self._data.T_base_flange[pose],
+            np.array(values).reshape(-1, 3),
+            np.array(covariances).reshape(-1, 3, 3),
+        )
+        return View(self._task.model(np.array(corners).reshape(-1, 3)), sightings)
+
+
+def _corner_model(view: View) -> CornerModel:
+    if not isinstance(view.model, CornerModel):
+        raise ValueError("a view of corners is needed")
+    return view.model
+
 
 def _in_flange(view: View) -> Array:
     """Marks (m, 3) of a view in the flange frame of their pose."""
-    model = view.model
-    if not isinstance(model, CornerModel):
-        raise ValueError("a view of corners is needed")
+    model = _corner_model(view)
     T = frames.invert(view.sightings.T_base_flange) @ model.T_base_user
     return np.asarray(np.einsum("mij,mj->mi", T[:, :3, :3], model.corner_user) + T[:, :3, 3])
 
 
 def _distances(view: View, X: Array) -> Array:
-    s = view.sightings
-    place = view.model
-    if not isinstance(place, CornerModel):
-        raise ValueError("a view of corners is needed")
-    return view.model.distance(s.T_base_flange @ X, place.T_base_user, s.value)
+    model, s = _corner_model(view), view.sightings
+    return model.distance(s.T_base_flange @ X, model.T_base_user, s.value)

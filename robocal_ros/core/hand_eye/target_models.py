@@ -154,7 +154,9 @@ def _across(direction: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class CornerModel:
-    """Marked edges of a staircase; sightings (x, z, 0): the mark lies where the laser meets it.
+    """Marked edges of a staircase; sightings (x, z, 0): the light was laid on the mark by eye.
+
+    What the eye missed is a shift of the light along the edges and a turn across them.
 
     Attributes
     ----------
@@ -170,6 +172,14 @@ class CornerModel:
     information: Array | None = None
 
     components = 3
+
+    @property
+    def across(self) -> Array:
+        """Place (m,) of each corner across the edges, from -1 to 1."""
+        away = self.corner_user - self.corner_user.mean(axis=0)
+        away = away - np.outer(away @ self.edge_user, self.edge_user)
+        place = away @ np.linalg.svd(away)[2][0]
+        return np.asarray(place / max(float(np.abs(place).max()), 1e-9))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -193,7 +203,9 @@ class CornerModel:
             at_user = self.corner_user + along[:, None] * self.edge_user
             spread[:, :, :3] = R
             spread[:, :, 3:] = -R @ frames.skew(at_user)
-        return Seen(np.column_stack([p[:, 0], p[:, 2], along]), p, slope, spread)
+        aim = np.zeros((len(s), 3, 2))
+        aim[:, 2, 0], aim[:, 2, 1] = 1.0, self.across
+        return Seen(np.column_stack([p[:, 0], p[:, 2], along]), p, slope, spread, aim)
 
     def moved(self, place: Array, step: Array) -> Array:
         """The user frame after a step along its own axes."""

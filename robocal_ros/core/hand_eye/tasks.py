@@ -1,6 +1,6 @@
 """One task per target: read its features from profiles, start, solve in the classic way."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from robocal_ros.core.errors import RobocalError, TooFewSamplesError
 from robocal_ros.core.fitting.arc import ArcRule, fit_arc
 from robocal_ros.core.fitting.edge import EdgeRule, fit_edge
-from robocal_ros.core.hand_eye.edge_start import line_starts
+from robocal_ros.core.hand_eye.edge_start import least_distances, line_starts
+from robocal_ros.core.hand_eye.mount_fit import MountFit
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.result import TargetKind
@@ -42,10 +43,17 @@ class HandEyeData:
 
 @dataclass(frozen=True, eq=False)
 class Read:
-    """Features of a data set: ``view``, and which shots gave none and why."""
+    """Features of a data set.
+
+    Attributes
+    ----------
+    view : of the features; rejected: which shots gave none, and why.
+    points : profile points (n, 2) that each feature rests on, where they are on the target.
+    """
 
     view: View
     rejected: Mapping[str, str]
+    points: Mapping[str, Array] = field(default_factory=dict)
 
 
 class Task(Protocol):
@@ -71,8 +79,11 @@ class Task(Protocol):
     def found(self, place: Array) -> Document:
         """What was found of the target."""
 
+    def more(self, fit: MountFit, read: Read) -> Document:
+        """Further figures of a fit."""
 
-def usable(rows: Mapping[str, object], rejected: Mapping[str, str], fewest: int, what: str) -> None:
+
+def usable(rows: Collection[str], rejected: Mapping[str, str], fewest: int, what: str) -> None:
     """Refuse when fewer than ``fewest`` shots gave a feature.
 
     Raises
@@ -102,16 +113,18 @@ class SphereTask:
         """Circles."""
         rule = ArcRule(self.target.radius_m)
         found: dict[str, tuple[int, Array, Array]] = {}
-        rejected = {}
+        rejected, points = {}, {}
         for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
             try:
                 arc = fit_arc(seen(profile), rule)
             except RobocalError as error:
                 rejected[name] = str(error)
                 continue
+            points[name] = seen(profile)[arc.used]
             found[name] = i, np.array([*arc.centre, arc.radius_m]), arc.covariance
         usable(found, rejected, self.fewest, "the sphere")
-        return Read(View(SphereModel(self.target.radius_m), _gathered(data, found)), rejected)
+        view = View(SphereModel(self.target.radius_m), _gathered(data, found))
+        return Read(view, rejected, points)
 
     def starts(self, view: View) -> list[MountState]:
         """All sides of the laser plane are tried."""
@@ -124,6 +137,17 @@ class SphereTask:
     def found(self, place: Array) -> Document:
         """Its centre in base."""
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
+
+    def more(self, fit: MountFit, read: Read) -> Document:
+        """How far profile points are from the sphere, all profiles together."""
+        s, centre = fit.views[0].sightings, fit.state.places[0]
+        far = []
+        for name, T_base_flange in zip(s.names, s.T_base_flange, strict=True):
+            x, z = read.points[name].T
+            T = T_base_flange @ fit.state.T_flange_sensor
+            base = np.outer(x, T[:3, 0]) + np.outer(z, T[:3, 2]) + T[:3, 3]
+            far.append(np.linalg.norm(base - centre, axis=1) - self.target.radius_m)
+        return {"point_residual_mm": float(np.sqrt(np.mean(np.concatenate(far) ** 2))) * 1e3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,14 +188,16 @@ class LineTask:
 
     def classic(self, view: View, near: MountState) -> MountState:
         """Least squares of the distances from the line, all alike."""
-        from robocal_ros.core.hand_eye.edge_start import least_distances
-
         return least_distances(view, near)
 
     def found(self, place: Array) -> Document:
         """A point of it and its direction in base."""
         line = {"point_mm": (place[0] * 1e3).tolist(), "direction": place[1].tolist()}
         return {"line": line, "known": self.target is not None}
+
+    def more(self, fit: MountFit, read: Read) -> Document:
+        """None."""
+        return {}
 
 
 def seen(profile: Profile | RobocalError) -> Array:
