@@ -156,7 +156,7 @@ class HandEyeSession(Commanded):
     def _start(self, command: Command, wall_ns: int) -> Outcome:
         data = data_set_begun(command.arguments)
         require_known(data, data.method)
-        self.data, self._found = data, None
+        self.data = data
         return Outcome(command, Code.ACCEPT, f"data set of a {data.kind} ({data.method}) begun")
 
     def _capture(self, command: Command, wall_ns: int) -> Outcome:
@@ -215,8 +215,6 @@ class HandEyeSession(Commanded):
             raise InputError(f"no capture {handle}; there are {there}")
         del data.captures[handle]
         data.samples.pop(handle, None)
-        if data.waiting is None:
-            self._found = None
         command = replace(command, arguments={**command.arguments, "handle": handle})
         words = f"capture {handle} removed, {len(data.samples)} samples are left"
         return Outcome(command, Code.ACCEPT, words, samples=len(data.samples))
@@ -231,7 +229,7 @@ class HandEyeSession(Commanded):
         arguments = command.arguments
         data = data_set_of(arguments["set"], self.current.arm)
         require_known(data, data.method)
-        self.data, self._found = data, None
+        self.data = data
         self._handle = max(self._handle, *data.samples, 0)
         count = len(data.samples)
         words = f"{count} samples of a {data.kind} loaded from {arguments.get('path', 'a file')}"
