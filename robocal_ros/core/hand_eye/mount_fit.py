@@ -91,9 +91,9 @@ def fit_mount(
     if len(np.unique(poses)) < len(poses):  # one sighting of a profile may be wrong, not all of it
         estimate, wrong, found = _settle(views, state, found, noise, together=False)
         state = estimate.state
-        views = _without(views, wrong, rejected)
+        views = without(views, wrong, rejected)
     estimate, wrong, found = _settle(views, state, found, noise, together=True)
-    views = _without(views, wrong, rejected)
+    views = without(views, wrong, rejected)
     return MountFit(
         views,
         estimate.state,
@@ -194,7 +194,7 @@ def open_directions(covariance: Array, reach_m: float, T_base_flange: Array) -> 
     return [describe_motion(direction / size, T_base_flange) for direction in open_ones.T]
 
 
-def _without(
+def without(
     views: tuple[View, ...], wrong: NDArray[np.bool_], rejected: dict[str, str]
 ) -> tuple[View, ...]:
     """The views without sightings marked in ``wrong`` (m,); those are named in ``rejected``."""
@@ -233,7 +233,7 @@ def leave_one_out(
     own = np.zeros(len(sample))
     for pose in np.unique(sample):
         out = sample == pose
-        rest = _without(views, out, {})
+        rest = without(views, out, {})
         if any(len(view.sightings.names) == 0 for view in rest):
             return None  # a target that only this pose saw
         try:

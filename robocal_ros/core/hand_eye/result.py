@@ -34,7 +34,8 @@ class HandEyeResult:
     leave_one_out_m : (n,) distance of each sample from the solution without it; None where too few
         samples remain to solve without one.
     rejected : name of each sample not used, with the reason.
-    target : what was found of the target, as a document (``center_mm``, ``line`` …).
+    target : what was found of the target, as a document (``center_mm``, ``line`` …); place: the
+        same as the target's model has it, where there is one.
     working_error_m : rms error to expect of a point at the working distance; None if not known.
     more : further entries of the document, such as ``point_residual_mm``.
     """
@@ -55,6 +56,7 @@ class HandEyeResult:
     more: Document = field(default_factory=dict)
     parent: Literal["flange", "base"] = "flange"
     pivot: Array = field(default_factory=lambda: np.zeros(3))
+    place: Array | None = None
 
 
 def increment(T_from: Array, T_to: Array, pivot: Array) -> Array:

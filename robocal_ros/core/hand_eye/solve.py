@@ -1,5 +1,6 @@
 """Where a line-laser sensor sits: profiles of a target and flange poses in, its pose out."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -87,10 +88,9 @@ def solve_task(
     if as_given > DOUBTFUL_M:
         _require_no_mistake(task, data, fit, settings, as_given)
     require_radius(fit)
-    rejected = {**read.rejected, **fit.rejected, **_swapped(read.view, fit)}
     if method == "classic":
         return _classic(task, read, fit.state, len(data.names), settings)
-    return result_of(task, fit, read, rejected, data, settings)
+    return result_of([task], fit, [read], data, settings)
 
 
 def best_fit(task: Task, view: View, settings: HandEyeSettings) -> MountFit:
@@ -130,44 +130,54 @@ def _require_no_mistake(
         raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")
 
 
-def _swapped(view: View, fit: MountFit) -> dict[str, str]:
+def _swapped(view: View, fit: MountFit, place: Array) -> dict[str, str]:
     names = np.array([name in fit.rejected for name in view.sightings.names])
     if np.sum(names) < 2:
         return {}
-    return swapped(fit, replace(fit, views=(view.take(names),)))
+    state = MountState(fit.state.T_flange_sensor, (place,))
+    return swapped(fit, replace(fit, views=(view.take(names),), state=state))
 
 
 def result_of(
-    task: Task,
+    tasks: Sequence[Task],
     fit: MountFit,
-    read: Read,
-    rejected: dict[str, str],
+    reads: Sequence[Read],
     data: HandEyeData,
     settings: HandEyeSettings,
 ) -> HandEyeResult:
-    """The result of a fit, judged."""
-    field = field_of(data)
-    pivot = pivot_of(fit.views)
+    """The result of a fit to one target or several, judged."""
+    field, pivot = field_of(data), pivot_of(fit.views)
     error_m = expected_error_m(fit.covariance[:6, :6], field - pivot)
     shots = len(data.names)
+    rejected = {name: why for read in reads for name, why in read.rejected.items()}
+    swaps = [
+        _swapped(read.view, fit, place) for read, place in zip(reads, fit.state.places, strict=True)
+    ]
+    found = [task.found(place) for task, place in zip(tasks, fit.state.places, strict=True)]
+    more = {
+        "robot_sigma_mm": fit.noise.sigma_m * 1e3,
+        "working_distance_mm": float(field[0, 2]) * 1e3,
+    }
+    for task, view, place, read in zip(tasks, fit.views, fit.state.places, reads, strict=True):
+        more |= task.more(
+            replace(fit, views=(view,), state=replace(fit.state, places=(place,))), read
+        )
+    alone = len(tasks) == 1
     return HandEyeResult(
-        kind=task.kind,
+        kind=tasks[0].kind if alone else "joint",
         method="best",
         T_flange_sensor=fit.state.T_flange_sensor,
         covariance=fit.covariance[:6, :6],
         samples=fit.names,
         residual_m=fit.distances(),
         leave_one_out_m=leave_one_out(fit.views, solved_again(fit)),
-        rejected=rejected,
-        target=task.found(fit.state.places[0]),
+        rejected=rejected | dict(fit.rejected) | {k: v for swap in swaps for k, v in swap.items()},
+        target=found[0] if alone else {t.kind: f for t, f in zip(tasks, found, strict=True)},
         working_error_m=error_m,
         pivot=pivot,
+        place=fit.state.places[0] if alone else None,
         verdict=judge(fit, shots, shots - _poses(fit.views), error_m, settings),
-        more={
-            "robot_sigma_mm": fit.noise.sigma_m * 1e3,
-            "working_distance_mm": float(field[0, 2]) * 1e3,
-            **task.more(fit, read),
-        },
+        more=more,
     )
 
 
@@ -199,5 +209,6 @@ def _classic(
         leave_one_out_m=leave_one_out(views, lambda part: task.classic(part[0], near)),
         rejected=dict(read.rejected),
         target=task.found(state.places[0]),
+        place=state.places[0],
         verdict=refused or Verdict(Code.ACCEPT, words),
     )

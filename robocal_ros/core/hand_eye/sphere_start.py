@@ -113,3 +113,17 @@ def classic_sphere(sightings: Sightings, radius_m: float, near: MountState) -> M
     T = sightings.T_base_flange @ found
     own = np.einsum("mij,mj->mi", T[:, :3, :3], centres) + T[:, :3, 3]
     return MountState(found, (own.mean(axis=0),))
+
+
+def agreed_centre(sightings: Sightings, radius_m: float, T_flange_sensor: Array) -> Array:
+    """The centre (3,) in base, the sensor held: each profile on the side on which they agree."""
+    T = sightings.T_base_flange @ T_flange_sensor
+    both = []
+    for side in (1.0, -1.0):
+        own = circle_centres(sightings.value, radius_m, np.full(len(T), side))
+        both.append(np.einsum("mij,mj->mi", T[:, :3, :3], own) + T[:, :3, 3])
+    points = np.concatenate(both)
+    gap = np.linalg.norm(points[:, None, None] - np.stack(both)[None], axis=3).min(axis=1)
+    near = points[int(np.argmin(np.median(gap, axis=1)))]
+    side = np.argmin(np.linalg.norm(np.stack(both) - near, axis=2), axis=0)
+    return np.asarray(np.median(np.stack(both)[side, np.arange(len(T))], axis=0))

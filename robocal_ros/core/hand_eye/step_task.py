@@ -61,6 +61,10 @@ class StepTask:
         X = linear_corners(view.sightings.value, _in_flange(view))
         return MountState(X, (self.target.T_base_user,))
 
+    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+        """The taught user frame."""
+        return self.target.T_base_user
+
     def found(self, place: Array) -> Document:
         """The user frame."""
         return {"T_base_user": transform_document(place)}

@@ -16,7 +16,7 @@ from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.result import TargetKind
 from robocal_ros.core.hand_eye.sightings import Sightings
-from robocal_ros.core.hand_eye.sphere_start import classic_sphere, sphere_starts
+from robocal_ros.core.hand_eye.sphere_start import agreed_centre, classic_sphere, sphere_starts
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
 
@@ -76,6 +76,9 @@ class Task(Protocol):
     def classic(self, view: View, near: MountState) -> MountState:
         """The classic estimate; ``near`` is a state near the solution."""
 
+    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+        """Where the target is, roughly, if the sensor sits there."""
+
     def found(self, place: Array) -> Document:
         """What was found of the target."""
 
@@ -134,6 +137,10 @@ class SphereTask:
         """Linear differences."""
         return classic_sphere(view.sightings, self.target.radius_m, near)
 
+    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+        """The centre on which the profiles agree best, each on either side."""
+        return agreed_centre(view.sightings, self.target.radius_m, T_flange_sensor)
+
     def found(self, place: Array) -> Document:
         """Its centre in base."""
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
@@ -189,6 +196,17 @@ class LineTask:
     def classic(self, view: View, near: MountState) -> MountState:
         """Least squares of the distances from the line, all alike."""
         return least_distances(view, near)
+
+    def placed(self, view: View, T_flange_sensor: Array) -> Array:
+        """The known line, or the one along the points."""
+        if self.target is not None:
+            return np.stack([self.target.point_base, self.target.direction_base])
+        s = view.sightings
+        T = s.T_base_flange @ T_flange_sensor
+        x, z = s.value[:, :1], s.value[:, 1:2]
+        points = x * T[:, :3, 0] + z * T[:, :3, 2] + T[:, :3, 3]
+        middle = np.median(points, axis=0)
+        return np.stack([middle, np.linalg.svd(points - middle)[2][0]])
 
     def found(self, place: Array) -> Document:
         """A point of it and its direction in base."""
