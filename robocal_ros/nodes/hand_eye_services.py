@@ -132,7 +132,8 @@ class HandEyeServices:
             if document["working_error_mm"] is not None:
                 response.expected_error_mm = float(document["working_error_mm"])
             response.residual_mm = float(document["residual_mm"]["rms"])
-            response.rejected = [int(name) for name in document["rejected"]]
+            because = document["rejected_because"]
+            response.rejected = [f"{name}: {why}" for name, why in because.items()]
         return answer(response, outcome)
 
     async def _load(self, request: Any, response: Any) -> Any:

@@ -74,7 +74,17 @@ SETTINGS = (
 
 
 def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
-    """Settings of the session, in SI."""
+    """Settings of the session, in SI.
+
+    Raises
+    ------
+    InputError
+        When the sensor's frame has no name of its own.
+    """
+    names = settings["base_frame"], settings["flange_frame"], settings["sensor_frame"]
+    if not all(names) or len(set(names)) < len(names):
+        told = ", ".join(f"'{name}'" for name in names)
+        raise InputError(f"base, flange and sensor need frames of different names, not {told}")
     return HandEyeConfig(
         base_frame=settings["base_frame"],
         flange_frame=settings["flange_frame"],

@@ -58,7 +58,8 @@ class HandEyeResults:
             raise ResidualError(f"no pose of the sensor explains the samples: {error}") from error
         document = hand_eye_document(result)
         kept = self._keep(data, samples, result, document, command, wall_ns)
-        verdict, used = result.verdict, len(result.samples)
+        verdict = result.verdict
+        used = len({name.partition("/")[0] for name in result.samples})  # a step names corners
         return Outcome(command, verdict.code, verdict.reason, document, kept, samples=used)
 
     def _keep(

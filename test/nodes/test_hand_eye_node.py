@@ -25,6 +25,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.diagnostics import ERROR
+from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.nodes.tool_messages import pose_message
 from robocal_ros.storage.bags import BagWriter, read_bag
@@ -269,6 +270,26 @@ def test_bad_input_never_ends_the_node(graph: Any, tmp_path: Path) -> None:
         assert (refused.success, refused.status) == (False, Code.BAD_INPUT), request
     assert sensor.node.is_active
     assert sensor.capture(SHOTS[0][1]).state == HandEyeSample.CAPTURED
+
+
+def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    """The third profile is one of another pose."""
+    assert sensor.start().success
+    for number, (q, shot) in enumerate(SHOTS[:10], 1):
+        sensor.robot.move(q, 0.2)
+        assert sensor.capture(SHOTS[11][1] if number == 3 else shot).handle == number
+    result = sensor.calibrate()
+    assert result.candidate_id, result.message
+    assert [told.partition(":")[0] for told in result.rejected] == ["3"]
+    assert result.samples == 9
+
+
+def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
+    for frame in ("", "tool0"):
+        node = graph.add(HandEyeNode, settings_of(tmp_path, sensor_frame=frame))
+        assert node.state == "unconfigured"
 
 
 def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> None:

@@ -196,6 +196,7 @@ def test_every_target_is_solved_by_its_own_estimator(history, name):
     outcome = driver.ask(events.CALIBRATE)
     assert outcome.status is Code.ACCEPT, outcome.message
     assert outcome.document["kind"] == ("step" if name == "step" else "line")
+    assert outcome.samples == count
     assert off_m(history, outcome, cell.T_flange_sensor) < LIMIT_M
 
 
