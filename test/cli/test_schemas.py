@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from camera_tables import camera_tables
 from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
@@ -36,6 +37,7 @@ CROSSED = ["tool", "crossed", "--radius-mm", "12", "--period-s", "2", "--start-d
 RUN = ["tool", "crossed", "--robot", "ur10", "--laser", "laser.yaml", "--taught-mm", "0,0,150",
        "--sample-period-s", "0.002", "--joints", "joints.csv"]  # fmt: skip
 PARALLEL = ["tool", "parallel", "--up-mm", "400", "--down-mm", "360", "--x-mm", "800"]
+CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -164,6 +166,12 @@ CASES = {
         ["tool", "points", "--data", "few_touches.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
+    "hand-eye camera": (
+        "hand-eye.camera.json",
+        [*CAMERA, "--poses", "camera_poses.csv", "--check", "camera_check.csv"],
+        [*CAMERA, "--poses", "few_camera_poses.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -185,6 +193,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
+    camera_tables(folder)
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)

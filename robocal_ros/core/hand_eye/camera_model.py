@@ -63,14 +63,15 @@ class PairProblem:
     pairs: PosePairs
     whitening: Array
     names: tuple[str, ...]
+    common_scale: float
     scale_components: int = 6
 
     @classmethod
-    def of(cls, pairs: PosePairs, covariance: Array) -> "PairProblem":
-        """With the inverse roots of the covariances."""
+    def of(cls, pairs: PosePairs, covariance: Array, common_scale: float) -> "PairProblem":
+        """With the inverse roots of the covariances; common errors so much larger than told."""
         count = 0 if pairs.shared is None else len(pairs.shared.covariance)
         names = (*NAMES, *(f"common_{i + 1}" for i in range(count)))
-        return cls(pairs, np.linalg.inv(np.linalg.cholesky(covariance)), names)
+        return cls(pairs, np.linalg.inv(np.linalg.cholesky(covariance)), names, common_scale)
 
     def linearise(self, state: PairState) -> tuple[Array, Array]:
         """Whitened differences (m, 6) and their Jacobian."""
@@ -93,5 +94,5 @@ class PairProblem:
         if shared is None:
             return None
         information = np.zeros((len(self.names), len(self.names)))
-        information[12:, 12:] = np.linalg.inv(shared.covariance)
+        information[12:, 12:] = np.linalg.inv(shared.covariance * self.common_scale**2)
         return information

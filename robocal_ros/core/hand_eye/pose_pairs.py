@@ -43,6 +43,7 @@ class PosePairs:
     names : (m,) of the samples.
     covariance : (m, 6, 6) of T_camera_board, m and rad: of its position, and of its turn, both
         along the camera's axes; None where it is not known.
+    time_s : (m,) of the samples of a stream, increasing; None of single shots.
     """
 
     T_base_flange: Array
@@ -51,6 +52,7 @@ class PosePairs:
     mount: Mount = "in-hand"
     covariance: Array | None = None
     shared: Shared | None = None
+    time_s: Array | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -78,6 +80,7 @@ class PosePairs:
             T_camera_board=self.T_camera_board[index],
             names=tuple(self.names[i] for i in index),
             covariance=None if self.covariance is None else self.covariance[index],
+            time_s=None if self.time_s is None else self.time_s[index],
             shared=None
             if self.shared is None
             else replace(self.shared, sensitivity=self.shared.sensitivity[index]),
