@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.errors import RankDeficientError
+from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.core.estimation import solve
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
 from robocal_ros.core.hand_eye.sightings import Sightings
@@ -18,7 +18,7 @@ DIRECTIONS = 60  # directions of an unknown line that are tried
 KEPT = 8
 ALIKE_M = 1e-6  # small, so that the descent goes to the very minimum
 SEED = 5  # of the fixed set of trials
-NO_STRETCH = 1e-6  # of the largest singular value, below which corners are on one line
+NO_STRETCH = 2e-3  # of their length: corners that lie on one line but for so much
 
 
 def linear_corners(value: Array, p_flange: Array) -> Array:
@@ -28,9 +28,13 @@ def linear_corners(value: Array, p_flange: Array) -> Array:
 
     Raises
     ------
+    TooFewSamplesError
+        Fewer than three corners.
     RankDeficientError
         When all corners lie on one line of the laser plane.
     """
+    if len(value) < 3:
+        raise TooFewSamplesError(f"{len(value)} corners fit the target, at least 3 are needed")
     A = np.column_stack([value[:, 0], value[:, 1], np.ones(len(value))])
     s = np.linalg.svd(A - A.mean(axis=0), compute_uv=False)
     if s[1] < NO_STRETCH * s[0]:

@@ -1,6 +1,7 @@
-"""How a sphere and a straight edge would be seen from planned poses, and from which others."""
+"""How targets would be seen from planned poses, and from which others they could be."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -10,7 +11,9 @@ from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
+from robocal_ros.core.hand_eye.step_task import StepTask
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
+from robocal_ros.core.hand_eye.targets import StepTarget
 
 Array = NDArray[np.float64]
 
@@ -145,4 +148,71 @@ class PlannedLine:
         at = _places(self.sensor, (0.0,))
         trios = list(product(_tilted(T_base_sensor), at, ALONG_M))
         poses = [_looking(R[None], s[None], place[0] + a * place[1])[0] for R, s, a in trios]
+        return np.array(poses)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedStep:
+    """A staircase; ``marks``: on which each planned pose lays the light, None for the first."""
+
+    target: StepTarget
+    sensor: SensorRange
+    marks: Sequence[str] | None = None
+    fewest: int = field(default=1, init=False)
+
+    def place(self, T_base_sensor: Array) -> Array:
+        """The taught user frame."""
+        return self.target.T_base_user
+
+    def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
+        """All corners of each pose's mark; poses that are not planned take the marks in turn."""
+        known = list(self.target.corners)
+        planned = self.marks is not None and len(self.marks) == len(T_base_flange)
+        turn = (
+            self.marks if planned and self.marks else (known[:1] if self.marks is None else known)
+        )
+        corners = [self.target.corners[turn[i % len(turn)]] for i in range(len(T_base_flange))]
+        pose = np.repeat(np.arange(len(corners)), [len(each) for each in corners])
+        model = StepTask(self.target).model(np.concatenate(corners))
+        seen = model.see((T_base_flange @ T_flange_sensor)[pose], place)
+        step = self.sensor.width_m / self.sensor.points
+        sigma = np.array([0.5 * step, self.sensor.noise_m / np.sqrt(EDGE_POINTS), 0.0])
+        spread = np.diag(sigma**2 + self.target.sigma_m**2)
+        names = tuple(f"pose {i + 1}" for i in pose)
+        return View(
+            model,
+            Sightings(
+                names, pose, T_base_flange[pose], seen.value, np.tile(spread, (len(pose), 1, 1))
+            ),
+        )
+
+    def unseen(self, view: View) -> dict[int, str]:
+        """Poses that see less than two corners."""
+        x, z, _ = view.sightings.value.T
+        found: dict[int, str] = {}
+        out = _out_of_range(x, z, 0.0, self.sensor)
+        for pose in np.unique(view.sightings.pose):
+            rows = np.flatnonzero(view.sightings.pose == pose)
+            if sum(int(row) not in out for row in rows) < 2:
+                found[int(pose)] = next(out[int(row)] for row in rows if int(row) in out)
+        return found
+
+    def candidates(self, T_base_sensor: Array, place: Array) -> Array:
+        """Light through the marks: tilted about their line, and within the plane of the light."""
+        every = list(self.target.corners.values())
+        along = place[:3, :3] @ (every[0][-1] - every[0][0])
+        along /= np.linalg.norm(along)
+        mean = frames.nearest_rotation(T_base_sensor[:, :3, :3].mean(axis=0))
+        x = along * np.sign(along @ mean[:, 0])
+        y = mean[:, 1] - x * (x @ mean[:, 1])
+        y /= np.linalg.norm(y)
+        level = np.column_stack([x, y, np.cross(x, y)])
+        poses = []
+        places = _places(self.sensor, (0.0,))
+        for number, (about_x, about_y, at) in enumerate(product(TILTS_RAD, TILTS_RAD, places)):
+            R = level @ frames.rotation_from_rpy([about_x, 0.0, 0.0])
+            R = R @ frames.rotation_from_rpy([0.0, about_y, 0.0])
+            marks = every[number % len(every)] if self.marks is not None else every[0]
+            middle = place[:3, :3] @ marks.mean(axis=0) + place[:3, 3]
+            poses.append(_looking(R[None], at[None], middle)[0])
         return np.array(poses)

@@ -138,7 +138,7 @@ def check_plan(
     proposed, better = np.empty((0, 4, 4)), None
     if not verdict.accept:
         proposed, better = _propose(
-            target, T_base_flange, state, (information, noise, sensor, limit_m)
+            target, T_base_flange, state, (information, noise, sensor, limit_m), len(seen)
         )
     return PlanReport(
         rank,
@@ -192,8 +192,9 @@ def _propose(
     T_base_flange: Array,
     state: MountState,
     known: tuple[Array, PoseNoise, SensorRange, float],
+    seen: int,
 ) -> tuple[Array, float]:
-    """Add, one by one, the candidate that lowers the expected error most, until it will do."""
+    """Add, one by one, the candidate that lowers the expected error most, until they will do."""
     information, noise, sensor, limit_m = known
     X, place = state.T_flange_sensor, state.places[0]
     candidates = target.candidates(T_base_flange @ X, place)
@@ -206,7 +207,7 @@ def _propose(
     total = information + np.diag(np.concatenate([vague, np.full(len(information) - 6, 1.0)]))
     chosen: list[int] = []
     error = np.inf
-    while len(chosen) < MOST_PROPOSED and error > limit_m:
+    while len(chosen) < MOST_PROPOSED and (error > limit_m or seen + len(chosen) < target.fewest):
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
         errors = _errors(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))

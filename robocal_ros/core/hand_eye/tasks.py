@@ -1,6 +1,6 @@
 """One task per target: read its features from profiles, start, solve in the classic way."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -22,6 +22,8 @@ from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
+
+RADII = (0.8, 0.9, 0.95, 1.05, 1.1, 1.25)  # shares of the radius as told
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,9 @@ class Task(Protocol):
     def more(self, fit: MountFit, read: Read) -> Document:
         """Further figures of a fit."""
 
+    def suspects(self) -> Iterable[tuple[str, "Task"]]:
+        """Mistakes in what is told of the target: in words, and the task without it."""
+
 
 def usable(rows: Collection[str], rejected: Mapping[str, str], fewest: int, what: str) -> None:
     """Refuse when fewer than ``fewest`` shots gave a feature.
@@ -144,6 +149,13 @@ class SphereTask:
     def found(self, place: Array) -> Document:
         """Its centre in base."""
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
+
+    def suspects(self) -> Iterable[tuple[str, Task]]:
+        """Other radii, the likeliest first."""
+        for share in sorted(RADII, key=lambda share: abs(share - 1.0)):
+            radius_m = share * self.target.radius_m
+            words = f"the profiles fit a sphere of radius {radius_m * 1e3:.1f} mm better"
+            yield f"{words}: check which sphere is mounted", SphereTask(SphereTarget(radius_m))
 
     def more(self, fit: MountFit, read: Read) -> Document:
         """How far profile points are from the sphere, all profiles together."""
@@ -216,6 +228,10 @@ class LineTask:
     def more(self, fit: MountFit, read: Read) -> Document:
         """None."""
         return {}
+
+    def suspects(self) -> Iterable[tuple[str, Task]]:
+        """None."""
+        return ()
 
 
 def seen(profile: Profile | RobocalError) -> Array:

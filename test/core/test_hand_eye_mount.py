@@ -1,0 +1,173 @@
+"""The mount as an estimation problem: its Jacobian, its invariance, its covariance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_target
+
+from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.mount_fit import fit_mount
+from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.result import increment
+from robocal_ros.core.hand_eye.sightings import Sightings
+from robocal_ros.core.hand_eye.step_task import StepTask
+from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
+
+X = CELL.T_flange_sensor
+FEATURE_M = 5e-6
+NOISE = PoseNoise(POSE_M, POSE_M, 1e-4)
+LINE = np.stack([T_BASE_USER[:3, 3], T_BASE_USER[:3, 0]])
+
+
+def sensor_poses(rng, count, p_base, p_sensor):
+    """Sensors that look down, tilted and rolled, and see a point of the base where it is wanted."""
+    turns = np.radians(rng.uniform(-1.0, 1.0, (count, 3)) * [25.0, 25.0, 60.0])
+    R = np.diag([1.0, -1.0, -1.0]) @ frames.exp_rotation(turns)
+    return frames.transform(R, p_base - np.einsum("nij,nj->ni", R, p_sensor))
+
+
+def pierced(T_base_sensor, point, direction):
+    """Where a line of the base meets y = 0 of each sensor: by solving for its parameter."""
+    found = []
+    for T in T_base_sensor:
+        y, origin = T[:3, 1], T[:3, 3]
+        along = y @ (origin - point) / (y @ direction)
+        found.append(frames.invert(T)[:3] @ np.append(point + along * direction, 1.0))
+    return np.array(found)
+
+
+def sphere_view(rng, count):
+    y = RADIUS_M * rng.uniform(0.4, 0.7, count) * rng.choice([-1.0, 1.0], count)
+    at = np.column_stack([rng.uniform(-5e-3, 5e-3, count), y, rng.uniform(0.19, 0.21, count)])
+    T = sensor_poses(rng, count, CENTRE, at)
+    value = np.column_stack([at[:, 0], at[:, 2], np.sqrt(RADIUS_M**2 - y**2)])
+    return View(SphereModel(RADIUS_M), sightings(rng, T, value, np.arange(count), 3)), CENTRE
+
+
+def line_view(rng, count):
+    at = np.column_stack([rng.uniform(-5e-3, 5e-3, (count, 1)), np.zeros((count, 1)),
+                          rng.uniform(0.19, 0.21, (count, 1))])  # fmt: skip
+    T = sensor_poses(rng, count, LINE[0] + rng.uniform(-0.04, 0.04, (count, 1)) * LINE[1], at)
+    p = pierced(T, *LINE)
+    value = np.column_stack([p[:, 0], p[:, 2], np.zeros(count)])
+    return View(LineModel(), sightings(rng, T, value, np.arange(count), 2)), LINE
+
+
+def step_view(rng, count):
+    target = stairs_target(user_sigma_m=1e-4, user_sigma_rad=1e-3)
+    corners = target.corners["near"]
+    middle = (T_BASE_USER @ np.append(corners.mean(axis=0), 1.0))[:3]
+    T = sensor_poses(rng, count, middle, np.tile([0.0, 0.0, 0.2], (count, 1)))
+    T = np.repeat(T, len(corners), axis=0)
+    user = np.tile(corners, (count, 1))
+    base = user @ T_BASE_USER[:3, :3].T + T_BASE_USER[:3, 3]
+    p = np.array([pierced(t[None], b, LINE[1])[0] for t, b in zip(T, base, strict=True)])
+    shown = (T[:, :3, :3] @ p[..., None])[..., 0] + T[:, :3, 3]
+    along = (shown - base) @ LINE[1]  # the light passes the mark by so much: as if it was meant
+    user = user + along[:, None] * target.edge_user
+    value = np.column_stack([p[:, 0], p[:, 2], np.zeros(len(p))])
+    pose = np.repeat(np.arange(count), len(corners))
+    return View(StepTask(target).model(user), sightings(rng, T, value, pose, 3)), T_BASE_USER
+
+
+def sightings(rng, T_base_sensor, value, pose, size):
+    """True features with noise, as seen by a robot whose reported poses are off."""
+    C = np.diag(np.where(np.arange(3) < size, FEATURE_M**2, 1.0))
+    noisy = value + FEATURE_M * rng.standard_normal(value.shape) * (np.arange(3) < size)
+    off = POSE_M * rng.standard_normal((int(pose.max()) + 1, 6))[pose]
+    error = frames.transform(frames.exp_rotation(off[:, 3:]), off[:, :3])
+    T = T_base_sensor @ frames.invert(X) @ error
+    names = tuple(f"p{i}/{k}" for k, i in enumerate(pose))
+    return Sightings(names, pose, T, noisy, np.tile(C, (len(pose), 1, 1)))
+
+
+VIEWS = {"sphere": sphere_view, "line": line_view, "step": step_view}
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_jacobian_is_the_numeric_one(kind):
+    view, place = VIEWS[kind](np.random.default_rng(1), 6)
+    state = MountState(X, (place,))
+    problem = MountProblem((view,), NOISE, state)
+    residual, jacobian = problem.linearise(state)
+    step = 1e-6
+    for i in range(len(problem.names)):
+        ends = [
+            problem.linearise(problem.retract(state, s * np.eye(len(problem.names))[i]))[0]
+            for s in (step, -step)
+        ]
+        numeric = (ends[0] - ends[1]) / (2.0 * step)
+        scale = np.abs(jacobian[..., i]).max() + np.abs(residual).max()
+        assert np.allclose(numeric, jacobian[..., i], atol=1e-6 * scale), problem.names[i]
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_effect_of_a_pose_error_is_the_numeric_one(kind):
+    view, place = VIEWS[kind](np.random.default_rng(2), 4)
+    state = MountState(X, (place,))
+    common = MountProblem((view,), NOISE, state).linear(state).common
+    step = 1e-6
+    for i in range(6):
+        ends = []
+        for sign in (1.0, -1.0):
+            d = sign * step * np.eye(6)[i]
+            moved = view.sightings.T_base_flange @ frames.transform(
+                frames.exp_rotation(d[3:]), d[:3]
+            )
+            other = View(view.model, replace(view.sightings, T_base_flange=moved))
+            ends.append(MountProblem((other,), NOISE, state).linear(state).residual)
+        numeric = (ends[0] - ends[1]) / (2.0 * step)
+        assert np.allclose(numeric, common[:, :, i], atol=1e-6 * (1.0 + np.abs(numeric).max()))
+
+
+@pytest.mark.parametrize("kind", VIEWS)
+def test_covariance_is_that_of_the_errors(kind):
+    """Chi-square of 6 numbers over 60 runs: its mean is 6 within 4 of its standard errors."""
+    rng = np.random.default_rng(3)
+    squared = []
+    for _ in range(60):
+        view, place = VIEWS[kind](rng, 15)
+        fit = fit_mount((view,), MountState(X, (place,)), NOISE)
+        C = fit.covariance[:6, :6] / fit.scale**2
+        off = increment(
+            fit.state.T_flange_sensor, X, MountProblem(fit.views, NOISE, fit.state).pivot
+        )
+        squared.append(off @ np.linalg.solve(C, off))
+    assert abs(np.mean(squared) - 6.0) < 4.0 * np.sqrt(12.0 / 60.0)
+
+
+def test_a_moved_base_gives_the_same_mount():
+    view, place = sphere_view(np.random.default_rng(4), 12)
+    T = frames.transform(frames.exp_rotation([0.4, -0.2, 1.1]), [2.0, -1.0, 0.5])
+    moved = replace(view.sightings, T_base_flange=T @ view.sightings.T_base_flange)
+    here = fit_mount((view,), MountState(X, (place,)))
+    there = fit_mount((View(view.model, moved),), MountState(X, (T[:3, :3] @ place + T[:3, 3],)))
+    sigma = np.sqrt(np.diag(here.covariance)[:6])
+    off = increment(here.state.T_flange_sensor, there.state.T_flange_sensor, np.zeros(3))
+    assert np.all(np.abs(off) < 0.02 * np.maximum(sigma, sigma.max()))
+
+
+def test_noise_of_poses_is_found_from_the_profiles():
+    """20 profiles leave 51 numbers over: their scale is known to 10 %, so 4 of that."""
+    view, place = sphere_view(np.random.default_rng(5), 20)
+    found = fit_mount((view,), MountState(X, (place,))).noise.sigma_m
+    assert abs(np.log(found / POSE_M)) < 0.4
+
+
+def test_one_wrong_profile_is_named_and_left_out():
+    view, place = sphere_view(np.random.default_rng(6), 15)
+    value = view.sightings.value.copy()
+    value[4, 0] += 3e-3
+    wrong = View(view.model, replace(view.sightings, value=value))
+    fit = fit_mount((wrong,), MountState(X, (place,)))
+    assert list(fit.rejected) == [view.sightings.names[4]]
+
+
+def test_one_wrong_corner_is_left_out_and_the_others_of_its_profile_stay():
+    view, place = step_view(np.random.default_rng(7), 6)
+    value = view.sightings.value.copy()
+    value[8, 1] += 2e-3
+    wrong = View(view.model, replace(view.sightings, value=value))
+    fit = fit_mount((wrong,), MountState(X, (place,)))
+    assert list(fit.rejected) == [view.sightings.names[8]]
