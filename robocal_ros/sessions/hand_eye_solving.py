@@ -95,7 +95,7 @@ def _of_profiles(
 def _of_poses(
     data: DataSet, samples: Sequence[HandEyeSample], method: Method, config: HandEyeConfig
 ) -> HandEyeResult:
-    from robocal_ros.core.hand_eye.camera import calibrate_camera
+    from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
     from robocal_ros.core.hand_eye.camera_fit import GivenNoise
     from robocal_ros.core.hand_eye.pose_pairs import PosePairs
 
@@ -105,7 +105,8 @@ def _of_poses(
         tuple(str(sample.handle) for sample in samples),
         data.mount,
     )
-    return calibrate_camera(pairs, method, GivenNoise(config.robot_sigma_m, config.robot_sigma_rad))
+    noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)
+    return calibrate_camera(pairs, CameraSettings(method, noise, config.limit_m))
 
 
 _SOLVERS: Mapping[str, Solver] = {
