@@ -54,7 +54,7 @@ class HandEyePlan:
         near, far, width = (1e-3 * x for x in self._settings["sensor_range_mm"])
         sensor = SensorRange(near, far, width, noise_m=self._settings["sensor_noise_mm"] * 1e-3)
         mount = self._mount(session)
-        found = judged_plan(session.data, poses, mount, sensor, session.config)
+        found = judged_plan(session.data, poses, list(request.marks), mount, sensor, session.config)
         return _answered(response, found)
 
     def _poses(self, request: Any, session: HandEyeSession) -> Array:

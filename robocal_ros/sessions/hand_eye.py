@@ -169,10 +169,7 @@ class HandEyeSession(Commanded):
         if len(data.captures) >= MOST_CAPTURES:
             raise LimitError(f"{MOST_CAPTURES} captures: remove some, or start a new data set")
         mark = str(command.arguments.get("mark", ""))
-        marks = tuple(data.target.get("corners", ("",)))
-        if mark not in marks:
-            wanted = ", ".join(marks) if any(marks) else "none"
-            raise InputError(f"mark '{mark}' is none of the target's: {wanted}")
+        data.require_mark(mark)
         handle = int(command.arguments.get("handle", self._handle + 1))
         self._handle, self._why, self._seen_ns = handle, None, 0
         words = f"waits for {data.topic} with the robot at standstill"

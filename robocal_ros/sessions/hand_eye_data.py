@@ -93,6 +93,19 @@ class DataSet:
         """The capture that waits; None while there is none."""
         return next((c for c in self.captures.values() if c.code is Code.NONE), None)
 
+    def require_mark(self, mark: str) -> None:
+        """Refuse a mark that the target does not have; only a step has any.
+
+        Raises
+        ------
+        InputError
+            Naming those that there are.
+        """
+        known = tuple(self.target.get("corners", ("",)))
+        if mark not in known:
+            words = ", ".join(known) if any(known) else "none"
+            raise InputError(f"mark '{mark}' is none of the target's: {words}")
+
     def put(self, sample: HandEyeSample) -> str:
         """Add a sample; says what it is."""
         count = len(sample.values)
