@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from robocal_ros.cli.arguments import ROBOT_HELP, positive
 from robocal_ros.cli.hand_eye_pairs import calibrate
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 NAME = "camera"
 HELP = "place a camera from images of a chessboard, or from poses of a board or a tracked target"
 
-METHODS = ("best", "classic", *CLOSED_FORMS)
+METHODS = ("best", "classic", "tsai", "park", "horaud", "andreff", "daniilidis", "shah", "li")
 MOUNTS = ("in-hand", "to-hand")
 MOST_NAMED = 5  # samples left out for one reason
 

@@ -8,12 +8,20 @@ import numpy as np
 import pytest
 from camera_tables import CELL, INTRINSICS, OFFSET_S, camera_tables, image_tables, stream_tables
 from command import conforms
+from scipy.spatial.transform import Rotation
 
 from bench import hand_eye_sets
+from robocal_ros.cli.hand_eye_camera import METHODS
 from robocal_ros.cli.main import main
+from robocal_ros.core.hand_eye.camera import METHODS as CORE_METHODS
 from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS
 from robocal_ros.core.hand_eye.camera_fit import fit_pairs
 from robocal_ros.core.hand_eye.camera_quality import distances
+from robocal_ros.sim.board_camera import TruePose
+from robocal_ros.storage.cells import write_cells
+from robocal_ros.storage.hand_eye_tables import write_pose_table
+from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.tables import joint_texts
 
 TRUTH_MM = CELL.camera.t[0] * 1e3
 FILES = (".csv", ".yaml")
@@ -80,6 +88,27 @@ def test_every_start_gives_the_same_camera(robocal) -> None:
     assert classic["sigma"] is None
     assert classic["leave_one_out_mm"] is None
     assert classic["start"] in CLOSED_FORMS
+
+
+def test_joints_are_enough_where_the_robot_is_known(robocal, folder: Path) -> None:
+    arm = load_robot("ur10")
+    rng = np.random.default_rng(4)
+    q = np.radians([0.0, -80.0, 90.0, -100.0, -90.0, 0.0]) + rng.uniform(-0.4, 0.4, (15, 6))
+    T = arm.fk(q)
+    flange = TruePose(Rotation.from_matrix(T[:, :3, :3]), T[:, :3, 3])
+    names = [f"j{i}" for i in range(15)]
+    columns = {"sample": names} | joint_texts(q, arm)
+    write_cells(folder / "joints.csv", columns)
+    write_pose_table(
+        folder / "joint_boards.csv", CELL.read_board(CELL.seen_from(flange), rng), names=names
+    )
+    pairs = ("--poses", "joints.csv", "--measured", "joint_boards.csv")
+    assert near(robocal(*pairs, "--robot", "ur10"))
+    assert "name the robot" in robocal(*pairs, status=2)["error"]["message"]
+
+
+def test_methods_are_those_of_the_core() -> None:
+    assert METHODS == CORE_METHODS
 
 
 def test_streams_tell_the_offset(robocal) -> None:

@@ -16,6 +16,7 @@ from robocal_ros.core.hand_eye.streams import (
     calibrate_streams,
     coarse_offset,
     pair_streams,
+    pairs_at,
     stream_of,
 )
 from robocal_ros.sim.board_camera import BoardCell, BoardNoise, moving_flange
@@ -118,6 +119,23 @@ def test_streams_of_two_runs_are_refused() -> None:
     other = frames.transform(walk.as_matrix(), camera.T[:, :3, 3])
     with pytest.raises(InputError, match="nowhere correlate"):
         coarse_offset(robot, replace(camera, T=other))
+
+
+def test_mistakes_in_streams_are_named() -> None:
+    _, robot, camera = recorded(0.3, "in-hand", 8)
+    with pytest.raises(InputError, match="mounted in-hand"):
+        calibrate_streams(robot, camera, "to-hand")
+    large = frames.transform(camera.T[:, :3, :3], 1.1 * camera.T[:, :3, 3])
+    with pytest.raises(InputError, match=r"multiplied by 0\.9"):
+        calibrate_streams(robot, replace(camera, T=large))
+
+
+def test_streams_that_hardly_overlap_are_too_short() -> None:
+    _, robot, camera = recorded(0.0, "in-hand", 9)
+    late = PoseStream(robot.time_s[130:], robot.T[130:], robot.names[130:])
+    early = PoseStream(camera.time_s[:30], camera.T[:30], camera.names[:30])
+    with pytest.raises(TooFewSamplesError, match="record both for longer"):
+        pairs_at(late, early, 0.0, "in-hand")
 
 
 def test_stamps_are_put_in_order_or_refused() -> None:

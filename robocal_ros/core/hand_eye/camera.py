@@ -82,7 +82,7 @@ def calibrate_camera(
         When nothing fits them.
     """
     how = settings or CameraSettings()
-    require_sound(pairs)
+    require_sound(pairs, rejected or {})
     fit = fit_pairs(pairs, how.noise, _start(pairs, how.method))
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
     if how.method == "classic":
@@ -90,7 +90,7 @@ def calibrate_camera(
     return _result(fit, how, check, dict(rejected or {}), about)
 
 
-def require_sound(pairs: PosePairs) -> None:
+def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
     """Refuse pairs in which no placement is worth a search, and name the mistake if it is known.
 
     Raises
@@ -98,7 +98,7 @@ def require_sound(pairs: PosePairs) -> None:
     TooFewSamplesError, RankDeficientError, InputError, ResidualError
         As `calibrate_camera`.
     """
-    require_pairs(pairs)
+    require_pairs(pairs, rejected)
     sound = robust_start(pairs)
     size_m = score(pairs, sound)
     if size_m <= LARGEST_START_M:

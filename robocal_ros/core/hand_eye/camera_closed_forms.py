@@ -15,6 +15,8 @@ HAND_EYE = ("tsai", "park", "horaud", "andreff", "daniilidis")
 ROBOT_WORLD = ("shah", "li")
 CLOSED_FORMS = (*HAND_EYE, *ROBOT_WORLD)
 
+_LEAST_DETERMINANT = 0.5  # of what OpenCV calls a rotation
+
 
 def closed_form(name: str, pairs: PosePairs) -> Placement | None:
     """One of ``CLOSED_FORMS`` (cv2.calibrateHandEye, cv2.calibrateRobotWorldHandEye).
@@ -24,7 +26,7 @@ def closed_form(name: str, pairs: PosePairs) -> Placement | None:
     """
     import cv2
 
-    carrier, board = pairs.T_reference_carrier, pairs.T_camera_board
+    carrier, board = pairs.T_boardside_cameraside, pairs.T_camera_board
     try:
         if name in HAND_EYE:
             code = getattr(cv2, f"CALIB_HAND_EYE_{name.upper()}")
@@ -57,7 +59,7 @@ def _call(solve: Callable[..., Any], first: Array, second: Array, method: int) -
 
 def _transform(found: Any) -> Array:
     R, t = np.asarray(found[0], dtype=np.float64), np.asarray(found[1], dtype=np.float64)
-    if not np.all(np.isfinite(R)):
+    if not np.all(np.isfinite(R)) or np.linalg.det(R) < _LEAST_DETERMINANT:
         return np.full((4, 4), np.nan)
     return frames.transform(frames.nearest_rotation(R), t.ravel())
 

@@ -1,5 +1,6 @@
 """What is wrong with pairs of poses that no placement fits, and motions that show too little."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -21,11 +22,14 @@ MOST_SHIFTED = 2  # samples by which one table may lag behind the other
 MOST_SWAPPED = 20  # rejected samples among which swaps are looked for
 SCALE_TOLERANCE = 0.02
 SCALE_SIGMAS = 5.0
+FEWEST_SCALED = 6  # samples: of fewer the sigma itself is not known
 _NEARLY = 0.1  # of a factor of a thousand
 
 
-def require_pairs(pairs: PosePairs) -> None:
+def require_pairs(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
     """Refuse pairs that cannot give an answer, before anything is solved.
+
+    ``rejected``: samples that were left out already, with the reason.
 
     Raises
     ------
@@ -40,6 +44,7 @@ def require_pairs(pairs: PosePairs) -> None:
         raise TooFewSamplesError(
             f"{len(pairs)} samples: at least {FEWEST_PAIRS} with turns about two axes are needed "
             "(15 or more are better)"
+            + "".join(f"; left out: {name}: {why}" for name, why in list(rejected.items())[:3])
         )
     for what, T in (("robot", pairs.T_base_flange), ("board", pairs.T_camera_board)):
         largest = float(np.linalg.norm(T[:, :3, 3], axis=1).max())
@@ -72,7 +77,7 @@ def _require_turns(pairs: PosePairs) -> None:
     words = " ".join(f"{value:+.2f}" for value in axis)
     hidden = [f"translation along the common rotation axis ({words} in the {where})"]
     remedy = "turn the flange about another axis too, by 20 deg or more"
-    if _one_centre(pairs.T_reference_carrier):
+    if _one_centre(pairs.T_boardside_cameraside):
         hidden.append(f"turn about the same axis ({words} in the {where})")
     raise RankDeficientError(
         f"the flange turned about one axis only ({np.degrees(spread[0]):.1f} deg rms, "
@@ -94,13 +99,13 @@ def _one_centre(T: Array) -> bool:
 
 def scale_of_board(pairs: PosePairs, at: Placement) -> tuple[float, float]:
     """Factor by which board positions would fit the robot's better, and its sigma."""
-    carrier = pairs.T_reference_carrier
+    carrier = pairs.T_boardside_cameraside
     R = carrier[:, :3, :3]
     seen = R @ (at.X[:3, :3] @ pairs.T_camera_board[:, :3, 3, None])
     A = np.concatenate([R, np.broadcast_to(-np.eye(3), R.shape), seen], axis=2).reshape(-1, 7)
     b = -carrier[:, :3, 3].ravel()
     found, _, rank, _ = np.linalg.lstsq(A, b, rcond=1e-10)
-    if rank < A.shape[1] or len(b) <= A.shape[1]:
+    if rank < A.shape[1] or len(pairs) < FEWEST_SCALED:
         return 1.0, np.inf
     variance = float(np.sum((b - A @ found) ** 2)) / (len(b) - A.shape[1])
     return float(found[6]), float(np.sqrt(variance * np.linalg.inv(A.T @ A)[6, 6]))

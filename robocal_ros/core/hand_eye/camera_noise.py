@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data solvable
 _NORMAL_MEDIAN = 1.538  # median length of three unit normals
 _GENEROUS = 2.0
+_LEAST_TOLD = 1e-6  # of what the samples would tell of a variance without unknowns
 _ROUNDS = 8
 _SETTLED = 1e-2
 
@@ -171,7 +172,10 @@ def _round(seen: Evidence, theta: Array, free: NDArray[np.bool_]) -> Array:
     held = np.append(np.where(free, 0.0, theta), 1.0)
     chosen = np.flatnonzero(free)
     right = q[chosen] - F[chosen] @ held
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(F)[chosen], np.finfo(float).tiny))
+    told = np.diag(F)[chosen]
+    if np.any(told <= _LEAST_TOLD * np.sum(flat**2, axis=1)[chosen]):
+        return theta  # the unknowns take up all that the samples say
+    scale = 1.0 / np.sqrt(told)
     found = nnls(F[np.ix_(chosen, chosen)] * np.outer(scale, scale), right * scale)[0] * scale
     new = theta.copy()
     new[chosen] = found

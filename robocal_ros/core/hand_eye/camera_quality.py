@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 MOST_REJECTED = 1.0 / 3.0
 LARGEST_RMS_M = 5e-3
+LEAST_REST = 1e-6  # what the others say about a sample, where they say anything
 
 
 def distances(pairs: PosePairs, at: Placement) -> Array:
@@ -24,16 +25,19 @@ def distances(pairs: PosePairs, at: Placement) -> Array:
 def left_out(fit: PairFit) -> Array | None:
     """How far each used sample (n,) lies from the solution without it, m; to first order.
 
-    By the leverage of each sample: (I - H_ii)^-1 r_i, as of linear least squares.
+    By the leverage of each sample: (I - H_ii)^-1 r_i, as of linear least squares. None where a
+    sample alone determines a direction: nothing solves without it.
     """
     used = ~fit.rejected
-    if int(used.sum()) <= 4:
-        return None
-    J, V = fit.jacobian[used], fit.expected[used]
+    root = np.linalg.cholesky(fit.expected[used])
+    J = np.linalg.solve(root, fit.jacobian[used])
     M = fit.estimate.covariance / fit.estimate.scale**2
-    rest = np.eye(6) - J @ M @ J.swapaxes(1, 2) @ np.linalg.inv(V)
-    alone = np.linalg.solve(rest, fit.differences[used][..., None])[..., 0]
-    return np.asarray(np.linalg.norm(alone[:, :3], axis=1))
+    rest = np.eye(6) - J @ M @ J.swapaxes(1, 2)
+    if float(np.linalg.eigvalsh(rest).min()) < LEAST_REST:
+        return None
+    whitened = np.linalg.solve(root, fit.differences[used][..., None])
+    alone = root @ np.linalg.solve(rest, whitened)
+    return np.asarray(np.linalg.norm(alone[:, :3, 0], axis=1))
 
 
 def working_error(fit: PairFit) -> float:

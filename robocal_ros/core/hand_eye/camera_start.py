@@ -60,7 +60,7 @@ def score(pairs: PosePairs, at: Placement) -> float:
 
 def _closed_forms(pairs: PosePairs, weights: Array) -> list[Placement]:
     """Placements for each set of weights (s, m)."""
-    carrier, board = pairs.T_reference_carrier, pairs.T_camera_board
+    carrier, board = pairs.T_boardside_cameraside, pairs.T_camera_board
     Ra, Rb = carrier[:, :3, :3], board[:, :3, :3]
     m = len(Ra)
     # vec(R_Z) = (R_board_camera (x) R_carrier) vec(R_X), columns stacked

@@ -58,11 +58,10 @@ class PosePairs:
         return len(self.names)
 
     @property
-    def T_reference_carrier(self) -> Array:
-        """(m, 4, 4): the camera's carrier in the frame of the board's: X maps to the first.
+    def T_boardside_cameraside(self) -> Array:
+        """The camera's parent in the board's (m, 4, 4): T_base_flange in hand, its inverse to hand.
 
-        T_base_flange in hand, its inverse to hand: then carrier, X and T_camera_board make Z
-        either way.
+        With it, T_boardside_cameraside X T_camera_board = Z either way.
         """
         return self.T_base_flange if self.mount == "in-hand" else frames.invert(self.T_base_flange)
 
@@ -97,7 +96,7 @@ class Placement:
 
 def predicted(pairs: PosePairs, at: Placement) -> Array:
     """T_camera_board (m, 4, 4) as the robot's poses have it."""
-    return np.asarray(frames.invert(pairs.T_reference_carrier @ at.X) @ at.Z)
+    return np.asarray(frames.invert(pairs.T_boardside_cameraside @ at.X) @ at.Z)
 
 
 def differences(predicted_T: Array, pairs: PosePairs) -> Array:

@@ -127,17 +127,19 @@ def _require_no_mistake(task: Task, data: HandEyeData, view: View, near: MountSt
     if as_given < DOUBTFUL_M:
         return
 
-    def followed(task: Task, data: HandEyeData) -> float:
-        view = task.read(data).view
+    def followed(task: Task, view: View) -> float:
         first = task.starts(view)[0]
         if (off := misfit(view, first)) > as_given:  # not worth following
             return off
         return misfit(view, first_look((view,), first))
 
     def with_poses(T_base_flange: Array) -> float:
-        return followed(task, replace(data, T_base_flange=T_base_flange))
+        return followed(task, task.posed(view, replace(data, T_base_flange=T_base_flange)))
 
-    told = ((words, partial(followed, other, data)) for words, other in task.suspects())
+    def as_told(other: Task) -> float:
+        return followed(other, other.read(data).view)
+
+    told = ((words, partial(as_told, other)) for words, other in task.suspects())
     words = explain(chain(undone(with_poses, data.T_base_flange), told), as_given)
     if words is not None:
         raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")

@@ -51,6 +51,10 @@ class StepTask:
         usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
         return Read(view, reader.rejected)
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Which corner is which depends on the poses."""
+        return self.read(data).view
+
     def starts(self, view: View) -> list[MountState]:
         """The closed form of the corners that agree."""
         X = robust_corners(view.sightings.value, _in_flange(view))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, TooFewSamplesError
+from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera, require_sound
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.pose_pairs import Mount, PosePairs, Shared, differences, predicted
@@ -113,8 +113,16 @@ def coarse_offset(robot: PoseStream, camera: PoseStream) -> float:
             f"the angular speeds of robot and camera nowhere correlate (at best "
             f"{value[best]:.2f}): are both streams of one run, and did the robot turn?"
         )
-    lag = best - (len(b) - 1)
+    lag = best - (len(b) - 1) + _peak(value[max(best - 1, 0) : best + 2])
     return float(robot.time_s[0] - camera.time_s[0] + lag * STEP_S)
+
+
+def _peak(value: Array) -> float:
+    """Where a parabola through the best value and its neighbours is highest, in steps from it."""
+    if len(value) < 3 or np.any(value <= -1.0):
+        return 0.0
+    curve = float(value[0] - 2.0 * value[1] + value[2])
+    return 0.0 if curve >= 0.0 else float(0.5 * (value[0] - value[2]) / curve)
 
 
 def _turns(stream: PoseStream) -> Array:
@@ -196,7 +204,7 @@ def pair_streams(
     """
     offset = coarse_offset(robot, camera)
     pairs, left_out = pairs_at(robot, camera, offset, mount)
-    require_sound(pairs)
+    require_sound(pairs, {})
     fit = fit_pairs(pairs, given)
     for _ in range(_ROUNDS):
         fit = fit_pairs(_with_offset(robot, pairs, fit, offset), given, fit.at)
@@ -205,6 +213,12 @@ def pair_streams(
         pairs, left_out = pairs_at(robot, camera, offset, mount)
         if abs(step) < max(_CLOSE_S, 0.01 * _sigma(fit)):
             break
+    else:
+        raise RankDeficientError(
+            f"the time offset did not settle (last {offset:.4f} s): record a motion that turns "
+            "about all axes, with changes of speed",
+            ("time offset",),
+        )
     return StreamPairs(_with_offset(robot, pairs, fit, offset), offset, _sigma(fit), left_out)
 
 

@@ -1,7 +1,7 @@
 """One task per target: read its features from profiles, start, solve in the classic way."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -72,6 +72,9 @@ class Task(Protocol):
     def read(self, data: HandEyeData) -> Read:
         """Features of profiles. Raises `RobocalError` when too few give any."""
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """The same features from other poses, those of ``data``."""
+
     def starts(self, view: View) -> list[MountState]:
         """First states, best first."""
 
@@ -133,6 +136,10 @@ class SphereTask:
         usable(found, rejected, self.fewest, "the sphere")
         view = View(SphereModel(self.target.radius_m), _gathered(data, found))
         return Read(view, rejected, points)
+
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Features do not depend on poses."""
+        return with_poses(view, data.T_base_flange)
 
     def starts(self, view: View) -> list[MountState]:
         """All sides of the laser plane are tried."""
@@ -198,6 +205,10 @@ class LineTask:
         usable(found, rejected, self.fewest, "the line")
         return Read(View(LineModel(self.target is not None), _gathered(data, found)), rejected)
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Features do not depend on poses."""
+        return with_poses(view, data.T_base_flange)
+
     def starts(self, view: View) -> list[MountState]:
         """Rotations, and directions of an unknown line, are tried."""
         line = None
@@ -245,6 +256,12 @@ def seen(profile: Profile | RobocalError) -> Array:
     if isinstance(profile, RobocalError):
         raise profile
     return profile.points
+
+
+def with_poses(view: View, T_base_flange: Array) -> View:
+    """A view from other poses (m, 4, 4)."""
+    s = view.sightings
+    return View(view.model, replace(s, T_base_flange=T_base_flange[s.pose]))
 
 
 def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:
