@@ -8,6 +8,7 @@ from camera_tables import camera_tables
 from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
+from hand_eye_bag import hand_eye_bag
 from hand_eye_tables import TRUE, hand_eye_tables
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
@@ -81,6 +82,12 @@ CASES = {
         "replay.tool.json",
         ["replay", TOOL_BAG],
         ["replay", TOOL_BAG, "--robot", "kr150_r3100"],
+        (2, "WRONG_ROBOT"),
+    ),
+    "replay hand-eye": (
+        "replay.hand_eye.json",
+        ["replay", "hand_eye.mcap"],
+        ["replay", "hand_eye.mcap", "--robot", "kr150_r3100"],
         (2, "WRONG_ROBOT"),
     ),
     "history list": (
@@ -232,6 +239,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     visits = shift()
     plain_bag(folder / "plain.mcap", visits)
     recorded_bag(folder / "live.mcap", folder / "state", visits)
+    hand_eye_bag(folder / "hand_eye.mcap")
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
