@@ -18,7 +18,6 @@ from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
 from robocal_ros.core.hand_eye.tracker_cube import (
     SMALLEST_ANGLE,
     Cube,
-    Plane,
     fit_plane,
     outward,
     tracked_cube,
@@ -39,8 +38,8 @@ Index = NDArray[np.int64]
 
 THINNED = 6000  # points that are enough to find the parts
 FEW = 500  # points that are enough for a face while the direction is searched
-MOST_ROUNDS = 200
-SETTLED = 1e-8
+MOST_ROUNDS = 150
+SEARCHED, SETTLED = 1e-6, 1e-8  # change of the rotation's entries
 PLACED = 1e-6
 MATCH_M = 5e-4  # of the sphere's heights, and of the faces' angle over ARM_M
 ARM_M = 0.05
@@ -74,7 +73,6 @@ class Classic:
 @dataclass(frozen=True, eq=False)
 class _Match:
     T_flange_sensor: Array
-    planes: tuple[Plane, Plane]
     seen: Cube
     mismatch_m: float
 
@@ -95,7 +93,7 @@ def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise)
     search = _Search(tracked, T_tracker_flange, target)
     match = search.best(scan.thinned(THINNED))
     X = match.T_flange_sensor
-    parts = parts_of(scan, X, match.planes, match.seen.centre, target.sphere_radius_m)
+    parts = parts_of(scan, X, match.seen, target.sphere_radius_m)
     match = search.refined(parts, X)
     return Classic(
         axes=axes,
@@ -145,11 +143,7 @@ class _Search:
         matches.sort(key=lambda match: match.mismatch_m)
         first = matches[0]
         for other in matches[1:]:
-            turn = frames.log_rotation(
-                first.T_flange_sensor[:3, :3].T @ other.T_flange_sensor[:3, :3]
-            )
-            rival = other.mismatch_m < max(CLEARLY * first.mismatch_m, ALIKE_M)
-            if rival and np.linalg.norm(turn) > DISTINCT_RAD:
+            if other.mismatch_m < max(CLEARLY * first.mismatch_m, ALIKE_M):
                 raise RankDeficientError(
                     "two mountings of the sensor explain the scan: the slide is square to the edge "
                     "of both faces, or the sphere is as high above one as above the other; turn "
@@ -163,15 +157,20 @@ class _Search:
         matches: list[_Match] = []
         failures: list[RobocalError] = []
         way = scan.direction()
-        for sign in (1.0, -1.0):
-            start = frames.transform(_rotation_from_y(sign * way), np.zeros(3))
-            faces = find_planes(scan, start)
-            for first, second in permutations(range(len(faces)), 2):
-                pair = scan.part(faces[first]), scan.part(faces[second])
+        starts = [frames.transform(_rotation_from_y(sign * way), np.zeros(3)) for sign in (1.0, -1.0)]
+        faces = find_planes(scan, starts[0])
+        for first, second in permutations(range(len(faces)), 2):
+            pair = scan.part(faces[first]).thinned(FEW), scan.part(faces[second]).thinned(FEW)
+            for start in starts:
+                X = self._turned(pair, start, SEARCHED)
+                if X is None or any(_alike(X, match.T_flange_sensor) for match in matches):
+                    continue
+                if abs(_cube(pair, X, np.zeros(3)).angle - self.tracked.angle) * ARM_M > MATCH_M:
+                    continue
                 rest = np.ones(len(scan.points), dtype=np.bool_)
                 rest[np.concatenate([faces[first], faces[second]])] = False
                 try:
-                    match = self._match(pair, scan.part(rest), start)
+                    match = self._placed(pair, scan.part(rest), X)
                 except RobocalError as error:
                     failures.append(error)
                     continue
@@ -179,57 +178,36 @@ class _Search:
                     matches.append(match)
         return matches, failures
 
-    def _match(self, pair: tuple[Scan, Scan], rest: Scan, start: Array) -> _Match | None:
-        few = pair[0].thinned(FEW), pair[1].thinned(FEW)
-        X = self._turned(few, start)
-        if X is None:
-            return None
-        planes = _planes(few, X)
-        angle = angle_between(planes[0].normal, planes[1].normal)
-        if abs(angle - self.tracked.angle) * ARM_M > MATCH_M:
-            return None
-        return self._placed(pair, rest, X)
-
-    def _turned(self, faces: tuple[Scan, Scan], start: Array) -> Array | None:
+    def _turned(self, faces: tuple[Scan, Scan], X: Array, settled: float) -> Array | None:
         """T_flange_sensor whose rotation builds the scan that gives it; None when none does."""
-        X = start
         measured = two_axis_frame(*self.tracked.normals)
         for _ in range(MOST_ROUNDS):
-            planes = _planes(faces, X)
-            normals = [plane.normal for plane in planes]
-            if max(normal[2] for normal in normals) > 0.0:  # the sensor sees no face from behind
+            normals = _cube(faces, X, np.zeros(3)).normals
+            if normals[:, 2].max() > 0.0:  # the sensor sees no face from behind
                 return None
             if np.linalg.norm(np.cross(*normals)) < SMALLEST_ANGLE:
                 return None
             R = self.T_tracker_flange[:3, :3].T @ measured @ two_axis_frame(*normals).T
             change = float(np.abs(R - X[:3, :3]).max())
             X = frames.transform(R, X[:3, 3])
-            if change < SETTLED:
+            if change < settled:
                 return X
         return None
 
     def _placed(self, faces: tuple[Scan, Scan], ball: Scan, X: Array) -> _Match | None:
-        """The match with the place of the sensor too, from the sphere."""
+        """The match with the place of the sensor too, from the sphere; None when none settles."""
         rule = SphereRule(self.target.sphere_radius_m)
         for _ in range(MOST_ROUNDS):
-            planes = _planes(faces, X)
-            centre = fit_sphere(ball.built(X), rule).centre
-            seen = Cube(
-                np.array([plane.normal for plane in planes]),
-                np.array([plane.offset for plane in planes]),
-                centre,
-            )
+            seen = _cube(faces, X, fit_sphere(ball.built(X), rule).centre)
             T_tracker_sensor = self.tracked.frame @ frames.invert(seen.frame)
             update = frames.invert(self.T_tracker_flange) @ T_tracker_sensor
             change = float(np.abs(update - X).max())
             X = update
             if change < PLACED:
-                break
-        else:
-            return None
-        angle = abs(seen.angle - self.tracked.angle) * ARM_M
-        heights = np.abs(seen.heights - self.tracked.heights)
-        return _Match(X, planes, seen, max(angle, float(heights.max())))
+                angle = abs(seen.angle - self.tracked.angle) * ARM_M
+                heights = np.abs(seen.heights - self.tracked.heights)
+                return _Match(X, seen, max(angle, float(heights.max())))
+        return None
 
     def refined(self, parts: tuple[Scan, Scan, Scan], X: Array) -> _Match:
         """The match from all points of the parts.
@@ -239,7 +217,7 @@ class _Search:
         ResidualError
             When it does not settle.
         """
-        turned = self._turned(parts[:2], X)
+        turned = self._turned(parts[:2], X, SETTLED)
         match = None if turned is None else self._placed(parts[:2], parts[2], turned)
         if match is None:
             raise ResidualError(
@@ -249,9 +227,16 @@ class _Search:
         return match
 
 
-def _planes(faces: tuple[Scan, Scan], X: Array) -> tuple[Plane, Plane]:
-    first, second = (fit_plane(face.built(X))[0] for face in faces)
-    return outward(first, second)
+def _cube(faces: tuple[Scan, Scan], X: Array, centre: Array) -> Cube:
+    """The target in the sensor frame of the first profile."""
+    planes = outward(*(fit_plane(face.built(X))[0] for face in faces))
+    normals = np.array([plane.normal for plane in planes])
+    return Cube(normals, np.array([plane.offset for plane in planes]), centre)
+
+
+def _alike(X: Array, Y: Array) -> bool:
+    turn = frames.log_rotation(X[:3, :3].T @ Y[:3, :3])
+    return bool(np.linalg.norm(turn) < DISTINCT_RAD)
 
 
 def _mirrored(scan: Scan) -> Scan:

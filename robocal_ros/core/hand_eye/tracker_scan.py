@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.errors import ResidualError
 from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.tracker_cube import Plane, fit_plane
+from robocal_ros.core.hand_eye.tracker_cube import Cube, Plane, fit_plane
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 MOST_PLANES = 4
-TRIPLES = 250
-JUDGES = 1200
+TRIPLES = 150
+JUDGES = 800
 REACH_M = 0.012  # between the points of a triple
 NEAR_M = 3e-4  # of a part's own points
 CLEAR_M = 1e-3  # points so near to another part may be of either
@@ -150,15 +150,15 @@ def _best_plane(cloud: Array, rng: np.random.Generator) -> Plane | None:
 
 
 def parts_of(
-    scan: Scan, T_flange_sensor: Array, planes: Sequence[Plane], centre: Array, radius_m: float
+    scan: Scan, T_flange_sensor: Array, seen: Cube, radius_m: float
 ) -> tuple[Scan, Scan, Scan]:
     """The scan of the first face, of the second and of the sphere; without points near another.
 
-    ``planes`` and ``centre`` (3,) are in the sensor frame of the first profile.
+    ``seen`` is in the sensor frame of the first profile.
     """
     cloud = scan.built(T_flange_sensor)
-    distance = np.linalg.norm(cloud - centre, axis=1)
-    first, second = (plane.distances(cloud) for plane in planes)
+    distance = np.linalg.norm(cloud - seen.centre, axis=1)
+    first, second = np.abs(cloud @ seen.normals.T - seen.offsets).T
     off_ball = distance > radius_m + CLEAR_M
     on_ball = np.abs(distance - radius_m) < NEAR_M
     return (
