@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.profile import FEWEST_POINTS, profile_of
+from robocal_ros.core.hand_eye.profile import profile_of
 from robocal_ros.core.hand_eye.tracker_data import (
     Arc,
     TrackerData,
@@ -19,6 +19,7 @@ from robocal_ros.core.hand_eye.tracker_data import (
     TrackerTarget,
 )
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.inverse import inverse
 from robocal_ros.sim.profile_sensor import ProfileSensor
 from robocal_ros.sim.profile_targets import Ball, Scene, block
 from robocal_ros.sim.robot import shift, turn
@@ -29,6 +30,7 @@ T_TRACKER_BASE = frames.transform(
     frames.rotation_from_rpy([0.03, -0.05, 2.4]), [3.0, 1.7, -0.8]
 )  # 3.5 m away, as in the source
 CUBE_M = 0.08
+FEWEST_LIT = 60  # points of a profile that is kept
 GRID = np.linspace(-0.3, 0.3, 3) * CUBE_M  # where the reflector touches a face
 
 
@@ -124,7 +126,7 @@ class TrackerCell:
         rng = np.random.default_rng(0)
         T = true_flange(self.arm, self.scan) @ self.T_flange_sensor
         shots = [still.shoot(pose, self.scene, rng) for pose in T]
-        lit = [i for i, xz in enumerate(shots) if np.sum(np.isfinite(xz[:, 0])) >= FEWEST_POINTS]
+        lit = [i for i, xz in enumerate(shots) if np.sum(np.isfinite(xz[:, 0])) >= FEWEST_LIT]
         names = ("arc_a", "arc_b")
         arcs = [
             Arc(name, q, self._seen(self.reflector_points(q)))
@@ -162,6 +164,14 @@ class TrackerCell:
             profiles=profiles,
         )
 
+    def told(self, rng: np.random.Generator) -> TrackerTarget:
+        """The target as its user measured it: the reflector's height has an error."""
+        target = self.sizes.target
+        if target.height_m is None:
+            return target
+        error_m = target.height_sigma_m * float(rng.standard_normal())
+        return replace(target, height_m=target.height_m + error_m)
+
     def _seen(self, points: Array) -> Array:
         T = self.T_tracker_base
         return np.asarray(points @ T[:3, :3].T + T[:3, 3])
@@ -183,16 +193,40 @@ def prp_cell(arm: SerialArm, sizes: Sizes | None = None) -> TrackerCell:
     height_m = 0.05643  # h0 + h1 of the source
     told = replace(told, target=replace(told.target, height_m=height_m))
     still = np.array([0.2, 0.3, 0.05])
-    arc, line, scan = (np.tile(still, (n, 1)) for n in (25, 16, 131))
-    arc[:, 1] = np.radians(np.linspace(-40.0, 80.0, 25))
-    line[:, 2] = np.linspace(0.0, 0.25, 16)
-    scan[:, 2] = np.linspace(0.05, 0.18, 131)
     R = frames.exp_rotation(np.radians(89.87) * np.array([1.0, 0.0018, 0.0002]))
     return TrackerCell(
         arm=arm,
         T_flange_sensor=frames.transform(R, [0.0571, 0.4474, 0.0493]),
         reflector=np.array([0.04, height_m, 0.06]),
-        arcs=(arc, line),
-        scan=scan,
+        arcs=(
+            one_joint(still, 1, np.radians(np.linspace(-40.0, 80.0, 25))),
+            one_joint(still, 2, np.linspace(0.0, 0.25, 16)),
+        ),
+        scan=one_joint(still, 2, np.linspace(0.05, 0.18, 131)),
         sizes=told,
     )
+
+
+def six_axis_cell(arm: SerialArm, q: Array, sizes: Sizes | None = None) -> TrackerCell:
+    """A six-axis arm around joint values (6,): arcs of joints 5 and 6, a straight scan."""
+    R = frames.rotation_from_rpy([0.05, -0.08, 0.6])
+    X = frames.transform(R, [0.03, -0.06, 0.09])
+    start = arm.fk(q)
+    slide = np.linspace(-0.065, 0.065, 131)[:, None] * (start[:3, :3] @ R[:, 1])
+    poses = frames.transform(start[:3, :3], start[:3, 3] + slide)
+    turn = np.radians(np.linspace(-50.0, 50.0, 21))
+    return TrackerCell(
+        arm=arm,
+        T_flange_sensor=X,
+        reflector=np.array([0.09, 0.05, 0.04]),
+        arcs=(one_joint(q, 4, q[4] + turn), one_joint(q, 5, q[5] + turn)),
+        scan=inverse(arm, poses, q),
+        sizes=sizes or Sizes(),
+    )
+
+
+def one_joint(q: Array, joint: int, values: Array) -> Array:
+    """Joint values (n, dof) in which one joint takes ``values`` (n,) and the others stand still."""
+    found = np.tile(q, (len(values), 1))
+    found[:, joint] = values
+    return found

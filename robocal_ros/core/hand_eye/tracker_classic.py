@@ -229,7 +229,7 @@ class _Search:
 
 def _cube(faces: tuple[Scan, Scan], X: Array, centre: Array) -> Cube:
     """The target in the sensor frame of the first profile."""
-    planes = outward(*(fit_plane(face.built(X))[0] for face in faces))
+    planes = outward(*(fit_plane(face.moment(X))[0] for face in faces))
     normals = np.array([plane.normal for plane in planes])
     return Cube(normals, np.array([plane.offset for plane in planes]), centre)
 
@@ -240,7 +240,7 @@ def _alike(X: Array, Y: Array) -> bool:
 
 
 def _mirrored(scan: Scan) -> Scan:
-    return replace(scan, points=scan.points * np.array([-1.0, 1.0, 1.0]))
+    return replace(scan, points=scan.points * np.array([-1.0, 1.0]))
 
 
 def _rotation_from_y(direction: Array) -> Array:

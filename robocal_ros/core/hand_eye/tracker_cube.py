@@ -64,14 +64,18 @@ class Cube:
         return np.asarray(self.normals @ self.centre - self.offsets)
 
 
-def fit_plane(points: Array) -> tuple[Plane, Array]:
-    """Plane nearest to points (n, 3), and their rms extents (3,) about it, the least one last."""
-    middle = points.mean(axis=0)
-    away = points - middle
-    size, axes = np.linalg.eigh(away.T @ away / len(points))
+def moment(points: Array) -> Array:
+    """Sum (4, 4) of the outer products of homogeneous points (n, 3)."""
+    homogeneous = np.insert(points, 3, 1.0, axis=1)
+    return np.asarray(homogeneous.T @ homogeneous)
+
+
+def fit_plane(sums: Array) -> tuple[Plane, Array]:
+    """Plane nearest to points of this `moment`, and their rms extents (3,), the least one last."""
+    middle = sums[:3, 3] / sums[3, 3]
+    size, axes = np.linalg.eigh(sums[:3, :3] / sums[3, 3] - np.outer(middle, middle))
     normal = axes[:, 0]
-    extent = np.sqrt(np.maximum(size[::-1], 0.0))
-    return Plane(normal, float(normal @ middle), middle), extent
+    return Plane(normal, float(normal @ middle), middle), np.sqrt(np.maximum(size[::-1], 0.0))
 
 
 def outward(first: Plane, second: Plane) -> tuple[Plane, Plane]:
@@ -112,7 +116,7 @@ def tracked_cube(
 
 
 def _tracked_face(name: str, points: Array, sigma_m: float) -> Plane:
-    plane, extent = fit_plane(points)
+    plane, extent = fit_plane(moment(points))
     if extent[1] < NARROWEST_M:
         raise RankDeficientError(
             f"the tracker points on {name} lie nearly on a line (rms width "

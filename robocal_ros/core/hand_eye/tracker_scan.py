@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.errors import ResidualError
 from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.tracker_cube import Cube, Plane, fit_plane
+from robocal_ros.core.hand_eye.tracker_cube import Cube, Plane, fit_plane, moment
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -33,7 +34,7 @@ class Scan:
 
     Attributes
     ----------
-    points : (n, 3) in the sensor frame of their own profile, m; y is 0.
+    points : (n, 2) x and z in the sensor frame of their own profile, m.
     profile : (n,) number of the profile of each.
     motion : (m, 4, 4) flange pose of each profile in that of the first.
     """
@@ -47,18 +48,38 @@ class Scan:
         """Join profiles; ``motion`` (m, 4, 4)."""
         xz = np.concatenate([profile.points for profile in profiles])
         number = np.repeat(np.arange(len(profiles)), [len(p.points) for p in profiles])
-        return cls(np.insert(xz, 1, 0.0, axis=1), number, motion)
+        return cls(xz, number, motion)
 
     def part(self, which: Index | NDArray[np.bool_]) -> "Scan":
         """The same scan with some of its points."""
         return Scan(self.points[which], self.profile[which], self.motion)
 
+    def carried(self, T_flange_sensor: Array) -> Array:
+        """Sensor pose (m, 4, 4) of each profile in that of the first."""
+        return np.asarray(frames.invert(T_flange_sensor) @ self.motion @ T_flange_sensor)
+
     def built(self, T_flange_sensor: Array) -> Array:
         """Points (n, 3) in the sensor frame of the first profile."""
-        T = frames.invert(T_flange_sensor) @ self.motion @ T_flange_sensor
-        R, t = T[:, :3, :3], T[:, :3, 3]
-        turned = np.einsum("nij,nj->ni", R[self.profile], self.points)
-        return np.asarray(turned + t[self.profile])
+        T = self.carried(T_flange_sensor)[self.profile]
+        x, z = self.points[:, :1], self.points[:, 1:]
+        return np.asarray(T[:, :3, 0] * x + T[:, :3, 2] * z + T[:, :3, 3])
+
+    @cached_property
+    def _moments(self) -> Array:
+        """Of each profile in its own sensor frame (m, 4, 4)."""
+        x, z = self.points.T
+        rows = (x * x, x * z, x, z * z, z, np.ones(len(x)))
+        count = len(self.motion)
+        sums = [np.bincount(self.profile, row, count) for row in rows]
+        found = np.zeros((count, 4, 4))
+        for row, (i, j) in zip(sums, ((0, 0), (0, 2), (0, 3), (2, 2), (2, 3), (3, 3)), strict=True):
+            found[:, i, j] = found[:, j, i] = row
+        return found
+
+    def moment(self, T_flange_sensor: Array) -> Array:
+        """`tracker_cube.moment` of the points `built`."""
+        T = self.carried(T_flange_sensor)
+        return np.asarray((T @ self._moments @ np.swapaxes(T, 1, 2)).sum(axis=0))
 
     def thinned(self, count: int) -> "Scan":
         """The same scan with every so-many-th of its points, about ``count`` of them."""
@@ -140,12 +161,12 @@ def _best_plane(cloud: Array, rng: np.random.Generator) -> Plane | None:
     chosen = judges[miss[:, best] < 2.0 * NEAR_M]
     if len(chosen) < 3:
         return None
-    plane = fit_plane(chosen)[0]
+    plane = fit_plane(moment(chosen))[0]
     for _ in range(ROUNDS):
         chosen = judges[plane.distances(judges) < NEAR_M]
         if len(chosen) < 3:
             return None
-        plane = fit_plane(chosen)[0]
+        plane = fit_plane(moment(chosen))[0]
     return plane
 
 

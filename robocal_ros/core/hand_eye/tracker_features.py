@@ -1,0 +1,144 @@
+"""What a profile tells of a face and of a sphere, condensed to a few independent figures.
+
+The sensor's noise is along its beam (z). Of a face a profile holds a line: its z at the middle of
+its x, and its slope, are all that it tells. Of the sphere it tells the centre, to first order
+about a place that is known well: three combinations of it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.hand_eye.tracker_scan import Scan
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FEWEST_POINTS = 8  # of a part in a profile
+FEWEST_LINES = 4
+REJECT = 4.5  # standard deviations
+STEEPEST = 0.25  # cosine between beam and normal below which a point of the sphere tells little
+FAINT = 1e-9  # share of the largest information below which a combination tells nothing
+_MAD = 1.4826
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """A face in the m profiles.
+
+    Attributes
+    ----------
+    middle : (m,) mean x, m; ``z_m`` (m,) the line there, ``slope`` (m,).
+    z_sigma, slope_sigma : (m,) their standard deviations.
+    seen : (m,) whether the profile shows the face; the other figures are 0, and sigma 1, without.
+    """
+
+    middle: Array
+    z_m: Array
+    slope: Array
+    z_sigma: Array
+    slope_sigma: Array
+    seen: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class Caps:
+    """A sphere in the m profiles: ``root @ (s - place) + offset`` is white for its centre s.
+
+    Attributes
+    ----------
+    place : (m, 3) about which it was linearised, sensor frame, m.
+    root : (m, 3, 3); ``offset`` (m, 3); ``seen`` (m, 3) which of the three tell anything.
+    """
+
+    place: Array
+    root: Array
+    offset: Array
+    seen: Mask
+
+
+def fit_lines(scan: Scan, name: str) -> tuple[Lines, float]:
+    """The face ``name`` in each profile, for a noise of 1 m, and the scatter of its points, m.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When fewer than four profiles show it.
+    """
+    m = len(scan.motion)
+    x, z = scan.points.T
+    used = np.ones(len(x), dtype=np.bool_)
+    for last in (False, True):
+        count = np.bincount(scan.profile[used], minlength=m).astype(float)
+        seen = count >= FEWEST_POINTS
+        n = np.where(seen, count, 1.0)
+        x0, z0 = (np.bincount(scan.profile[used], v[used], m) / n for v in (x, z))
+        dx, dz = x - x0[scan.profile], z - z0[scan.profile]
+        spread = np.bincount(scan.profile[used], dx[used] ** 2, m)
+        product = np.bincount(scan.profile[used], dx[used] * dz[used], m)
+        slope = product / np.where(spread > 0.0, spread, 1.0)
+        miss = dz - slope[scan.profile] * dx
+        shown = used & seen[scan.profile]
+        if np.sum(seen) < FEWEST_LINES:
+            raise TooFewSamplesError(
+                f"{np.sum(seen)} profiles show {name} (at least {FEWEST_LINES}): scan more of it"
+            )
+        freedom = max(float(np.sum(shown)) - 2.0 * float(np.sum(seen)), 1.0)
+        if last:
+            noise = float(np.sqrt(np.sum(miss[shown] ** 2) / freedom))
+        else:
+            noise = _MAD * float(np.median(np.abs(miss[shown])))
+            used = used & (np.abs(miss) <= REJECT * noise)
+    seen &= spread > 0.0
+    lines = Lines(
+        middle=np.where(seen, x0, 0.0),
+        z_m=np.where(seen, z0, 0.0),
+        slope=np.where(seen, slope, 0.0),
+        z_sigma=np.where(seen, 1.0 / np.sqrt(n), 1.0),
+        slope_sigma=np.where(seen, 1.0 / np.sqrt(np.where(seen, spread, 1.0)), 1.0),
+        seen=seen,
+    )
+    return lines, noise
+
+
+def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
+    """The sphere in each profile, about its centres (m, 3), sensor frames, m.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When hardly anything of it is seen.
+    """
+    m = len(scan.motion)
+    away = np.insert(scan.points, 1, 0.0, axis=1) - place[scan.profile]
+    distance = np.linalg.norm(away, axis=1)
+    normal = away / distance[:, None]
+    facing = normal[:, 2] < -STEEPEST
+    miss = np.where(facing, (distance - radius_m) / np.where(facing, normal[:, 2], 1.0), np.inf)
+    # a wrong place shifts all points of a profile alike: outliers are judged about their median
+    limit = REJECT * max(noise_m, _MAD * float(np.median(np.abs(miss[facing]))))
+    used = facing & (np.abs(miss) < limit)
+    count = np.bincount(scan.profile[used], minlength=m)
+    used &= (count >= FEWEST_POINTS)[scan.profile]
+    if np.sum(used) < FEWEST_LINES * FEWEST_POINTS:
+        raise TooFewSamplesError(f"{np.sum(used)} points show the sphere: scan more of it")
+    profile, r = scan.profile[used], miss[used] / noise_m
+    J = -normal[used] / (normal[used, 2:] * noise_m)
+    information = np.empty((m, 3, 3))
+    gradient = np.empty((m, 3))
+    for i in range(3):
+        gradient[:, i] = np.bincount(profile, J[:, i] * r, m)
+        for j in range(3):
+            information[:, i, j] = np.bincount(profile, J[:, i] * J[:, j], m)
+    size, axes = np.linalg.eigh(information)
+    seen = size > FAINT * max(float(size.max()), np.finfo(float).tiny)
+    length = np.sqrt(np.where(seen, size, 1.0))
+    turned = np.einsum("mij,mi->mj", axes, gradient)
+    return Caps(
+        place=place,
+        root=np.where(seen, length, 0.0)[:, :, None] * np.swapaxes(axes, 1, 2),
+        offset=np.where(seen, turned / length, 0.0),
+        seen=seen,
+    )
