@@ -3,10 +3,10 @@
 The contract is written in docs/hand_eye_sphere.md.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -272,3 +272,21 @@ def write_pose_table(
     columns |= dict(zip(POSITION["mm"], map(texts, T_base_flange[:, :3, 3].T * 1e3), strict=True))
     columns |= dict(zip(QUATERNION, map(texts, frames.quat_xyzw(T_base_flange).T), strict=True))
     write_cells(path, columns)
+
+
+def write_shots(
+    path: Path, folder: Path, T_base_flange: Array, profiles: Mapping[str, Array], **more: Any
+) -> None:
+    """Write a table of shots and, into ``folder``, the profile of each by the name of its shot.
+
+    ``more`` as in `write_pose_table`.
+
+    Raises
+    ------
+    InputError
+        When one of them cannot be written.
+    """
+    files = [f"{name}.csv" for name in profiles]
+    for file, points in zip(files, profiles.values(), strict=True):
+        write_profile(folder / file, points)
+    write_pose_table(path, T_base_flange, files, names=tuple(profiles), **more)

@@ -1,0 +1,183 @@
+"""The golden hand-eye bags: what they hold, that their script makes them again, their truth."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robocal_ros.core.hand_eye.profile import Profile
+from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.core.point_clouds import cloud_points
+from robocal_ros.storage.bags import BagMessage, bag_info, read_bag
+from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
+from robocal_ros.storage.hand_eye_targets import read_target
+from robocal_ros.storage.robots import load_robot
+
+BAGS = Path(__file__).parent.parent / "bags"
+KINDS = ("sphere", "step", "line")
+UR10 = load_robot("ur10")
+FLANGE_M = 1e-3  # an arm whose lengths err by 0.05 mm and angles by 0.05 mrad, at a metre
+SPIKES = 0.02  # more of the points than are speckled (0.3 %) or ragged
+
+
+@pytest.fixture(scope="module")
+def script():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BAGS))
+        import make_hand_eye
+
+        yield make_hand_eye
+        sys.modules.pop("make_hand_eye", None)
+
+
+@pytest.fixture(scope="module")
+def recordings(script) -> dict[str, Any]:
+    return {kind: script.build(kind) for kind in KINDS}
+
+
+def messages(path: Path, topic: str) -> list[BagMessage]:
+    return [m for m in read_bag(path) if m.topic == topic]
+
+
+def stamp_s(message: Any) -> float:
+    return message.header.stamp.sec - 1_790_000_000 + message.header.stamp.nanosec * 1e-9
+
+
+def truth_of(path: Path) -> dict[str, Any]:
+    (told,) = messages(path, "/truth/hand_eye")
+    return json.loads(told.message.data)
+
+
+def bag(kind: str) -> Path:
+    return BAGS / f"hand_eye_{kind}.mcap"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_is_small_and_says_what_it_is(kind):
+    info = bag_info(bag(kind))
+    assert bag(kind).stat().st_size < 1_500_000
+    assert not info.notes
+    assert set(info.topics) == {"/joint_states", "/profile", "/truth/hand_eye"}
+    assert info.topics["/profile"].messages == 15
+    assert truth_of(bag(kind))["simulated"] is True
+    frames_seen = [m.message.header.frame_id for m in messages(bag(kind), "/profile")]
+    marked = {"laser/near", "laser/far"} if kind == "step" else {"laser"}
+    assert set(frames_seen) == marked
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_its_script_makes_it_again(script, recordings, tmp_path, kind):
+    again = tmp_path / "again.mcap"
+    script.write_bag(recordings[kind], again)
+    assert again.with_suffix(".yaml").read_text() == bag(kind).with_suffix(".yaml").read_text()
+    made, kept = list(read_bag(again)), list(read_bag(bag(kind)))
+    assert [m[:3] for m in made] == [m[:3] for m in kept]
+    for one, two in zip(kept, made, strict=True):
+        if one.topic == "/profile":
+            apart = cloud_points(one.message) - cloud_points(two.message)
+            assert np.nanmax(np.abs(apart)) <= 1.1e-6
+            assert np.isnan(apart).mean() < 1.0
+        elif one.topic == "/joint_states":
+            assert np.abs(one.message.position - two.message.position).max() <= 1.1e-6
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_robot_stands_still_at_each_shot(kind):
+    joints = messages(bag(kind), "/joint_states")
+    at = np.array([stamp_s(m.message) for m in joints])
+    q = np.array([m.message.position for m in joints])
+    shots = [stamp_s(m.message) for m in messages(bag(kind), "/profile")]
+    assert joints[0].message.name == list(UR10.joint_names)
+    for shot in shots:
+        rest = (at > shot - 0.5) & (at < shot + 0.3)
+        assert rest.sum() == pytest.approx(0.8 * 125, abs=2)
+        assert np.ptp(q[rest], axis=0).max() < 2e-5  # servo hum of 1e-6 rad
+        before = (at > shot - 0.9) & (at < shot - 0.62)
+        assert np.ptp(q[before], axis=0).max() > 1e-4  # it has just arrived
+
+
+def base_points(kind: str) -> list[np.ndarray]:
+    """Points (n, 3) of each profile, base, by the nominal robot and the true sensor pose."""
+    joints = messages(bag(kind), "/joint_states")
+    at = np.array([stamp_s(m.message) for m in joints])
+    X = np.array(truth_of(bag(kind))["T_flange_sensor"])
+    found = []
+    for shot in messages(bag(kind), "/profile"):
+        q = joints[int(np.argmin(np.abs(at - stamp_s(shot.message))))].message.position
+        p = cloud_points(shot.message)
+        assert np.all(p[:, 1] == 0.0)
+        p = p[np.isfinite(p).all(axis=1)]
+        found.append((UR10.fk(q) @ X @ np.insert(p, 3, 1.0, axis=1).T)[:3].T)
+    return found
+
+
+def test_the_profiles_show_the_sphere():
+    centre = np.array(truth_of(bag("sphere"))["center_base"])
+    for points in base_points("sphere"):
+        off = np.abs(np.linalg.norm(points - centre, axis=1) - 0.02)
+        assert np.mean(off > FLANGE_M) < SPIKES
+
+
+def in_user(kind: str, points: np.ndarray) -> np.ndarray:
+    T = np.array(truth_of(bag(kind))["T_base_user"])
+    return (points - T[:3, 3]) @ T[:3, :3]
+
+
+def test_the_profiles_show_the_stairs():
+    """Near a tread or a riser, near the mark."""
+    frame_ids = [m.message.header.frame_id for m in messages(bag("step"), "/profile")]
+    for points, frame_id in zip(base_points("step"), frame_ids, strict=True):
+        x, y, z = in_user("step", points).T
+        assert np.median(x) == pytest.approx(0.03 if frame_id == "laser/near" else 0.06, abs=5e-3)
+        step = np.clip(np.floor(y / 0.01), 0, 4)
+        to_tread = np.abs(z - 0.01 * (step + 1))
+        to_riser = np.abs(y - 0.01 * np.round(y / 0.01))
+        assert np.mean(np.minimum(to_tread, to_riser) > FLANGE_M) < SPIKES
+
+
+def test_the_profiles_show_the_edge():
+    for points in base_points("line"):
+        _, y, z = in_user("line", points).T
+        on_top, in_front = np.abs(z) < FLANGE_M, np.abs(y) < FLANGE_M
+        assert np.mean(on_top | in_front) > 1.0 - SPIKES
+        assert np.hypot(y, z).min() < FLANGE_M
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_tables_hold_the_same_shots(script, recordings, tmp_path, kind):
+    script.write_csv(recordings[kind], tmp_path)
+    table = read_pose_table(tmp_path / "poses.csv", UR10)
+    # joints are written to 12 digits, 5e-10 degrees at most; six of them turn the flange
+    assert table.T_base_flange == pytest.approx(UR10.fk(table.q), abs=1e-10)
+    marks = [m.message.header.frame_id for m in messages(bag(kind), "/profile")]
+    if kind == "step":
+        assert [f"laser/{mark}" for mark in table.mark] == marks
+    else:
+        assert table.mark is None
+    profiles = read_profiles(tmp_path / "profiles", table)
+    for profile, shot in zip(profiles, messages(bag(kind), "/profile"), strict=True):
+        assert isinstance(profile, Profile)
+        seen = cloud_points(shot.message)
+        seen = seen[np.isfinite(seen).all(axis=1)][:, ::2]
+        assert profile.points == pytest.approx(seen, abs=1e-6)
+    check = read_pose_table(tmp_path / "check.csv")
+    assert len(check) == 5
+    assert not set(check.files) & set(table.files)
+    assert all(isinstance(p, Profile) for p in read_profiles(tmp_path / "profiles", check))
+    target = read_target(tmp_path / "target.yaml")
+    kinds = {"sphere": SphereTarget, "step": StepTarget, "line": LineTarget}
+    assert isinstance(target, kinds[kind])
+
+
+def test_the_targets_are_where_the_robot_takes_them_to_be():
+    """Known to the teaching error and the robot's own."""
+    T = np.array(truth_of(bag("step"))["T_base_user"])
+    step, line = (read_target(bag(kind).with_suffix(".yaml")) for kind in ("step", "line"))
+    assert np.linalg.norm(step.T_base_user[:3, 3] - T[:3, 3]) < FLANGE_M
+    assert np.abs(step.T_base_user[:3, :3] - T[:3, :3]).max() < 5e-3
+    assert np.linalg.norm(line.point_base - T[:3, 3]) < FLANGE_M
+    assert line.direction_base @ T[:3, 0] > np.cos(5e-3)
+    assert step.corners["near"][2].tolist() == pytest.approx([0.03, 0.02, 0.03])
