@@ -14,7 +14,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.estimation import Estimate, solve
-from robocal_ros.core.hand_eye.result import Document, HandEyeResult, Method, point_covariance
+from robocal_ros.core.hand_eye.result import HandEyeResult, Method, point_covariance
 from robocal_ros.core.hand_eye.tracker_classic import Classic, solve_classic
 from robocal_ros.core.hand_eye.tracker_cube import Cube
 from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget

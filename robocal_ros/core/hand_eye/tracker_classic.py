@@ -25,7 +25,6 @@ from robocal_ros.core.hand_eye.tracker_cube import (
 from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.core.hand_eye.tracker_flange import (
     Axis,
-    angle_between,
     fit_axes,
     flange_pose,
     reflector_in_flange,
@@ -157,7 +156,9 @@ class _Search:
         matches: list[_Match] = []
         failures: list[RobocalError] = []
         way = scan.direction()
-        starts = [frames.transform(_rotation_from_y(sign * way), np.zeros(3)) for sign in (1.0, -1.0)]
+        starts = [
+            frames.transform(_rotation_from_y(sign * way), np.zeros(3)) for sign in (1.0, -1.0)
+        ]
         faces = find_planes(scan, starts[0])
         for first, second in permutations(range(len(faces)), 2):
             pair = scan.part(faces[first]).thinned(FEW), scan.part(faces[second]).thinned(FEW)

@@ -121,7 +121,9 @@ def _circle(points: Array, counts: Array) -> tuple[Array, Array, Array]:
     return basis[2] * np.sign(turn), middle + centre @ basis[:2], miss
 
 
-def _require_long(arc: Arc, used: NDArray[np.bool_], centre: Array, joint: int, slides: bool) -> None:
+def _require_long(
+    arc: Arc, used: NDArray[np.bool_], centre: Array, joint: int, slides: bool
+) -> None:
     extent = float(np.ptp(arc.q[used, joint]))
     if slides and extent < SHORTEST_LINE_M:
         raise TooFewSamplesError(
@@ -181,9 +183,7 @@ def nominal_axis(data: TrackerData, arc: Arc, joint: int) -> tuple[Array, Array]
     return R @ w, R @ (data.arm.fk(q)[:3, 3] + np.cross(w, v)) + t
 
 
-def flange_pose(
-    data: TrackerData, axes: tuple[Axis, Axis], target: TrackerTarget
-) -> Array:
+def flange_pose(data: TrackerData, axes: tuple[Axis, Axis], target: TrackerTarget) -> Array:
     """T_tracker_flange (4, 4) at the first profile, in closed form.
 
     Raises
@@ -243,7 +243,9 @@ def angle_between(a: Array, b: Array) -> float:
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
-def reflector_in_flange(data: TrackerData, axes: tuple[Axis, Axis], T_tracker_flange: Array) -> Array:
+def reflector_in_flange(
+    data: TrackerData, axes: tuple[Axis, Axis], T_tracker_flange: Array
+) -> Array:
     """Mean position (3,) of the reflector in the flange, m."""
     T_flange_tracker = frames.invert(T_tracker_flange)
     found = []

@@ -78,7 +78,12 @@ class TrackerProblem:
     @cached_property
     def rows(self) -> tuple[str, ...]:
         """What each row was measured by."""
-        found = [f"{arc.name} {i + 1}" for arc in self.data.arcs for i in range(len(arc.q)) for _ in range(3)]
+        found = [
+            f"{arc.name} {i + 1}"
+            for arc in self.data.arcs
+            for i in range(len(arc.q))
+            for _ in range(3)
+        ]
         found += [f"sphere {i + 1}" for i in range(len(self.data.sphere)) for _ in range(3)]
         for name, points in zip(("face_1", "face_2"), self.data.faces, strict=True):
             found += [f"{name} {i + 1}" for i in range(len(points))]
