@@ -19,7 +19,6 @@ from robocal_ros.core.hand_eye.tracker_data import (
     TrackerTarget,
 )
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.inverse import inverse
 from robocal_ros.sim.profile_sensor import ProfileSensor
 from robocal_ros.sim.profile_targets import Ball, Scene, block
 from robocal_ros.sim.robot import shift, turn
@@ -185,48 +184,3 @@ class TrackerCell:
         sigma = np.where(self.arm.prismatic, noise.joint_m, noise.joint_rad)
         moves = np.ptp(q, axis=0) > 0.0
         return q + np.where(moves, sigma, 0.0) * rng.standard_normal(q.shape)
-
-
-def prp_cell(arm: SerialArm, sizes: Sizes | None = None) -> TrackerCell:
-    """The source's cell: a P-R-P arm, the sensor 90 deg about x, the reflector 56.43 mm high."""
-    told = sizes or Sizes()
-    height_m = 0.05643  # h0 + h1 of the source
-    told = replace(told, target=replace(told.target, height_m=height_m))
-    still = np.array([0.2, 0.3, 0.05])
-    R = frames.exp_rotation(np.radians(89.87) * np.array([1.0, 0.0018, 0.0002]))
-    return TrackerCell(
-        arm=arm,
-        T_flange_sensor=frames.transform(R, [0.0571, 0.4474, 0.0493]),
-        reflector=np.array([0.04, height_m, 0.06]),
-        arcs=(
-            one_joint(still, 1, np.radians(np.linspace(-40.0, 80.0, 25))),
-            one_joint(still, 2, np.linspace(0.0, 0.25, 16)),
-        ),
-        scan=one_joint(still, 2, np.linspace(0.05, 0.18, 131)),
-        sizes=told,
-    )
-
-
-def six_axis_cell(arm: SerialArm, q: Array, sizes: Sizes | None = None) -> TrackerCell:
-    """A six-axis arm around joint values (6,): arcs of joints 5 and 6, a straight scan."""
-    R = frames.rotation_from_rpy([0.05, -0.08, 0.6])
-    X = frames.transform(R, [0.03, -0.06, 0.09])
-    start = arm.fk(q)
-    slide = np.linspace(-0.065, 0.065, 131)[:, None] * (start[:3, :3] @ R[:, 1])
-    poses = frames.transform(start[:3, :3], start[:3, 3] + slide)
-    turn = np.radians(np.linspace(-50.0, 50.0, 21))
-    return TrackerCell(
-        arm=arm,
-        T_flange_sensor=X,
-        reflector=np.array([0.09, 0.05, 0.04]),
-        arcs=(one_joint(q, 4, q[4] + turn), one_joint(q, 5, q[5] + turn)),
-        scan=inverse(arm, poses, q),
-        sizes=sizes or Sizes(),
-    )
-
-
-def one_joint(q: Array, joint: int, values: Array) -> Array:
-    """Joint values (n, dof) in which one joint takes ``values`` (n,) and the others stand still."""
-    found = np.tile(q, (len(values), 1))
-    found[:, joint] = values
-    return found

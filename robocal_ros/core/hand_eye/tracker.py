@@ -61,11 +61,9 @@ def solve_tracker(
         return _result(data, target, classic, _state(classic), "classic", verdict)
     problem, estimate = solve_best(data, target, noise, classic)
     covariance = estimate.covariance[SENSOR, SENSOR]
-    found = replace(
-        _result(data, target, classic, estimate.state, "best", Verdict(Code.NONE, "")),
-        covariance=covariance,
-        rejected=_rejected(problem, estimate),
-    )
+    found = _result(data, target, classic, estimate.state, "best", Verdict(Code.NONE, ""))
+    rejected = {**found.rejected, **_rejected(problem, estimate)}
+    found = replace(found, covariance=covariance, rejected=rejected)
     z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
     spread = point_covariance(found, np.array([[0.0, 0.0, z]]))
     working_m = float(np.sqrt(np.trace(spread[0])))
@@ -109,8 +107,7 @@ def solve_best(
 
 
 def _with_noise(lines: Lines, noise_m: float) -> Lines:
-    sigma = {"z_sigma": lines.z_sigma * noise_m, "slope_sigma": lines.slope_sigma * noise_m}
-    return replace(lines, **sigma)
+    return replace(lines, z_sigma=lines.z_sigma * noise_m, slope_sigma=lines.slope_sigma * noise_m)
 
 
 def _misfit(estimate: Estimate[TrackerState]) -> float:
@@ -160,15 +157,17 @@ def _result(
     verdict: Verdict,
 ) -> HandEyeResult:
     residual_m, seen = _profile_residuals(data, target, classic.parts, state)
+    names = np.array([profile.name for profile in data.profiles])
     cube = Cube(state.normals, state.offsets, state.centre)
     return HandEyeResult(
         kind="tracker",
         method=method,
         T_flange_sensor=state.T_flange_sensor,
         covariance=None,
-        samples=tuple(p.name for p, shown in zip(data.profiles, seen, strict=True) if shown),
+        samples=tuple(names[seen].tolist()),
         residual_m=residual_m[seen],
         verdict=verdict,
+        rejected=dict.fromkeys(names[~seen].tolist(), "shows neither the faces nor the sphere"),
         target={
             "centre_tracker_mm": (state.centre * 1e3).tolist(),
             "face_angle_deg": float(np.degrees(cube.angle)),

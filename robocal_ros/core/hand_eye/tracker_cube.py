@@ -120,7 +120,8 @@ def _tracked_face(name: str, points: Array, sigma_m: float) -> Plane:
     if extent[1] < NARROWEST_M:
         raise RankDeficientError(
             f"the tracker points on {name} lie nearly on a line (rms width "
-            f"{extent[1] * 1e3:.1f} mm, at least {NARROWEST_M * 1e3:.0f}): spread them over the face",
+            f"{extent[1] * 1e3:.1f} mm, at least {NARROWEST_M * 1e3:.0f}): spread them over "
+            "the face",
             [f"turn of {name} about a line"],
         )
     miss = plane.distances(points)

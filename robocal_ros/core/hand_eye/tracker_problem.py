@@ -78,18 +78,15 @@ class TrackerProblem:
     @cached_property
     def rows(self) -> tuple[str, ...]:
         """What each row was measured by."""
-        found = [
-            f"{arc.name} {i + 1}"
-            for arc in self.data.arcs
-            for i in range(len(arc.q))
-            for _ in range(3)
-        ]
-        found += [f"sphere {i + 1}" for i in range(len(self.data.sphere)) for _ in range(3)]
+        parts = [(arc.name, arc.points) for arc in self.data.arcs] + [("sphere", self.data.sphere)]
+        found: list[str] = []
+        for name, points in parts:
+            found += [f"{name} {i + 1}" for i in range(len(points)) for _ in range(3)]
         for name, points in zip(("face_1", "face_2"), self.data.faces, strict=True):
             found += [f"{name} {i + 1}" for i in range(len(points))]
         found += ["height"] if self.target.height_m is not None else []
         profiles, _ = np.nonzero(self._seen)
-        return tuple(found + [self.data.profiles[i].name for i in profiles])
+        return tuple(found + [self.data.profiles[i].name for i in profiles.tolist()])
 
     def linearise(self, state: TrackerState) -> tuple[Array, Array]:
         """Whitened rows (r, 1), and their Jacobian (r, 1, 24)."""
@@ -140,7 +137,7 @@ class TrackerProblem:
         return np.array([(self.height_axis @ state.reflector - height_m) / sigma]), J
 
     def _profiles(self, state: TrackerState) -> tuple[Array, Array, Array]:
-        """Rows (m, 7) of the profiles, their Jacobian (m, 7, 24), and that of the sensor's twist."""
+        """Rows (m, 7) of the profiles, their Jacobian (m, 7, 24), and by the sensor's twist."""
         motion = self.data.motion
         P = state.sensor_poses(motion)
         parts = [self._line(state, P, face) for face in (0, 1)] + [self._cap(state, P)]
@@ -219,9 +216,9 @@ class TrackerProblem:
         sigma = np.where(np.ptp(q, axis=0) > MOVED, sigma, 0.0)
         R = np.swapaxes(arm.fk(q)[:, :3, :3], 1, 2)
         J = arm.jacobian(q)
-        return np.concatenate([R @ J[:, :3], R @ J[:, 3:]], axis=1) * sigma
+        return np.asarray(np.concatenate([R @ J[:, :3], R @ J[:, 3:]], axis=1) * sigma)
 
 
 def sphere_in(P: Array, centre: Array) -> Array:
     """A centre (3,) in the frames of sensor poses (m, 4, 4)."""
-    return np.einsum("mji,mj->mi", P[:, :3, :3], centre - P[:, :3, 3])
+    return np.asarray(np.einsum("mji,mj->mi", P[:, :3, :3], centre - P[:, :3, 3]))
