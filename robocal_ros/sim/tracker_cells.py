@@ -34,7 +34,7 @@ def prp_cell(arm: SerialArm, sizes: Sizes | None = None) -> TrackerCell:
             one_joint(PRP_STILL, 1, np.radians(np.linspace(-40.0, 80.0, 25))),
             one_joint(PRP_STILL, 2, np.linspace(0.0, 0.25, 16)),
         ),
-        scan=one_joint(PRP_STILL, 2, np.linspace(0.05, 0.18, 131)),
+        scan=one_joint(PRP_STILL, 2, np.linspace(0.05, 0.18, 66)),
         sizes=told,
     )
 
@@ -44,7 +44,7 @@ def six_axis_cell(arm: SerialArm, q: Array, sizes: Sizes | None = None) -> Track
     R = frames.rotation_from_rpy([0.05, -0.08, 0.6])
     X = frames.transform(R, [0.03, -0.06, 0.09])
     start = arm.fk(q)
-    slide = np.linspace(-0.065, 0.065, 131)[:, None] * (start[:3, :3] @ R[:, 1])
+    slide = np.linspace(-0.065, 0.065, 66)[:, None] * (start[:3, :3] @ R[:, 1])
     poses = frames.transform(start[:3, :3], start[:3, 3] + slide)
     turn = np.radians(np.linspace(-50.0, 50.0, 21))
     return TrackerCell(

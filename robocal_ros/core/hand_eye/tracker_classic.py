@@ -123,11 +123,11 @@ class _Search:
             When two mountings of the sensor do.
         """
         matches, failures = self._matches(scan)
-        if not matches and not failures and self._matches(_mirrored(scan))[0]:
+        if not matches and self._matches(_reversed(scan))[0]:
             raise ResidualError(
-                "the scan fits the tracker's target only as its mirror image (the frame of face_1, "
-                "face_2 and their edge is left-handed): the x axis of the profiles runs backwards, "
-                "or the faces' points are swapped with those of other faces"
+                "the scan fits the tracker's target only when it is built backwards, as its mirror "
+                "image (the frame of face_1, face_2 and their edge is left-handed): the joint "
+                "readings of the profiles run against those of the arcs, or against the motion"
             )
         if not matches and failures:
             raise failures[0]
@@ -240,8 +240,8 @@ def _alike(X: Array, Y: Array) -> bool:
     return bool(np.linalg.norm(turn) < DISTINCT_RAD)
 
 
-def _mirrored(scan: Scan) -> Scan:
-    return replace(scan, points=scan.points * np.array([-1.0, 1.0]))
+def _reversed(scan: Scan) -> Scan:
+    return replace(scan, motion=frames.invert(scan.motion))
 
 
 def _rotation_from_y(direction: Array) -> Array:

@@ -17,7 +17,9 @@ from robocal_ros.core.hand_eye.tracker_flange import angle_between, two_axis_fra
 Array = NDArray[np.float64]
 
 NARROWEST_M = 5e-3  # rms extent of the points on a face in its narrower direction
-REJECT = 5.0
+REJECT = 5.0  # standard deviations
+LARGEST_SCATTER = 10.0  # of the points of a face, over the tracker's noise
+MAD = 1.4826  # standard deviation by the median distance
 SMALLEST_ANGLE = float(np.sin(np.radians(20.0)))
 
 
@@ -125,7 +127,8 @@ def _tracked_face(name: str, points: Array, sigma_m: float) -> Plane:
             [f"turn of {name} about a line"],
         )
     miss = plane.distances(points)
-    if miss.max() > REJECT * sigma_m:
+    scatter = max(sigma_m, MAD * float(np.median(miss)))
+    if miss.max() > REJECT * scatter or scatter > LARGEST_SCATTER * sigma_m:
         raise ResidualError(
             f"{name}: point {int(np.argmax(miss)) + 1} of {len(points)} lies "
             f"{miss.max() * 1e3:.3f} mm beside the plane of the others (noise "

@@ -5,6 +5,7 @@ two joints, by the lines of their axes in the flange that the nominal geometry g
 """
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ SHORTEST_ARC_RAD = float(np.radians(20.0))
 SHORTEST_LINE_M = 0.03
 SMALLEST_RADIUS_M = 0.03
 REJECT = 5.0  # standard deviations
+LARGEST_SCATTER = 10.0  # of a path's points, over the tracker's noise
+RAYLEIGH = 1.177  # median distance over the standard deviation of a coordinate
 MOST_REJECTED = 0.2
 LARGEST_SKEW_RAD = float(np.radians(1.0))  # of the axes, against the nominal geometry
 PARALLEL = float(np.sin(np.radians(5.0)))
@@ -68,26 +71,32 @@ def fit_axis(arc: Arc, joint: int, slides: bool, sigma_m: float) -> Axis:
     TooFewSamplesError
         When the path is too short.
     ResidualError
-        When more than a fifth of the points are off it.
+        When they scatter ten times more than the tracker does, or more than a fifth are wild.
     """
     used = np.ones(len(arc.points), dtype=np.bool_)
     while True:
         points, counts = arc.points[used], arc.q[used, joint]
         direction, centre, miss = (_line if slides else _circle)(points, counts)
+        scatter = float(np.median(miss)) / RAYLEIGH
+        if scatter > LARGEST_SCATTER * sigma_m:
+            _refuse_path(arc, joint, slides, scatter, sigma_m)
         worst = int(np.argmax(miss))
-        if miss[worst] < REJECT * sigma_m:
+        if miss[worst] < REJECT * max(sigma_m, scatter):
             break
         used[np.flatnonzero(used)[worst]] = False
-        kept = int(np.sum(used))
-        if kept < max(FEWEST_ARC_POINTS, (1.0 - MOST_REJECTED) * len(used)):
-            raise ResidualError(
-                f"{arc.name}: points lie {miss[worst] * 1e3:.3f} mm beside the "
-                f"{'line' if slides else 'circle'} of joint {joint + 1} (noise "
-                f"{sigma_m * 1e3:.3f} mm): check that the reflector sits firmly, that the "
-                "tracker stood still and that no other joint moved"
-            )
+        if np.sum(used) < max(FEWEST_ARC_POINTS, (1.0 - MOST_REJECTED) * len(used)):
+            _refuse_path(arc, joint, slides, float(miss[worst]), sigma_m)
     _require_long(arc, used, centre, joint, slides)
     return Axis(arc.name, joint, slides, direction, centre, used)
+
+
+def _refuse_path(arc: Arc, joint: int, slides: bool, miss_m: float, sigma_m: float) -> NoReturn:
+    raise ResidualError(
+        f"{arc.name}: points lie {miss_m * 1e3:.3f} mm beside the "
+        f"{'line' if slides else 'circle'} of joint {joint + 1} (noise {sigma_m * 1e3:.3f} mm): "
+        "check that the reflector sits firmly, that the tracker stood still and that no other "
+        "joint moved"
+    )
 
 
 def _line(points: Array, counts: Array) -> tuple[Array, Array, Array]:
