@@ -52,6 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="instead of a target file: of the sphere and of the reflector alike",
     )
     parser.add_argument("--method", choices=METHODS, default=METHODS[0])
+    _add_limits(parser)
+
+
+def _add_limits(parser: argparse.ArgumentParser) -> None:
     noise = parser.add_argument_group("noise, one sigma")
     noise.add_argument(
         "--tracker-sigma-mm", type=positive, default=0.015, metavar="S", help="default 0.015"

@@ -81,7 +81,8 @@ def prp_sphere_shots(
     radius = cell.sizes.target.sphere_radius_m
     middle = true_flange(arm, PRP_STILL[None])[0] @ PRP_SENSOR
     scene = Scene((Ball((middle @ [0.0, 0.0, 0.2, 1.0])[:3], radius),))
-    q, profiles = [], []
+    q: list[Array] = []
+    profiles: list[Profile] = []
     while len(q) < count:
         joints = PRP_STILL + rng.uniform(-1.0, 1.0, 3) * [0.008, np.radians(6.0), 0.02]
         xz = cell.sensor.shoot(true_flange(arm, joints[None])[0] @ PRP_SENSOR, scene, rng)

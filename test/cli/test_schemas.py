@@ -13,7 +13,7 @@ from tracker_files import SCAN, tracker_files
 
 from robocal_ros.cli.main import COMMANDS
 from robocal_ros.sim.tracker_cells import prp_cell
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_description
 
 UR_NOMINAL = """[DH]
 a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
@@ -188,7 +188,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
-    tracker_files(folder, prp_cell(load_robot("p1r2p3")))
+    tracker_files(folder, prp_cell(load_description("p1r2p3").arm))
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)

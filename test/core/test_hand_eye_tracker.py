@@ -295,7 +295,7 @@ def test_faces_and_scans_that_tell_too_little():
     with pytest.raises(ResidualError, match="slide over at least 20 mm"):
         solve(replace(data, q=np.tile(data.q[0], (len(data.q), 1))))
     with pytest.raises(ResidualError, match=r"centres of the sphere differ by (0\.9|1\.0)"):
-        solve(replace(data, sphere=data.sphere + [[1e-3, 0.0, 0.0], [0.0] * 3, [0.0] * 3]))
+        solve(replace(data, sphere=data.sphere + 1e-3 * np.eye(3)[0] * np.eye(3)[:, :1]))
 
 
 def test_noise_far_above_what_was_told_is_refused():
