@@ -96,7 +96,7 @@ def source_runs() -> Runs:
 
 
 def largest_of_three(poses: Array) -> Array:
-    """(n / 3, 3): axis, angle in deg and translation in mm of three runs from their mean, at most."""
+    """(n / 3, 3): largest axis, angle, deg, and translation, mm, of three runs from their mean."""
     found = []
     for i in range(0, len(poses) - OF_THREE + 1, OF_THREE):
         away = spread(poses[i : i + OF_THREE])

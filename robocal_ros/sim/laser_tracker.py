@@ -20,7 +20,7 @@ from robocal_ros.core.hand_eye.tracker_data import (
 )
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.profile_targets import Ball, Scene, block
+from robocal_ros.sim.profile_targets import Ball, Body, Scene, block
 from robocal_ros.sim.robot import shift, turn
 
 Array = NDArray[np.float64]
@@ -63,6 +63,7 @@ class TrackerCell:
     arcs : joint values (n, dof) of the two paths; ``scan`` (m, dof) of the profiles.
     edge_rad : angle in the sensor's x-y plane from its y to the edge between both faces;
         ``lean_rad`` turns the cube about that edge.
+    around : whatever else the sensor may see.
     """
 
     arm: SerialArm
@@ -75,6 +76,7 @@ class TrackerCell:
     sensor: ProfileSensor = field(default_factory=ProfileSensor)
     edge_rad: float = float(np.radians(40.0))
     lean_rad: float = float(np.radians(7.0))
+    around: tuple[Body, ...] = ()
 
     @property
     def T_base_view(self) -> Array:
@@ -102,9 +104,9 @@ class TrackerCell:
 
     @property
     def scene(self) -> Scene:
-        """The cube and the sphere."""
+        """The cube and the sphere, and what is around."""
         ball = Ball(self.centre, self.sizes.target.sphere_radius_m)
-        return Scene((block(self.T_base_cube, CUBE_M, CUBE_M, CUBE_M), ball))
+        return Scene((block(self.T_base_cube, CUBE_M, CUBE_M, CUBE_M), ball, *self.around))
 
     def face_points(self) -> tuple[Array, Array]:
         """Centres (9, 3) of the reflector while it touches the face z = 0, and y = 0; base, m."""

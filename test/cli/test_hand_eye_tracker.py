@@ -1,4 +1,4 @@
-"""``robocal hand-eye tracker``: both methods from files, and what it says of files that are wrong."""
+"""``robocal hand-eye tracker``: both methods from files, and what it says of wrong files."""
 
 from pathlib import Path
 

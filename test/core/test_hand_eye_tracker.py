@@ -19,6 +19,7 @@ from robocal_ros.core.hand_eye.tracker_classic import solve_classic
 from robocal_ros.core.hand_eye.tracker_data import Arc, TrackerData
 from robocal_ros.core.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
 from robocal_ros.sim.laser_tracker import TrackerCell
+from robocal_ros.sim.profile_targets import Prism, Stem
 from robocal_ros.sim.tracker_cells import prp_cell, six_axis_cell
 from robocal_ros.sim.ur10_station import Q_NEAR
 from robocal_ros.storage.robots import load_robot
@@ -206,6 +207,22 @@ def with_arc(which: int, arc: Arc) -> TrackerData:
     arcs = list(noisy().arcs)
     arcs[which] = arc
     return replace(noisy(), arcs=(arcs[0], arcs[1]))
+
+
+def test_a_table_and_a_stem_in_the_field_do_no_harm():
+    """With all the sensor's depth, dropouts, and light that is mirrored to another place."""
+    made = cell("prp")
+    view = made.T_base_view
+    top = view @ frames.transform(np.diag([1.0, -1.0, -1.0]), [-0.5, 0.0, 0.29])
+    square = np.array([[-0.5, -0.05], [0.5, -0.05], [0.5, 0.0], [-0.5, 0.0]])
+    stem = Stem(made.centre, view[:3, 2], 0.25 * made.sizes.target.sphere_radius_m, 0.08)
+    seen = replace(made.sensor, far_m=0.4, dropouts=0.02, ghosts=0.05)
+    busy = replace(made, around=(Prism(top, square, 1.0), stem), sensor=seen)
+    found = solve(busy.measure(np.random.default_rng(6)), "best", busy)
+    assert found.verdict.accept
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(busy, found.T_flange_sensor)) < 4.0 * sigma)
+    assert found.residual_m.max() < 3.0 * busy.sensor.noise_m
 
 
 def part(arc: Arc, rows: slice) -> Arc:

@@ -24,6 +24,8 @@ CLEAR_M = 1e-3  # points so near to another part may be of either
 SMALLEST_SHARE = 0.03
 FEWEST_PATCH_POINTS = 100
 ROUNDS = 4
+SHORTEST_RUN_M = 3e-3
+WIDEST_GAP_M = 3e-3  # between neighbours on one part
 SHORTEST_SCAN_M = 0.02
 LARGEST_TURN_RAD = float(np.radians(5.0))
 
@@ -182,8 +184,28 @@ def parts_of(
     first, second = np.abs(cloud @ seen.normals.T - seen.offsets).T
     off_ball = distance > radius_m + CLEAR_M
     on_ball = np.abs(distance - radius_m) < NEAR_M
-    return (
-        scan.part((first < NEAR_M) & (second > CLEAR_M) & off_ball),
-        scan.part((second < NEAR_M) & (first > CLEAR_M) & off_ball),
-        scan.part(on_ball & (np.minimum(first, second) > CLEAR_M)),
+    chosen = (
+        (first < NEAR_M) & (second > CLEAR_M) & off_ball,
+        (second < NEAR_M) & (first > CLEAR_M) & off_ball,
+        on_ball & (np.minimum(first, second) > CLEAR_M),
     )
+    faces_and_ball = [_unbroken(scan.part(which)) for which in chosen]
+    return faces_and_ball[0], faces_and_ball[1], faces_and_ball[2]
+
+
+def _unbroken(scan: Scan) -> Scan:
+    """The longest run of points in each profile, where it is long enough.
+
+    A face ends where its plane meets a table; beyond, the crossing of both is a short run.
+    """
+    points, profile = scan.points, scan.profile
+    if not len(points):
+        return scan
+    apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > WIDEST_GAP_M
+    begins = np.flatnonzero(np.concatenate([[True], apart | (np.diff(profile) > 0)]))
+    ends = np.append(begins[1:], len(points)) - 1
+    extent = np.linalg.norm(points[ends] - points[begins], axis=1)
+    longest = np.full(len(scan.motion), SHORTEST_RUN_M)
+    np.maximum.at(longest, profile[begins], extent)
+    keep = extent >= longest[profile[begins]]
+    return scan.part(np.repeat(keep, ends - begins + 1))
