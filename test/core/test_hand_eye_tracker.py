@@ -189,6 +189,25 @@ def test_a_wild_tracker_point_is_named_and_left_out():
     assert np.all(np.abs(away[:3, 3]) < sigma[:3])
 
 
+@pytest.mark.parametrize("off_deg", [0.1, -0.05])
+def test_axes_that_are_not_quite_square(off_deg):
+    """Named, not rejected; the flange is midway between what either axis says."""
+    nominal = load_robot("p1r2p3")
+    mdh = np.array(nominal.mdh)
+    mdh[1, 3] += np.radians(off_deg)
+    made = prp_cell(nominal.with_mdh(mdh))
+    found = solve(replace(made.measure(np.random.default_rng(7)), arm=nominal), "best", made)
+    assert found.verdict.accept
+    assert not found.rejected
+    assert found.more["residual_over_noise"] < 1.2
+    # the line's direction is known to 0.015 mm / (75 mm sqrt(16)) = 0.003 deg
+    assert abs(found.more["axes_off_nominal"]["angle_deg"] - off_deg) < 4.0 * 0.003
+    half = frames.exp_rotation([-0.5 * np.radians(off_deg), 0.0, 0.0])
+    T = frames.transform(half, np.zeros(3)) @ found.T_flange_sensor
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(made, T)) < 4.0 * sigma)
+
+
 def test_spikes_in_the_profiles_do_no_harm():
     made = cell("prp")
     rng = np.random.default_rng(3)

@@ -19,9 +19,9 @@ from robocal_ros.core.hand_eye.tracker_classic import Classic, solve_classic
 from robocal_ros.core.hand_eye.tracker_cube import Cube
 from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.core.hand_eye.tracker_features import Lines, fit_caps, fit_lines
-from robocal_ros.core.hand_eye.tracker_flange import nominal_axis
 from robocal_ros.core.hand_eye.tracker_problem import TrackerProblem, sphere_in
 from robocal_ros.core.hand_eye.tracker_scan import Scan
+from robocal_ros.core.hand_eye.tracker_skew import AxisPair
 from robocal_ros.core.hand_eye.tracker_state import SENSOR, TrackerState
 
 Array = NDArray[np.float64]
@@ -67,7 +67,13 @@ def solve_tracker(
     z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
     spread = point_covariance(found, np.array([[0.0, 0.0, z]]))
     working_m = float(np.sqrt(np.trace(spread[0])))
-    more = {**found.more, "residual_over_noise": _misfit(estimate), "widened_by": estimate.scale}
+    angle, gap_m = estimate.state.mismatch.tolist()
+    more = {
+        **found.more,
+        "residual_over_noise": _misfit(estimate),
+        "widened_by": estimate.scale,
+        "axes_off_nominal": {"angle_deg": float(np.degrees(angle)), "gap_mm": gap_m * 1e3},
+    }
     verdict = _verdict(estimate, working_m, limit_m)
     return replace(found, working_error_m=working_m, verdict=verdict, more=more)
 
@@ -76,7 +82,7 @@ def _state(classic: Classic) -> TrackerState:
     cube = classic.tracked
     return TrackerState(
         classic.T_tracker_flange, classic.T_flange_sensor, classic.reflector,
-        cube.centre, cube.normals, cube.offsets,
+        cube.centre, cube.normals, cube.offsets, np.zeros(2),
     )  # fmt: skip
 
 
@@ -95,12 +101,11 @@ def solve_best(
     noise_m = max(scatter_m, SMALLEST_NOISE_M)
     lines = [_with_noise(lines, noise_m) for lines, _ in fits]
     state = _state(classic)
-    turning = next(i for i in (1, 0) if not classic.axes[i].slides)
-    axis, _ = nominal_axis(data, data.arcs[turning], classic.axes[turning].joint)
+    axes = AxisPair.of(data, classic.axes)
     for _ in range(ROUNDS):
         place = sphere_in(state.sensor_poses(data.motion), state.centre)
         caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m)
-        problem = TrackerProblem(data, target, noise, state, axis, lines, caps)
+        problem = TrackerProblem(data, target, noise, state, axes, lines, caps)
         estimate = solve(problem, state)
         state = estimate.state
     return problem, estimate

@@ -20,9 +20,11 @@ from robocal_ros.core.hand_eye.tracker_data import (
     TrackerTarget,
 )
 from robocal_ros.core.hand_eye.tracker_features import Caps, Lines
+from robocal_ros.core.hand_eye.tracker_skew import AxisPair
 from robocal_ros.core.hand_eye.tracker_state import (
     CENTRE,
     FLANGE,
+    MISMATCH,
     NAMES,
     NORMALS,
     OFFSETS,
@@ -45,7 +47,7 @@ class TrackerProblem:
     Attributes
     ----------
     start : the state at which the noise of the joints is turned into noise of the rows.
-    height_axis : (3,) of the flange, along which the reflector's height is given.
+    axes : of the arcs, by the nominal geometry.
     lines, caps : what the profiles show of the faces and of the sphere, noise included.
     """
 
@@ -53,7 +55,7 @@ class TrackerProblem:
     target: TrackerTarget
     noise: TrackerNoise
     start: TrackerState
-    height_axis: Array
+    axes: AxisPair
     lines: Sequence[Lines]
     caps: Caps
 
@@ -84,14 +86,16 @@ class TrackerProblem:
             found += [f"{name} {i + 1}" for i in range(len(points)) for _ in range(3)]
         for name, points in zip(("face_1", "face_2"), self.data.faces, strict=True):
             found += [f"{name} {i + 1}" for i in range(len(points))]
+        found += ["axes"] * 2
         found += ["height"] if self.target.height_m is not None else []
         profiles, _ = np.nonzero(self._seen)
         return tuple(found + [self.data.profiles[i].name for i in profiles.tolist()])
 
     def linearise(self, state: TrackerState) -> tuple[Array, Array]:
-        """Whitened rows (r, 1), and their Jacobian (r, 1, 24)."""
+        """Whitened rows (r, 1), and their Jacobian (r, 1, 26)."""
         parts = [self._arc(state, i) for i in (0, 1)]
         parts += [self._sphere(state), *(self._face(state, i) for i in (0, 1))]
+        parts.append(self._mismatch(state))
         if self.target.height_m is not None:
             parts.append(self._height(state))
         residual, J, _ = self._profiles(state)
@@ -104,7 +108,8 @@ class TrackerProblem:
 
     def _arc(self, state: TrackerState, which: int) -> tuple[Array, Array]:
         arc, white = self.data.arcs[which], self._arc_whitening[which]
-        T = self._motions[which]
+        share = self.axes.share_of(arc.q)
+        T = self.axes.carried(self._motions[which], state.mismatch, share)
         place = T[:, :3, :3] @ state.reflector + T[:, :3, 3]
         R, t = state.T_tracker_flange[:3, :3], state.T_tracker_flange[:3, 3]
         J = np.zeros((len(arc.points), 3, UNKNOWNS))
@@ -112,6 +117,7 @@ class TrackerProblem:
             [np.broadcast_to(R, (len(place), 3, 3)), -R @ frames.skew(place)], axis=2
         )
         J[..., REFLECTOR] = R @ T[:, :3, :3]
+        J[..., MISMATCH] = J[..., FLANGE] @ self.axes.twists(T, share)
         residual = place @ R.T + t - arc.points
         rows = white @ np.concatenate([residual[..., None], J], axis=2)
         return rows[..., 0].ravel(), rows[..., 1:].reshape(-1, UNKNOWNS)
@@ -130,15 +136,22 @@ class TrackerProblem:
         off = points @ normal - state.offsets[face] - self.target.reflector_radius_m
         return off / sigma, J
 
+    def _mismatch(self, state: TrackerState) -> tuple[Array, Array]:
+        J = np.zeros((2, UNKNOWNS))
+        J[:, MISMATCH] = np.diag(1.0 / self.axes.sigma)
+        return state.mismatch / self.axes.sigma, J
+
     def _height(self, state: TrackerState) -> tuple[Array, Array]:
+        axis = self.axes.height_axis
         sigma, height_m = self.target.height_sigma_m, self.target.height_m or 0.0
         J = np.zeros((1, UNKNOWNS))
-        J[0, REFLECTOR] = self.height_axis / sigma
-        return np.array([(self.height_axis @ state.reflector - height_m) / sigma]), J
+        J[0, REFLECTOR] = axis / sigma
+        return np.array([(axis @ state.reflector - height_m) / sigma]), J
 
     def _profiles(self, state: TrackerState) -> tuple[Array, Array, Array]:
-        """Rows (m, 7) of the profiles, their Jacobian (m, 7, 24), and by the sensor's twist."""
-        motion = self.data.motion
+        """Rows (m, 7) of the profiles, their Jacobian (m, 7, 26), and by the sensor's twist."""
+        share = self.axes.share_of(self.data.q)
+        motion = self.axes.carried(self.data.motion, state.mismatch, share)
         P = state.sensor_poses(motion)
         parts = [self._line(state, P, face) for face in (0, 1)] + [self._cap(state, P)]
         residual = np.concatenate([part[0] for part in parts], axis=1)
@@ -146,6 +159,7 @@ class TrackerProblem:
         J = np.concatenate([part[2] for part in parts], axis=1)
         J[..., SENSOR] = twist
         J[..., FLANGE] = twist @ adjoint(frames.invert(motion @ state.T_flange_sensor))
+        J[..., MISMATCH] = J[..., FLANGE] @ self.axes.twists(motion, share)
         return residual, J, twist
 
     def _line(self, state: TrackerState, P: Array, face: int) -> tuple[Array, Array, Array]:

@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 FLANGE, SENSOR = slice(0, 6), slice(6, 12)
 REFLECTOR, CENTRE = slice(12, 15), slice(15, 18)
 NORMALS = (slice(18, 20), slice(20, 22))
-OFFSETS = slice(22, 24)
-UNKNOWNS = 24
+OFFSETS, MISMATCH = slice(22, 24), slice(24, 26)
+UNKNOWNS = 26
 NAMES = tuple(
     f"{what} {axis}"
     for what, axes in (
@@ -24,6 +24,7 @@ NAMES = tuple(
         ("face_1", ("tilt", "turn")),
         ("face_2", ("tilt", "turn")),
         ("face offset", ("1", "2")),
+        ("axes", ("angle", "gap")),
     )
     for axis in axes
 )
@@ -38,6 +39,7 @@ class TrackerState:
     T_tracker_flange : (4, 4) at the first profile; T_flange_sensor (4, 4).
     reflector : (3,) in the flange; ``centre`` (3,) of the sphere, tracker.
     normals, offsets : (2, 3) and (2,) of the faces, outward, tracker.
+    mismatch : (2,) of the axes' angle and gap, real minus nominal.
     """
 
     T_tracker_flange: Array
@@ -46,9 +48,10 @@ class TrackerState:
     centre: Array
     normals: Array
     offsets: Array
+    mismatch: Array
 
     def moved(self, step: Array) -> "TrackerState":
-        """The state after an increment (24,)."""
+        """The state after an increment (26,)."""
         tilts = np.array(
             [tangents(n) @ step[part] for n, part in zip(self.normals, NORMALS, strict=True)]
         )
@@ -60,6 +63,7 @@ class TrackerState:
             centre=self.centre + step[CENTRE],
             normals=normals / np.linalg.norm(normals, axis=1)[:, None],
             offsets=self.offsets + step[OFFSETS],
+            mismatch=self.mismatch + step[MISMATCH],
         )
 
     def sensor_poses(self, motion: Array) -> Array:
