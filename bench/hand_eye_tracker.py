@@ -156,7 +156,7 @@ def bound_table() -> Table:
     return table
 
 
-def effects_table(runs: int = 12) -> Table:
+def effects_table(runs: int = 10) -> Table:
     """What each circumstance does to both methods."""
     table = Table(
         "hand_eye_tracker_effects",

@@ -174,7 +174,7 @@ def _result(
         verdict=verdict,
         rejected=dict.fromkeys(names[~seen].tolist(), "shows neither the faces nor the sphere"),
         target={
-            "centre_tracker_mm": (state.centre * 1e3).tolist(),
+            "center_tracker_mm": (state.centre * 1e3).tolist(),
             "face_angle_deg": float(np.degrees(cube.angle)),
             "sphere_height_mm": (cube.heights * 1e3).tolist(),
         },

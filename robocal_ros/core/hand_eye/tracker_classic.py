@@ -16,7 +16,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
 from robocal_ros.core.hand_eye.tracker_cube import (
-    SMALLEST_ANGLE,
+    PARALLEL_FACES,
     Cube,
     fit_plane,
     outward,
@@ -38,7 +38,7 @@ Index = NDArray[np.int64]
 THINNED = 6000  # points that are enough to find the parts
 FEW = 500  # points that are enough for a face while the direction is searched
 MOST_ROUNDS = 150
-SEARCHED, SETTLED = 1e-6, 1e-8  # change of the rotation's entries
+SEARCHED, SETTLED = 1e-5, 1e-8  # change of the rotation's entries
 PLACED = 1e-6
 MATCH_M = 5e-4  # of the sphere's heights, and of the faces' angle over ARM_M
 ARM_M = 0.05
@@ -186,7 +186,7 @@ class _Search:
             normals = _cube(faces, X, np.zeros(3)).normals
             if normals[:, 2].max() > 0.0:  # the sensor sees no face from behind
                 return None
-            if np.linalg.norm(np.cross(*normals)) < SMALLEST_ANGLE:
+            if abs(normals[0] @ normals[1]) > PARALLEL_FACES:
                 return None
             R = self.T_tracker_flange[:3, :3].T @ measured @ two_axis_frame(*normals).T
             change = float(np.abs(R - X[:3, :3]).max())

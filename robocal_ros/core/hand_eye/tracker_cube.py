@@ -20,7 +20,7 @@ NARROWEST_M = 5e-3  # rms extent of the points on a face in its narrower directi
 REJECT = 5.0  # standard deviations
 LARGEST_SCATTER = 10.0  # of the points of a face, over the tracker's noise
 MAD = 1.4826  # standard deviation by the median distance
-SMALLEST_ANGLE = float(np.sin(np.radians(20.0)))
+PARALLEL_FACES = float(np.cos(np.radians(20.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def tracked_cube(
         *(_tracked_face(f"face_{i + 1}", points, sigma_m) for i, points in enumerate(faces))
     )
     normals = np.array([first.normal, second.normal])
-    if np.linalg.norm(np.cross(*normals)) < SMALLEST_ANGLE:
+    if abs(normals[0] @ normals[1]) > PARALLEL_FACES:
         raise RankDeficientError(
             "face_1 and face_2 are parallel: touch two faces that meet in an edge",
             ["turn about the normal of the faces"],

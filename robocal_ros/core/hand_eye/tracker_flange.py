@@ -58,9 +58,12 @@ def two_axis_frame(first: Array, second: Array) -> Array:
     one from the sensor's are made in the same way.
     """
     middle, across = first + second, first - second
-    middle, across = middle / np.linalg.norm(middle), across / np.linalg.norm(across)
-    x, y = (middle + across) / np.sqrt(2.0), (middle - across) / np.sqrt(2.0)
-    return np.column_stack([x, y, np.cross(x, y)])
+    middle, across = (
+        middle / np.sqrt(2.0 * (middle @ middle)),
+        across / np.sqrt(2.0 * (across @ across)),
+    )
+    x, y = middle + across, middle - across
+    return np.column_stack([x, y, frames.skew(x) @ y])
 
 
 def fit_axis(arc: Arc, joint: int, slides: bool, sigma_m: float) -> Axis:
