@@ -38,7 +38,9 @@ Index = NDArray[np.int64]
 THINNED = 6000  # points that are enough to find the parts
 FEW = 500  # points that are enough for a face while the direction is searched
 MOST_ROUNDS = 150
-SEARCHED, SETTLED = 1e-5, 1e-8  # change of the rotation's entries
+SEARCHED, SETTLED = 1e-5, 1e-9  # rad
+MOST_TURNS, PLAIN_TURNS = 40, 4
+TRIAL, LONGEST_STEP = 1e-5, 0.3  # rad, of Newton's method
 PLACED = 1e-6
 MATCH_M = 5e-4  # of the sphere's heights, and of the faces' angle over ARM_M
 ARM_M = 0.05
@@ -180,20 +182,42 @@ class _Search:
         return matches, failures
 
     def _turned(self, faces: tuple[Scan, Scan], X: Array, settled: float) -> Array | None:
-        """T_flange_sensor whose rotation builds the scan that gives it; None when none does."""
-        measured = two_axis_frame(*self.tracked.normals)
-        for _ in range(MOST_ROUNDS):
-            normals = _cube(faces, X, np.zeros(3)).normals
-            if normals[:, 2].max() > 0.0:  # the sensor sees no face from behind
+        """T_flange_sensor whose rotation builds the scan that gives it; None when none does.
+
+        The source's iteration first; then Newton's, which also settles where that creeps.
+        """
+        R, t = X[:3, :3], X[:3, 3]
+        for turn in range(MOST_TURNS):
+            miss = self._miss(faces, R, t)
+            if miss is None:
                 return None
-            if abs(normals[0] @ normals[1]) > PARALLEL_FACES:
-                return None
-            R = self.T_tracker_flange[:3, :3].T @ measured @ two_axis_frame(*normals).T
-            change = float(np.abs(R - X[:3, :3]).max())
-            X = frames.transform(R, X[:3, 3])
-            if change < settled:
-                return X
+            step = miss
+            if turn >= PLAIN_TURNS:
+                moved = [
+                    self._miss(faces, R @ frames.exp_rotation(e), t) for e in TRIAL * np.eye(3)
+                ]
+                found = [column for column in moved if column is not None]
+                if len(found) < 3:
+                    return None
+                newton = np.linalg.lstsq(
+                    np.array(found).T - miss[:, None], -TRIAL * miss, rcond=None
+                )[0]
+                step = newton if np.linalg.norm(newton) < LONGEST_STEP else miss
+            R = R @ frames.exp_rotation(step)
+            if np.linalg.norm(step) < settled:
+                return frames.transform(R, t)
         return None
+
+    def _miss(self, faces: tuple[Scan, Scan], R: Array, t: Array) -> Array | None:
+        """Turn (3,) from a rotation to the one that the scan built with it gives."""
+        normals = _cube(faces, frames.transform(R, t), np.zeros(3)).normals
+        if normals[:, 2].max() > 0.0:  # the sensor sees no face from behind
+            return None
+        if abs(normals[0] @ normals[1]) > PARALLEL_FACES:
+            return None
+        measured = two_axis_frame(*self.tracked.normals)
+        image = self.T_tracker_flange[:3, :3].T @ measured @ two_axis_frame(*normals).T
+        return frames.log_rotation(R.T @ image)
 
     def _placed(self, faces: tuple[Scan, Scan], ball: Scan, X: Array) -> _Match | None:
         """The match with the place of the sensor too, from the sphere; None when none settles."""
