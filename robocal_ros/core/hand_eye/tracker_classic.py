@@ -191,22 +191,20 @@ class _Search:
             miss = self._miss(faces, R, t)
             if miss is None:
                 return None
-            step = miss
-            if turn >= PLAIN_TURNS:
-                moved = [
-                    self._miss(faces, R @ frames.exp_rotation(e), t) for e in TRIAL * np.eye(3)
-                ]
-                found = [column for column in moved if column is not None]
-                if len(found) < 3:
-                    return None
-                newton = np.linalg.lstsq(
-                    np.array(found).T - miss[:, None], -TRIAL * miss, rcond=None
-                )[0]
-                step = newton if np.linalg.norm(newton) < LONGEST_STEP else miss
+            step = miss if turn < PLAIN_TURNS else self._newton(faces, R, t, miss)
             R = R @ frames.exp_rotation(step)
             if np.linalg.norm(step) < settled:
                 return frames.transform(R, t)
         return None
+
+    def _newton(self, faces: tuple[Scan, Scan], R: Array, t: Array, miss: Array) -> Array:
+        """Newton's step (3,) where it is a sound one, else the plain one."""
+        tried = [self._miss(faces, R @ frames.exp_rotation(e), t) for e in TRIAL * np.eye(3)]
+        columns = [other - miss for other in tried if other is not None]
+        if len(columns) < 3:
+            return miss
+        step = np.asarray(np.linalg.lstsq(np.array(columns).T, -TRIAL * miss, rcond=None)[0])
+        return step if np.linalg.norm(step) < LONGEST_STEP else miss
 
     def _miss(self, faces: tuple[Scan, Scan], R: Array, t: Array) -> Array | None:
         """Turn (3,) from a rotation to the one that the scan built with it gives."""

@@ -115,30 +115,36 @@ def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
     away = np.insert(scan.points, 1, 0.0, axis=1) - place[scan.profile]
     distance = np.linalg.norm(away, axis=1)
     normal = away / distance[:, None]
-    facing = normal[:, 2] < -STEEPEST
-    miss = np.where(facing, (distance - radius_m) / np.where(facing, normal[:, 2], 1.0), np.inf)
-    # a wrong place shifts all points of a profile alike: outliers are judged about their median
-    limit = REJECT * max(noise_m, _MAD * float(np.median(np.abs(miss[facing]))))
-    used = facing & (np.abs(miss) < limit)
-    count = np.bincount(scan.profile[used], minlength=m)
-    used &= (count >= FEWEST_POINTS)[scan.profile]
-    if np.sum(used) < FEWEST_LINES * FEWEST_POINTS:
-        raise TooFewSamplesError(f"{np.sum(used)} points show the sphere: scan more of it")
-    profile, r = scan.profile[used], miss[used] / noise_m
-    J = -normal[used] / (normal[used, 2:] * noise_m)
-    information = np.empty((m, 3, 3))
-    gradient = np.empty((m, 3))
-    for i in range(3):
-        gradient[:, i] = np.bincount(profile, J[:, i] * r, m)
-        for j in range(3):
-            information[:, i, j] = np.bincount(profile, J[:, i] * J[:, j], m)
-    size, axes = np.linalg.eigh(information)
-    seen = size > FAINT * max(float(size.max()), np.finfo(float).tiny)
+    used = normal[:, 2] < -STEEPEST
+    z = np.where(used, normal[:, 2], 1.0)
+    r, J = (distance - radius_m) / (z * noise_m), -normal / (z * noise_m)[:, None]
+    for last in (False, True):
+        used &= (np.bincount(scan.profile[used], minlength=m) >= FEWEST_POINTS)[scan.profile]
+        if np.sum(used) < FEWEST_LINES * FEWEST_POINTS:
+            raise TooFewSamplesError(f"{np.sum(used)} points show the sphere: scan more of it")
+        information, gradient = _sums(J[used], r[used], scan.profile[used], m)
+        size, axes = np.linalg.eigh(information)
+        seen = size > FAINT * float(size.max())
+        turned = np.einsum("mij,mi->mj", axes, gradient)
+        if not last:  # a place that is off, or a joint's error, shifts a profile as a whole
+            shift = np.einsum(
+                "mij,mj->mi", axes, np.where(seen, turned / np.where(seen, size, 1.0), 0.0)
+            )
+            used &= np.abs(r - np.sum(J * shift[scan.profile], axis=1)) < REJECT
     length = np.sqrt(np.where(seen, size, 1.0))
-    turned = np.einsum("mij,mi->mj", axes, gradient)
     return Caps(
         place=place,
         root=np.where(seen, length, 0.0)[:, :, None] * np.swapaxes(axes, 1, 2),
         offset=np.where(seen, turned / length, 0.0),
         seen=seen,
     )
+
+
+def _sums(J: Array, r: Array, profile: NDArray[np.int64], m: int) -> tuple[Array, Array]:
+    """Normal matrix (m, 3, 3) and gradient (m, 3) of the points of each profile."""
+    information, gradient = np.empty((m, 3, 3)), np.empty((m, 3))
+    for i in range(3):
+        gradient[:, i] = np.bincount(profile, J[:, i] * r, m)
+        for j in range(3):
+            information[:, i, j] = np.bincount(profile, J[:, i] * J[:, j], m)
+    return information, gradient

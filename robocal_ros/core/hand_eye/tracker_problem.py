@@ -224,10 +224,15 @@ class TrackerProblem:
         return np.linalg.inv(np.linalg.cholesky(covariance))
 
     def _joint_errors(self, q: Array) -> Array:
-        """Twists (n, 6, dof) of the flange, its own axes, by one sigma of each joint that moves."""
+        """Twists (n, 6, dof) of the flange, its own axes, by one sigma of each joint.
+
+        A joint that stands still for an arc has no error; where several move, none stands still.
+        """
         arm = self.data.arm
         sigma = np.where(arm.prismatic, self.noise.joint_m, self.noise.joint_rad)
-        sigma = np.where(np.ptp(q, axis=0) > MOVED, sigma, 0.0)
+        moved = np.ptp(q, axis=0) > MOVED
+        if np.sum(moved) == 1:
+            sigma = np.where(moved, sigma, 0.0)
         R = np.swapaxes(arm.fk(q)[:, :3, :3], 1, 2)
         J = arm.jacobian(q)
         return np.asarray(np.concatenate([R @ J[:, :3], R @ J[:, 3:]], axis=1) * sigma)
