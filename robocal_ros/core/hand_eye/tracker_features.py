@@ -112,12 +112,14 @@ def fit_caps(scan: Scan, place: Array, radius_m: float, noise_m: float) -> Caps:
         When hardly anything of it is seen.
     """
     m = len(scan.motion)
-    away = np.insert(scan.points, 1, 0.0, axis=1) - place[scan.profile]
-    distance = np.linalg.norm(away, axis=1)
-    normal = away / distance[:, None]
-    used = normal[:, 2] < -STEEPEST
-    z = np.where(used, normal[:, 2], 1.0)
-    r, J = (distance - radius_m) / (z * noise_m), -normal / (z * noise_m)[:, None]
+    # Where the ball is seen at each x: the measured z, being noisy, must not enter the normals.
+    x, z = scan.points.T
+    side = x - place[scan.profile, 0], -place[scan.profile, 1]
+    depth = radius_m**2 - side[0] ** 2 - side[1] ** 2
+    used = depth > (STEEPEST * radius_m) ** 2
+    front = -np.sqrt(np.where(used, depth, radius_m**2))
+    r = (z - place[scan.profile, 2] - front) / noise_m
+    J = -np.column_stack([side[0] / front, side[1] / front, np.ones(len(x))]) / noise_m
     for last in (False, True):
         used &= (np.bincount(scan.profile[used], minlength=m) >= FEWEST_POINTS)[scan.profile]
         if np.sum(used) < FEWEST_LINES * FEWEST_POINTS:
