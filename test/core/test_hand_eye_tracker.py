@@ -17,6 +17,8 @@ from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.tracker import solve_best, solve_tracker, spread
 from robocal_ros.core.hand_eye.tracker_classic import solve_classic
 from robocal_ros.core.hand_eye.tracker_data import Arc, TrackerData
+from robocal_ros.core.hand_eye.tracker_features import fit_caps
+from robocal_ros.core.hand_eye.tracker_scan import Scan
 from robocal_ros.core.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
 from robocal_ros.sim.laser_tracker import TrackerCell
 from robocal_ros.sim.profile_targets import Prism, Stem
@@ -119,6 +121,22 @@ def test_the_jacobian_is_the_derivative():
         slope = (ahead - back) / (2.0 * step)
         scale = np.abs(jacobian[..., k]).max()
         assert np.abs(slope - jacobian[..., k]).max() < 1e-5 * scale
+
+
+def test_noise_of_the_points_leaves_a_balls_place_unbiased():
+    """The same profile of a ball 2000 times: the mean pull on its centre, chi-square."""
+    m, radius, noise = 2000, 0.01905, 3.7e-5
+    centre = np.array([0.0, 0.008, 0.21])
+    x = np.linspace(-0.015, 0.011, 260)
+    z = centre[2] - np.sqrt(radius**2 - centre[1] ** 2 - (x - centre[0]) ** 2)
+    rng = np.random.default_rng(8)
+    points = np.column_stack([np.tile(x, m), np.tile(z, m) + noise * rng.standard_normal(260 * m)])
+    scan = Scan(points, np.repeat(np.arange(m), 260), np.broadcast_to(np.eye(4), (m, 4, 4)))
+    caps = fit_caps(scan, np.tile(centre, (m, 1)), radius, noise)
+    pull = np.einsum("mij,mi->mj", caps.root, caps.offset).mean(axis=0)
+    information = np.einsum("mij,mik->jk", caps.root, caps.root) / m
+    chi2 = m * pull @ np.linalg.solve(information, pull)
+    assert chi2 < 25.0  # of 3 degrees of freedom: chance 2e-5
 
 
 def test_the_adjoint_carries_twists_across_a_transform():
