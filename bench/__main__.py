@@ -28,6 +28,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
     from bench import (
         files,
         hand_eye_camera,
+        hand_eye_tracker,
         monte_carlo,
         real_data,
         speed,
@@ -48,6 +49,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "thermal": thermal.tables,
         "tool": tool.tables,
         "hand_eye_camera": hand_eye_camera.tables,
+        "hand_eye_tracker": hand_eye_tracker.tables,
         "speed": speed.tables,
         "startup": start,
         "files": lambda: [files.file_times()],
