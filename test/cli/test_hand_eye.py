@@ -17,6 +17,7 @@ from hand_eye_tables import (
     RADIUS_M,
     ROBOT_M,
     SHOTS,
+    STAIRS,
     T_BASE_USER,
     TRUE,
     hand_eye_tables,
@@ -33,7 +34,8 @@ from robocal_ros.sim.hand_eye_cell import ArmRobot, Shots, View, view
 from robocal_ros.sim.hand_eye_sets import DOWN, sphere_shots
 from robocal_ros.sim.profile_targets import ball_on_table
 from robocal_ros.sim.ur10_station import Q_NEAR
-from robocal_ros.storage.hand_eye_tables import write_pose_table
+from robocal_ros.storage.hand_eye_files import read_flange_mount
+from robocal_ros.storage.hand_eye_tables import read_pose_table, write_pose_table
 from robocal_ros.storage.hand_eye_targets import write_target
 from robocal_ros.storage.robots import load_robot
 
@@ -412,6 +414,22 @@ class TestPlan:
         again = robocal(*self.plan(kind, one, mount, *known, "--limit-mm", 0.3))
         assert again["verdict"]["accept"], again["verdict"]
         assert again["working_error_mm"] == pytest.approx(found["proposed_error_mm"], rel=0.02)
+
+    def test_marks_of_proposed_poses(self, made, mount, tmp_path):
+        """The light of each lies on the mark that is told, by the place of the stairs."""
+        poses = tmp_path / "poses.csv"
+        rows = (made / "step" / "poses.csv").read_text().splitlines()
+        poses.write_text("\n".join(rows[:2]) + "\n")
+        more = tmp_path / "more.csv"
+        run = self.plan("step", poses, mount, *target(made / "step"), "--propose", more)
+        found = robocal(*run, "--limit-mm", 0.05)
+        written = read_pose_table(more, None, None)
+        assert list(written.mark) == found["proposed_marks"]
+        assert len(written) == len(found["proposed"]) > 1
+        for T_base_flange, mark in zip(written.T_base_flange, written.mark, strict=True):
+            T = frames.invert(T_base_flange @ read_flange_mount(mount))
+            lit = T[:3, :3] @ STAIRS.middle(mark) + T[:3, 3]
+            assert abs(lit[1]) < 1e-3
 
     def test_turns_about_one_axis_are_named(self, mount, tmp_path):
         cell = replace(CELL, tilt_rad=0.0)
