@@ -36,9 +36,8 @@ def linear_mounts(T_base_flange: Array, centres: Array) -> Array:
     A = (A - A.mean(axis=1, keepdims=True)).reshape(p, 3 * m, 12)
     b = -(place - place.mean(axis=0)).reshape(-1)
     solution = np.linalg.pinv(A, rcond=1e-9) @ b
-    U, _, Vt = np.linalg.svd(solution[:, :9].reshape(p, 3, 3))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return frames.transform(U @ Vt, solution[:, 9:])
+    turn = frames.nearest_rotation(solution[:, :9].reshape(p, 3, 3))
+    return frames.transform(turn, solution[:, 9:])
 
 
 def _placed(T_base_flange: Array, turn: Array, centres: Array) -> tuple[Array, Array]:
