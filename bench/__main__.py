@@ -25,7 +25,7 @@ KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
-    from bench import files, monte_carlo, real_data, speed, startup, thermal, tool
+    from bench import files, hand_eye, monte_carlo, real_data, speed, startup, thermal, tool
 
     def start() -> Sequence[Table]:
         if startup.EXECUTABLES.is_dir():
@@ -38,6 +38,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "monte_carlo": monte_carlo.tables,
         "thermal": thermal.tables,
         "tool": tool.tables,
+        "hand_eye": hand_eye.tables,
         "speed": speed.tables,
         "startup": start,
         "files": lambda: [files.file_times()],
