@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.errors import RankDeficientError
+from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.core.estimation import solve
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
 from robocal_ros.core.hand_eye.sightings import Sightings
@@ -19,7 +19,7 @@ KEPT = 8
 PARTS = 50  # of the corners that are tried
 ALIKE_M = 1e-6  # small, so that the descent goes to the very minimum
 SEED = 5  # of the fixed set of trials
-NO_STRETCH = 1e-6  # of the largest singular value, below which corners are on one line
+NO_STRETCH = 2e-3  # of their length: corners that lie on one line but for so much
 
 
 def linear_corners(value: Array, p_flange: Array) -> Array:
@@ -29,9 +29,13 @@ def linear_corners(value: Array, p_flange: Array) -> Array:
 
     Raises
     ------
+    TooFewSamplesError
+        Fewer than three corners.
     RankDeficientError
         When all corners lie on one line of the laser plane.
     """
+    if len(value) < 3:
+        raise TooFewSamplesError(f"{len(value)} corners fit the target, at least 3 are needed")
     X, seen = _linear(value, p_flange)
     if not seen:
         words = "rotation about the line of the corners"
@@ -70,7 +74,7 @@ def _linear(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
     columns = np.linalg.pinv(A) @ p_flange  # rows r1, r3, t
     r1, r3, t = np.moveaxis(columns, -2, 0)
     R = frames.nearest_rotation(np.stack([r1, np.cross(r3, r1), r3], axis=-1))
-    return frames.transform(R, t), np.sum(s[..., 1:2], axis=-1) > NO_STRETCH * s[..., 0]
+    return frames.transform(R, t), np.asarray(s[..., 1] > NO_STRETCH * s[..., 0])
 
 
 def _miss(X: Array, value: Array, p_flange: Array) -> Array:

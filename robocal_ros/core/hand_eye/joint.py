@@ -10,7 +10,7 @@ from robocal_ros.core.hand_eye.mount_fit import fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.result import HandEyeResult
-from robocal_ros.core.hand_eye.solve import best_fit, result_of
+from robocal_ros.core.hand_eye.solve import look, result_of
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task
 
 Part = tuple[Task, HandEyeData]
@@ -65,11 +65,13 @@ def _read(parts: Sequence[Part]) -> list[Read]:
 
 
 def _first(parts: Sequence[Part], reads: Sequence[Read], settings: HandEyeSettings) -> MountState:
+    """The pose of the sensor from the target that shows it best alone."""
     failure: RobocalError | None = None
     fits = []
     for (task, _), read in zip(parts, reads, strict=True):
         try:
-            fits.append(best_fit(task, read.view, settings))
+            near = look(task, read.view)
+            fits.append(fit_mount((read.view,), near, settings.noise()))
         except RobocalError as error:
             failure = failure or error
     if not fits:

@@ -1,6 +1,7 @@
 """Common mistakes in the data, recognised because undoing them makes everything fit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,9 @@ from robocal_ros.core.hand_eye.mount_fit import MountFit
 Array = NDArray[np.float64]
 
 CLEARLY = 0.2  # of the misfit as given: below it the undone data are the right ones
-MOST_LOST = 0.34
 FITS = 5.0  # times the rms of the others
 
-_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+LEFT_HANDED = "they come from a left-handed frame: turn one axis round"
 
 
 def _scaled(factor: float) -> Callable[[Array], Array]:
@@ -23,6 +23,19 @@ def _scaled(factor: float) -> Callable[[Array], Array]:
         return frames.transform(T[:, :3, :3], factor * T[:, :3, 3])
 
     return scale
+
+
+_FLIP = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def _mirrored(T: Array) -> Array:
+    return np.asarray(_FLIP @ T @ _FLIP)
+
+
+def _mirrored_place(T: Array, axis: int) -> Array:
+    mirrored = T.copy()
+    mirrored[:, axis, 3] *= -1.0
+    return mirrored
 
 
 MISTAKES: tuple[tuple[str, Callable[[Array], Array]], ...] = (
@@ -35,9 +48,13 @@ MISTAKES: tuple[tuple[str, Callable[[Array], Array]], ...] = (
         lambda T: np.roll(T, 1, axis=0),
     ),
     ("the poses fit when inverted: give the flange in the base, not the base in it", frames.invert),
-    (
-        "the poses fit when mirrored: they come from a left-handed frame; turn one axis round",
-        lambda T: _MIRROR @ T @ _MIRROR,
+    (f"the poses fit when mirrored as a whole: {LEFT_HANDED}", _mirrored),
+    *(
+        (
+            f"the poses fit with {axis} of their positions negated: {LEFT_HANDED}",
+            partial(_mirrored_place, axis=number),
+        )
+        for number, axis in enumerate("xyz")
     ),
     (
         "the poses fit when 1000 times larger: their positions are in m where mm are expected",
@@ -51,31 +68,31 @@ MISTAKES: tuple[tuple[str, Callable[[Array], Array]], ...] = (
 """What is wrong, in words, and what undoes it: poses (m, 4, 4) as they should have been."""
 
 
-def misfit(fit: MountFit) -> float:
-    """Median distance of the sightings used, m; more where many were thrown away."""
-    used = len(fit.names)
-    lost = len(fit.rejected) / max(used + len(fit.rejected), 1)
-    return float(np.median(fit.distances())) * (1.0 if lost < MOST_LOST else 1e3)
+def undone(
+    misfit_with: Callable[[Array], float], T_base_flange: Array
+) -> Iterator[tuple[str, Callable[[], float]]]:
+    """Each mistake in poses (m, 4, 4) in words, and the misfit, m, once it is undone.
 
-
-def explain(
-    refit: Callable[[Array], MountFit], T_base_flange: Array, as_given_m: float
-) -> str | None:
-    """Say which mistake in the poses (m, 4, 4) explains a misfit; None where none does.
-
-    ``refit`` solves with other poses; ``as_given_m`` is the `misfit` of the poses as they are.
+    ``misfit_with`` solves with other poses.
     """
-    for words, undone in MISTAKES:
+    for words, undo in MISTAKES:
+        yield words, partial(misfit_with, undo(T_base_flange))
+
+
+def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: float) -> str | None:
+    """The words of the suspect with the smallest misfit; None where none is clearly better."""
+    best, least = None, CLEARLY * as_given_m
+    for words, misfit in suspects:
         try:
-            fit = refit(undone(T_base_flange))
+            found = misfit()
         except RobocalError:
             continue
-        if misfit(fit) < CLEARLY * as_given_m:
-            return words
-    return None
+        if found < least:
+            best, least = words, found
+    return best
 
 
-def swapped(fit: MountFit, lost: "MountFit") -> dict[str, str]:
+def swapped(fit: MountFit, lost: MountFit) -> dict[str, str]:
     """Which rejected sightings fit the pose of another rejected one: names and reasons.
 
     ``lost`` holds the rejected sightings under the same state.

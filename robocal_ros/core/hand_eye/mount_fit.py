@@ -22,6 +22,7 @@ from robocal_ros.core.observability import observability
 
 Array = NDArray[np.float64]
 
+LOOKS = 3
 ROUNDS = 8
 SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
@@ -105,11 +106,16 @@ def fit_mount(
     )
 
 
-def first_look(views: tuple[View, ...], start: MountState, noise: PoseNoise | None) -> MountState:
-    """Where a start leads, robustly and before the noise is known. Raises as `fit_mount`."""
+def first_look(views: tuple[View, ...], start: MountState) -> MountState:
+    """Where a start leads, robustly, the noise as the misfit tells it. Raises as `fit_mount`.
+
+    So a state that is far off, or poses that cannot fit, are not followed to the last digit.
+    """
     state = start
-    for _ in range(2):  # the first weights are taken at the start, which may be far off
-        problem = MountProblem(views, noise or FIRST_NOISE, state, together=False)
+    for _ in range(LOOKS):
+        off = float(np.median(distances(views, state)))
+        noise = PoseNoise(max(off, FIRST_NOISE.sigma_m), FIRST_NOISE.sigma_rad, FIRST_NOISE.aim_m)
+        problem = MountProblem(views, noise, state, together=False)
         state = _solved(problem, state).state
     return state
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.mistakes import explain, misfit, swapped
+from robocal_ros.core.hand_eye.mistakes import explain, swapped, undone
 from robocal_ros.core.hand_eye.mount_fit import (
     MountFit,
     distances,
@@ -83,49 +85,62 @@ def solve_task(
         A mark that the target does not have.
     """
     read = task.read(data)
-    fit = best_fit(task, read.view, settings)
-    as_given = misfit(fit)
-    if as_given > DOUBTFUL_M:
-        _require_no_mistake(task, data, fit, settings, as_given)
+    near = look(task, read.view)
+    _require_no_mistake(task, data, read.view, near)
+    fit = fit_mount((read.view,), near, settings.noise())
     require_radius(fit)
+    require_seen(fit, float(np.abs(read.view.sightings.value[:, 1]).mean()))
     if method == "classic":
         return _classic(task, read, fit.state, len(data.names), settings)
     return result_of([task], fit, [read], data, settings)
 
 
-def best_fit(task: Task, view: View, settings: HandEyeSettings) -> MountFit:
-    """The most likely fit, from the start that leads nearest to the sightings.
+def look(task: Task, view: View) -> MountState:
+    """The state nearest to the sightings to which a start leads, before the noise is known.
 
     Raises
     ------
     TooFewSamplesError, RankDeficientError
         When none leads anywhere.
     """
-    noise = settings.noise()
     states: list[MountState] = []
     failure: RobocalError | None = None
     for start in task.starts(view):
         try:
-            states.append(first_look((view,), start, noise))
+            states.append(first_look((view,), start))
         except RobocalError as error:
             failure = failure or error
             if isinstance(error, RankDeficientError):
                 break  # it lies in the poses, not in the start
     if not states:
         raise failure or RobocalError("no start was found")
-    nearest = min(states, key=lambda state: float(np.median(distances((view,), state))))
-    fit = fit_mount((view,), nearest, noise)
-    require_seen(fit, float(np.abs(view.sightings.value[:, 1]).mean()))
-    return fit
+    return min(states, key=lambda state: misfit(view, state))
 
 
-def _require_no_mistake(
-    task: Task, data: HandEyeData, fit: MountFit, settings: HandEyeSettings, as_given: float
-) -> None:
-    def refit(T_base_flange: Array) -> MountFit:
-        return best_fit(task, task.read(replace(data, T_base_flange=T_base_flange)).view, settings)
+def misfit(view: View, state: MountState) -> float:
+    """Median distance of sightings from their target, m."""
+    return float(np.median(distances((view,), state)))
 
-    words = explain(refit, data.T_base_flange, as_given)
+
+def _require_no_mistake(task: Task, data: HandEyeData, view: View, near: MountState) -> None:
+    as_given = misfit(view, near)
+    if as_given < DOUBTFUL_M:
+        return
+
+    def followed(task: Task, view: View) -> float:
+        first = task.starts(view)[0]
+        if (off := misfit(view, first)) > as_given:  # not worth following
+            return off
+        return misfit(view, first_look((view,), first))
+
+    def with_poses(T_base_flange: Array) -> float:
+        return followed(task, task.posed(view, replace(data, T_base_flange=T_base_flange)))
+
+    def as_told(other: Task) -> float:
+        return followed(other, other.read(data).view)
+
+    told = ((words, partial(as_told, other)) for words, other in task.suspects())
+    words = explain(chain(undone(with_poses, data.T_base_flange), told), as_given)
     if words is not None:
         raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")
 

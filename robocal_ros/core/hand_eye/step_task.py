@@ -1,7 +1,7 @@
 """The staircase: corners at known places, laid under the laser mark by mark."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.sightings import Sightings
 from robocal_ros.core.hand_eye.target_models import CornerModel
 from robocal_ros.core.hand_eye.targets import StepTarget
-from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, seen, usable
+from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task, seen, usable
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -46,10 +46,14 @@ class StepTask:
         miss = [float(np.median(_distances(v, X))) for v, X in zip(views, starts, strict=True)]
         turned = miss[0] > TURNED_M and miss[1] < TURNED * miss[0]
         start = MountState(starts[int(turned)], (self.target.T_base_user,))
-        near = first_look((views[int(turned)],), start, None)
+        near = first_look((views[int(turned)],), start)
         view = reader.view(reader.predicted(near.T_flange_sensor))
         usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
         return Read(view, reader.rejected)
+
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Which corner is which depends on the poses."""
+        return self.read(data).view
 
     def starts(self, view: View) -> list[MountState]:
         """The closed form of the corners that agree."""
@@ -72,6 +76,13 @@ class StepTask:
     def more(self, fit: MountFit, read: Read) -> Document:
         """How well the light was laid on the marks."""
         return {"aim_sigma_mm": fit.noise.aim_m * 1e3}
+
+    def suspects(self) -> Iterable[tuple[str, Task]]:
+        """The corners in a left-handed frame."""
+        mirror = np.array([-1.0, 1.0, 1.0])
+        other = {mark: mirror * corners for mark, corners in self.target.corners.items()}
+        words = "the corners fit when their x is negated: the target file is left-handed"
+        return ((words, replace(self, target=replace(self.target, corners=other))),)
 
     def model(self, corner_user: Array) -> CornerModel:
         """Corners (m, 3), user frame, with what is known of that frame."""

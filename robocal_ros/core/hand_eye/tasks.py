@@ -1,7 +1,7 @@
 """One task per target: read its features from profiles, start, solve in the classic way."""
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -22,6 +22,8 @@ from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
+
+RADII = (0.8, 0.9, 0.95, 1.05, 1.1, 1.25)  # shares of the radius as told
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,9 @@ class Task(Protocol):
     def read(self, data: HandEyeData) -> Read:
         """Features of profiles. Raises `RobocalError` when too few give any."""
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """The same features from other poses, those of ``data``."""
+
     def starts(self, view: View) -> list[MountState]:
         """First states, best first."""
 
@@ -84,6 +89,9 @@ class Task(Protocol):
 
     def more(self, fit: MountFit, read: Read) -> Document:
         """Further figures of a fit."""
+
+    def suspects(self) -> Iterable[tuple[str, "Task"]]:
+        """Mistakes in what is told of the target: in words, and the task without it."""
 
 
 def usable(rows: Collection[str], rejected: Mapping[str, str], fewest: int, what: str) -> None:
@@ -129,6 +137,10 @@ class SphereTask:
         view = View(SphereModel(self.target.radius_m), _gathered(data, found))
         return Read(view, rejected, points)
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Features do not depend on poses."""
+        return with_poses(view, data.T_base_flange)
+
     def starts(self, view: View) -> list[MountState]:
         """All sides of the laser plane are tried."""
         return sphere_starts(view.sightings, self.target.radius_m)
@@ -144,6 +156,13 @@ class SphereTask:
     def found(self, place: Array) -> Document:
         """Its centre in base."""
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
+
+    def suspects(self) -> Iterable[tuple[str, Task]]:
+        """Other radii, the likeliest first."""
+        for share in sorted(RADII, key=lambda share: abs(share - 1.0)):
+            radius_m = share * self.target.radius_m
+            words = f"the profiles fit a sphere of radius {radius_m * 1e3:.1f} mm better"
+            yield f"{words}: check which sphere is mounted", SphereTask(SphereTarget(radius_m))
 
     def more(self, fit: MountFit, read: Read) -> Document:
         """How far profile points are from the sphere, all profiles together."""
@@ -186,6 +205,10 @@ class LineTask:
         usable(found, rejected, self.fewest, "the line")
         return Read(View(LineModel(self.target is not None), _gathered(data, found)), rejected)
 
+    def posed(self, view: View, data: HandEyeData) -> View:
+        """Features do not depend on poses."""
+        return with_poses(view, data.T_base_flange)
+
     def starts(self, view: View) -> list[MountState]:
         """Rotations, and directions of an unknown line, are tried."""
         line = None
@@ -217,6 +240,10 @@ class LineTask:
         """None."""
         return {}
 
+    def suspects(self) -> Iterable[tuple[str, Task]]:
+        """None."""
+        return ()
+
 
 def seen(profile: Profile | RobocalError) -> Array:
     """Points (n, 2) of a profile.
@@ -229,6 +256,12 @@ def seen(profile: Profile | RobocalError) -> Array:
     if isinstance(profile, RobocalError):
         raise profile
     return profile.points
+
+
+def with_poses(view: View, T_base_flange: Array) -> View:
+    """A view from other poses (m, 4, 4)."""
+    s = view.sightings
+    return View(view.model, replace(s, T_base_flange=T_base_flange[s.pose]))
 
 
 def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:

@@ -1,0 +1,114 @@
+"""Planned poses: judged before the robot moves, and mended."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hand_eye_sets import (
+    CELL,
+    CENTRE,
+    POSE_M,
+    RADIUS_M,
+    STAIRS,
+    T_BASE_USER,
+    data_of,
+    stairs_target,
+)
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.mount_problem import PoseNoise
+from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+from robocal_ros.core.hand_eye.planning import SensorRange, check_plan
+from robocal_ros.core.hand_eye.quality import HandEyeSettings
+from robocal_ros.core.hand_eye.result import at_origin
+from robocal_ros.core.hand_eye.solve import solve_sphere
+from robocal_ros.core.hand_eye.targets import SphereTarget
+from robocal_ros.sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
+
+SENSOR = SensorRange(width_m=0.09)
+NOISE = PoseNoise(POSE_M, 1e-6, 1e-4)
+LIMIT_M = 3e-4
+
+
+def sphere_poses(count, cell=CELL, seed=0):
+    return sphere_shots(
+        cell, CENTRE, RADIUS_M, count, np.random.default_rng(seed)
+    ).true_T_base_flange
+
+
+def judged(target, poses, limit_m=LIMIT_M):
+    return check_plan(target, poses, CELL.T_flange_sensor, SENSOR, NOISE, limit_m)
+
+
+BALL = PlannedSphere(RADIUS_M, SENSOR, tuple(CENTRE))
+PLANNED = {
+    "sphere": (BALL, lambda: sphere_poses(5)),
+    "line": (
+        PlannedLine(SENSOR, np.stack([T_BASE_USER[:3, 3], T_BASE_USER[:3, 0]])),
+        lambda: edge_shots(CELL, T_BASE_USER, 5, np.random.default_rng(1)).true_T_base_flange,
+    ),
+    "step": (
+        PlannedStep(stairs_target(), SENSOR, ("near", "far")),
+        lambda: (
+            step_shots(CELL, STAIRS, 2, np.random.default_rng(2), level=True).true_T_base_flange
+        ),
+    ),
+}
+
+
+def test_expected_error_is_that_of_a_calibration_from_these_poses():
+    """The information of a plan against the covariance that profiles from it give."""
+    shots = sphere_shots(CELL, CENTRE, RADIUS_M, 15, np.random.default_rng(3))
+    settings = HandEyeSettings(POSE_M, 1e-6)
+    result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", settings)
+    plan = judged(BALL, shots.true_T_base_flange)
+    assert plan.rank == plan.unknowns == 9
+    achieved = np.sqrt(np.diag(at_origin(result.covariance, result.pivot)))
+    assert plan.sigma == pytest.approx(achieved, rel=0.1)  # the robot's error rules, not the arc
+
+
+@pytest.mark.parametrize("kind", PLANNED)
+def test_proposed_poses_mend_a_poor_plan(kind):
+    target, poses = PLANNED[kind]
+    plan = judged(target, poses(), 1.5e-4)
+    assert not plan.verdict.accept
+    assert plan.proposed_error_m < 1.5e-4
+    every = np.concatenate([poses(), plan.proposed])
+    if kind == "step":
+        target = replace(target, marks=None)  # what is proposed may lie on any mark
+    mended = judged(target, every, 3e-4)
+    assert mended.working_error_m < 3e-4
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_poses_without_enough_rotation_are_refused_in_words(turned):
+    still = replace(CELL, tilt_rad=0.0, roll_rad=np.radians(60.0) * turned)
+    plan = judged(BALL, sphere_poses(12, still))
+    assert plan.verdict.code is Code.RANK_DEFICIENT
+    assert plan.rank < plan.unknowns
+    assert "translation" in plan.unobservable[0]
+    missing = "about another axis" if turned else "about two axes"
+    assert all(missing in words for words in plan.unobservable)
+
+
+def test_too_few_poses():
+    plan = judged(BALL, sphere_poses(4))
+    assert plan.verdict.code is Code.TOO_FEW_SAMPLES
+    assert len(plan.proposed) >= 1
+
+
+def test_a_pose_that_does_not_see_the_target_is_told():
+    poses = sphere_poses(8)
+    poses[2, :3, 3] += [0.0, 0.0, 0.1]
+    plan = judged(BALL, poses)
+    assert list(plan.unseen) == [2]
+    assert "mm" in plan.unseen[2]
+
+
+def test_a_moved_base_gives_the_same_judgement():
+    poses = sphere_poses(8)
+    T = frames.transform(frames.exp_rotation([0.2, 0.5, -0.7]), [1.0, 2.0, -0.5])
+    moved = PlannedSphere(RADIUS_M, SENSOR, tuple((T @ np.append(CENTRE, 1.0))[:3]))
+    here, there = judged(BALL, poses), judged(moved, T @ poses)
+    assert here.working_error_m == pytest.approx(there.working_error_m, rel=1e-6)
