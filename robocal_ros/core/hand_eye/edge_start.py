@@ -62,7 +62,7 @@ def robust_corners(value: Array, p_flange: Array) -> Array:
     near = _miss(best, value, p_flange) <= 3.0 * median[first]
     try:
         return linear_corners(value[near], p_flange[near])
-    except RankDeficientError:
+    except (RankDeficientError, TooFewSamplesError):
         return best
 
 
