@@ -28,13 +28,13 @@ from bench.hand_eye_worlds import (
 from bench.tables import Goal, Table
 from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.errors import RankDeficientError
-from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount
-from robocal_ros.core.hand_eye.mount_problem import PoseNoise, pivot_of
+from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount, require_seen
+from robocal_ros.core.hand_eye.mount_problem import PoseNoise, View, pivot_of
 from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
 from robocal_ros.core.hand_eye.planning import PlannedTarget, SensorRange, check_plan
-from robocal_ros.core.hand_eye.quality import HandEyeSettings, expected_error_m
+from robocal_ros.core.hand_eye.quality import expected_error_m
 from robocal_ros.core.hand_eye.result import at_origin, increment
-from robocal_ros.core.hand_eye.solve import best_fit
+from robocal_ros.core.hand_eye.solve import look
 from robocal_ros.core.hand_eye.targets import StepTarget
 
 Array = NDArray[np.float64]
@@ -97,6 +97,13 @@ def squared_error(fit: MountFit) -> float:
     return float(step @ np.linalg.solve(fit.covariance[:6, :6], step))
 
 
+def calibrated(world: World, view: View) -> MountFit:
+    """As `robocal_ros.core.hand_eye.solve` does it, from features; no noise is told."""
+    fit = fit_mount((view,), look(world.task, view))
+    require_seen(fit, float(np.abs(view.sightings.value[:, 1]).mean()))
+    return fit
+
+
 @cache
 def outcomes(draw: Draw, runs: int) -> Runs:
     """Draw poses and noise anew and calibrate."""
@@ -107,7 +114,7 @@ def outcomes(draw: Draw, runs: int) -> Runs:
         world = draw(rng)
         view, noise = world.measured(rng), world.noise
         try:
-            fit = best_fit(world.task, view, HandEyeSettings())
+            fit = calibrated(world, view)
         except RankDeficientError:
             refused += 1
             continue
@@ -260,7 +267,7 @@ def _planned(draw: Draw, plan: PlannedTarget, sensor: SensorRange) -> tuple[floa
         expected.append(report.working_error_m**2)
         field = sensor.field_points - world.pivot
         for _ in range(PLANNED_RUNS // 5):
-            fit = best_fit(world.task, world.measured(rng), HandEyeSettings())
+            fit = calibrated(world, world.measured(rng))
             step = increment(X, fit.state.T_flange_sensor, world.pivot)
             achieved.append(expected_error_m(np.outer(step, step), field) ** 2)
     return float(np.sqrt(np.mean(expected))), float(np.sqrt(np.mean(achieved)))
