@@ -39,6 +39,7 @@ setup(
         "console_scripts": [
             "robocal = robocal_ros.cli.main:main",
             "tcf_node = robocal_ros.nodes.tcf_node:main",
+            "hand_eye_node = robocal_ros.nodes.hand_eye_node:main",
             "thermal_node = robocal_ros.nodes.thermal_node:main",
             "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
             "cell_sim_node = robocal_ros.nodes.cell_sim_node:main",

@@ -25,7 +25,18 @@ KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
-    from bench import files, hand_eye, monte_carlo, real_data, speed, startup, thermal, tool
+    from bench import (
+        files,
+        hand_eye,
+        hand_eye_camera,
+        hand_eye_tracker,
+        monte_carlo,
+        real_data,
+        speed,
+        startup,
+        thermal,
+        tool,
+    )
 
     def start() -> Sequence[Table]:
         if startup.EXECUTABLES.is_dir():
@@ -39,6 +50,8 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "thermal": thermal.tables,
         "tool": tool.tables,
         "hand_eye": hand_eye.tables,
+        "hand_eye_camera": hand_eye_camera.tables,
+        "hand_eye_tracker": hand_eye_tracker.tables,
         "speed": speed.tables,
         "startup": start,
         "files": lambda: [files.file_times()],

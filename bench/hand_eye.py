@@ -21,20 +21,20 @@ from bench.hand_eye_worlds import (
     T_BASE_USER,
     World,
     X,
+    calibrated,
     line_world,
     sphere_world,
+    squared_error,
     step_world,
 )
 from bench.tables import Goal, Table
 from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.errors import RankDeficientError
-from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount, require_seen
-from robocal_ros.core.hand_eye.mount_problem import PoseNoise, View, pivot_of
+from robocal_ros.core.hand_eye.mount_problem import PoseNoise
 from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
 from robocal_ros.core.hand_eye.planning import PlannedTarget, SensorRange, check_plan
 from robocal_ros.core.hand_eye.quality import expected_error_m
 from robocal_ros.core.hand_eye.result import at_origin, increment
-from robocal_ros.core.hand_eye.solve import look
 from robocal_ros.core.hand_eye.targets import StepTarget
 
 Array = NDArray[np.float64]
@@ -54,12 +54,12 @@ CASES: dict[str, Draw] = {
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Outcomes of n runs: of the best method, of the same that is told all noise, of the classic.
+    """Outcomes of n runs.
 
     Attributes
     ----------
     best, classic : (n, 6) increments from the true mount about the pivot (n, 3).
-    squared, told_squared : (n,) squared errors in units of their own covariance, best and told.
+    squared : (n,) squared errors of the best method in units of its own covariance.
     bound : (n, 6, 6); ``apart``: largest difference between it and the estimator's own.
     robot_m : (n,) robot's noise as found; ``rejected``: share of features;
         refused: of runs, as poses that do not show all directions.
@@ -69,7 +69,6 @@ class Runs:
     classic: Array
     pivot: Array
     squared: Array
-    told_squared: Array
     bound: Array
     apart: float
     robot_m: Array
@@ -91,19 +90,6 @@ class Runs:
         return float(np.sqrt(np.trace(self.bound[:, rows, rows], axis1=1, axis2=2).mean()))
 
 
-def squared_error(fit: MountFit) -> float:
-    """Squared error in units of the fit's covariance: chi-square where that is true."""
-    step = increment(fit.state.T_flange_sensor, X, pivot_of(fit.views))
-    return float(step @ np.linalg.solve(fit.covariance[:6, :6], step))
-
-
-def calibrated(world: World, view: View) -> MountFit:
-    """As `robocal_ros.core.hand_eye.solve` does it, from features; no noise is told."""
-    fit = fit_mount((view,), look(world.task, view))
-    require_seen(fit, float(np.abs(view.sightings.value[:, 1]).mean()))
-    return fit
-
-
 @cache
 def outcomes(draw: Draw, runs: int) -> Runs:
     """Draw poses and noise anew and calibrate."""
@@ -112,14 +98,13 @@ def outcomes(draw: Draw, runs: int) -> Runs:
     for seed in range(runs):
         rng = np.random.default_rng([50, seed])
         world = draw(rng)
-        view, noise = world.measured(rng), world.noise
+        view = world.measured(rng)
         try:
-            fit = calibrated(world, view)
+            fit = calibrated(world.task, view)
         except RankDeficientError:
             refused += 1
             continue
-        told = fit_mount((view,), fit.state, PoseNoise(noise.pose_m, noise.pose_rad, noise.aim_m))
-        squared.append([squared_error(fit), squared_error(told)])
+        squared.append(squared_error(fit))
         old = world.task.classic(view, fit.state).T_flange_sensor
         pivot.append(world.pivot)
         best.append(increment(X, fit.state.T_flange_sensor, world.pivot))
@@ -131,9 +116,8 @@ def outcomes(draw: Draw, runs: int) -> Runs:
         robot.append(fit.noise.sigma_m)
         lost += len(fit.rejected)
         shown += len(view.sightings.names)
-    both = np.array(squared).T
     return Runs(
-        np.array(best), np.array(classic), np.array(pivot), both[0], both[1], np.array(bound),
+        np.array(best), np.array(classic), np.array(pivot), np.array(squared), np.array(bound),
         max(apart), np.array(robot), lost / shown, refused / runs,
     )  # fmt: skip
 
@@ -165,33 +149,30 @@ def bound_table() -> Table:
 def covariance_table() -> Table:
     """Is the reported covariance true?"""
     band = [chi2_quantile(p, UNKNOWNS * RUNS) / (UNKNOWNS * RUNS) for p in (0.025, 0.975)]
-    most = 0.05 + 1.96 * float(np.sqrt(0.05 * 0.95 / RUNS))
     table = Table(
         "hand_eye_covariance",
         "The same: squared error over the reported covariance",
-        ("target", "noise", "mean of d2 / 6", "goal", "beyond the 95 % quantile, %", "goal, %",
-         "robot found, mm", "features rejected, %",
-         "runs refused, %"),
-        f"{RUNS} runs; mean: its 95 % band is {band[0]:.3f} to {band[1]:.3f} when the covariance "
-        "is true. Told: the robot's noise is known.",
+        ("target", "mean of d2 / 6", "goal", "beyond the 95 % quantile, %", "robot found, mm",
+         "features rejected, %", "runs refused, %"),
+        f"{RUNS} runs; the mean's 95 % band is {band[0]:.3f} to {band[1]:.3f} for a true "
+        "covariance. The noise is found from the same poses, so that errors have the tails of "
+        "Student's t: more than 5 % lie beyond the quantile of chi-square. Nothing is wrong in "
+        "these data: each rejection is a false one. Refused: poses that leave a direction open.",
     )  # fmt: skip
     limit = chi2_quantile(0.95, UNKNOWNS)
     for name, draw in CASES.items():
         runs = outcomes(draw, RUNS)
-        for words, squared in (("found", runs.squared), ("told", runs.told_squared)):
-            mean = float(squared.mean()) / UNKNOWNS
-            outside = float(np.mean(squared > limit))
-            side = Goal(mean, band[1]) if mean > 1.0 else Goal(mean, band[0], at_least=True)
-            table.add(
-                name, words, mean, side, 100.0 * outside, Goal(100.0 * outside, 100.0 * most),
-                1e3 * float(np.median(runs.robot_m)) if words == "found" else None,
-                100.0 * runs.rejected if words == "found" else None,
-                100.0 * runs.refused if words == "found" else None,
-            )  # fmt: skip
+        mean = float(runs.squared.mean()) / UNKNOWNS
+        table.add(
+            name, mean,
+            Goal(mean, band[1]) if mean > 1.0 else Goal(mean, band[0], at_least=True),
+            100.0 * float(np.mean(runs.squared > limit)), 1e3 * float(np.median(runs.robot_m)),
+            100.0 * runs.rejected, 100.0 * runs.refused,
+        )  # fmt: skip
     return table
 
 
-def classic_table(runs: int = 200) -> Table:
+def classic_table(runs: int = 100) -> Table:
     """Sphere: both methods where poses are off by more."""
     table = Table(
         "hand_eye_classic",
@@ -207,7 +188,7 @@ def classic_table(runs: int = 200) -> Table:
         ),
         f"Simulated features, {runs} runs each; poses err in position alone.",
     )
-    for pose_m in (2e-5, 5e-5, 1e-4):
+    for pose_m in (2e-5, 1e-4):
         found = outcomes(_sphere_with(pose_m), runs)
         for where, pivot in (("middle of the field", None), ("origin", found.pivot)):
             best, classic = (found.rms_mm(e, pivot) for e in (found.best, found.classic))
@@ -267,7 +248,7 @@ def _planned(draw: Draw, plan: PlannedTarget, sensor: SensorRange) -> tuple[floa
         expected.append(report.working_error_m**2)
         field = sensor.field_points - world.pivot
         for _ in range(PLANNED_RUNS // 5):
-            fit = calibrated(world, world.measured(rng))
+            fit = calibrated(world.task, world.measured(rng))
             step = increment(X, fit.state.T_flange_sensor, world.pivot)
             achieved.append(expected_error_m(np.outer(step, step), field) ** 2)
     return float(np.sqrt(np.mean(expected))), float(np.sqrt(np.mean(achieved)))

@@ -20,8 +20,17 @@ from bench.hand_eye_bound import (
 )
 from robocal_ros.core import frames
 from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount, require_seen
+from robocal_ros.core.hand_eye.mount_problem import (
+    MountProblem,
+    MountState,
+    PoseNoise,
+    View,
+    pivot_of,
+)
+from robocal_ros.core.hand_eye.result import increment
 from robocal_ros.core.hand_eye.sightings import Index, Sightings, TargetModel
+from robocal_ros.core.hand_eye.solve import look
 from robocal_ros.core.hand_eye.step_task import StepTask
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
@@ -202,3 +211,16 @@ def _corners(rng: np.random.Generator, poses: int) -> Array:
     ):
         one[:2, :2] = corner_covariance(turn, FLANK_M, POINT_M, PITCH_M)
     return covariance
+
+
+def calibrated(task: Task, view: View) -> MountFit:
+    """As the solver does it with the features of profiles; no noise is told."""
+    fit = fit_mount((view,), look(task, view))
+    require_seen(fit, float(np.abs(view.sightings.value[:, 1]).mean()))
+    return fit
+
+
+def squared_error(fit: MountFit) -> float:
+    """Squared error of a mount in units of its covariance: chi-square where that is true."""
+    step = increment(fit.state.T_flange_sensor, X, pivot_of(fit.views))
+    return float(step @ np.linalg.solve(fit.covariance[:6, :6], step))

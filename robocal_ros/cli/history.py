@@ -13,7 +13,15 @@ from robocal_ros.cli.arguments import count, text
 from robocal_ros.cli.history_view import show_decision, show_entry, show_list
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.proposals import BEFORE_ANY, HEALTHY_TOOL, THERMAL, TOOL, Decision, Entry
+from robocal_ros.core.proposals import (
+    BEFORE_ANY,
+    HEALTHY_TOOL,
+    THERMAL,
+    TOOL,
+    Decision,
+    Entry,
+    hand_eye_kind,
+)
 from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
@@ -87,9 +95,10 @@ def _add_rollback_target(action: argparse.ArgumentParser) -> None:
     )
     action.add_argument(
         "--kind",
-        choices=_KINDS,
+        type=_kind,
+        metavar="KIND",
         default=THERMAL,
-        help=f"kind of calibration, default {THERMAL}",
+        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
     )
 
 
@@ -198,6 +207,15 @@ _ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]
     "reject": _reject,
     "rollback": _rollback,
 }
+
+
+def _kind(value: str) -> str:
+    """A kind of calibration; each sensor has its own."""
+    start = hand_eye_kind("")
+    if value not in _KINDS and (not value.startswith(start) or value == start):
+        known = ", ".join((*_KINDS, hand_eye_kind("SENSOR")))
+        raise argparse.ArgumentTypeError(f"'{value}' is none of {known}")
+    return value
 
 
 def _decided(

@@ -47,6 +47,7 @@ COMMANDS = {
     "history": "history",
     "thermal": "thermal",
     "tool": "tool",
+    "hand-eye": "hand_eye",
     "import-ur": "import_ur",
 }
 """Name of each command and its module, in the order of the help."""

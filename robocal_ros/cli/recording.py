@@ -1,4 +1,4 @@
-"""A bag as a recording of a thermal session: its inputs, its commands, its beginning."""
+"""A bag as a recording of a session: its inputs, its commands, its beginning."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -9,11 +9,13 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import stamp_ns
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.hand_eye_shots import SHOTS
 from robocal_ros.sessions.observations import JOINTS, MEASURING
 from robocal_ros.sessions.replay import EVENTS, input_topics, read_events, topic_kind
 from robocal_ros.storage.bags import BagMessage, BagReader
 
-INPUTS = (JOINTS, *MEASURING, EDGES)
+MEASURED = (*MEASURING, EDGES, *SHOTS)
+INPUTS = (JOINTS, *MEASURED)
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Recording:
     def warnings(self) -> list[str]:
         """What is wrong with the bag, as far as it was read, and what it lacks."""
         info = self.reader.info
-        lacking = not {*MEASURING, EDGES} & set(self.inputs.values())
+        lacking = not set(MEASURED) & set(self.inputs.values())
         words = f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}"
         return [*info.notes, words] if lacking else list(info.notes)
 

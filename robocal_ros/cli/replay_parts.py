@@ -3,7 +3,9 @@
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
 from robocal_ros.core.streams import JointStream
+from robocal_ros.sessions.commanded import Commanded
 from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.replay import ReplayReport
 
 
 def seconds(stamp_ns: int | None) -> float:
@@ -29,4 +31,23 @@ def command_document(outcome: Outcome) -> Document:
         "code": outcome.status.name,
         "message": outcome.message,
         "samples": outcome.samples,
+    }
+
+
+def commanded_document(report: ReplayReport, session: Commanded, recording: Recording) -> Document:
+    """What the replay of a recorded session tells, whatever it measures."""
+    topic = {kind: name for name, kind in recording.inputs.items()}
+    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
+    return {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "start_ns": recording.start_ns,
+        "topics": topic,
+        "recorded": True,
+        "ignored": {name: sum(why.values()) for name, why in ignored.items()},
+        "ignored_reasons": ignored,
+        "gaps": gaps_document(session.stream, recording),
+        "commands": [command_document(outcome) for outcome in report.outcomes],
+        "differs": report.differs,
+        "warnings": recording.warnings,
     }

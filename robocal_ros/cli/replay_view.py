@@ -24,8 +24,8 @@ def show_replay(console: "Console", document: Document) -> None:
     """Print a replay; a single candidate in full, several as a table."""
     from rich.text import Text
 
-    if "runs" in document:
-        _show_runs(console, document)
+    if "runs" in document or "calibrations" in document:
+        _show_commands(console, document)
         return
     candidates = document["candidates"]
     if len(candidates) == 1:
@@ -44,17 +44,19 @@ def show_replay(console: "Console", document: Document) -> None:
     _show_equality(console, document)
 
 
-def _show_runs(console: "Console", document: Document) -> None:
+def _show_commands(console: "Console", document: Document) -> None:
     from rich.text import Text
 
     for entry in document["commands"]:
         style = "" if entry["code"] == "ACCEPT" else "red"
         words = f"{entry['command']}: {entry['code']}: {entry['message']}"
         console.print(Text(words, style=style), soft_wrap=True)
-    where = ", ".join(f"{x:.3f}" for x in document["final_tool"]["xyz_mm"])
-    console.print(
-        f"In force at the end: revision {document['final_tool']['revision']}, ({where}) mm"
-    )
+    final = document["final_tool"] if "runs" in document else document["final_sensor"]
+    if final is None:
+        console.print("Nothing is in force at the end.")
+    else:
+        where = ", ".join(f"{x:.3f}" for x in final["xyz_mm"])
+        console.print(f"In force at the end: revision {final['revision']}, ({where}) mm")
     _show_losses(console, document)
     _show_equality(console, document)
 

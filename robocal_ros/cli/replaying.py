@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros import __version__
+from robocal_ros.cli.hand_eye_replaying import replay_hand_eye
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
@@ -17,6 +18,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import (
     ReplayReport,
@@ -35,6 +37,12 @@ from robocal_ros.storage.calibrations import CalibrationHistory
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
 Watch = Callable[[str, Recording], Iterator[BagMessage]]
+
+
+_OF_OTHER_NODES = (
+    (is_tool_session, replay_tool, "tool"),
+    (is_hand_eye_session, replay_hand_eye, "hand-eye"),
+)
 
 
 @dataclass(frozen=True)
@@ -77,12 +85,15 @@ def replay_bag(request: Request, watch: Watch) -> Document:
             raise InputError(words, file=str(request.bag))
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
-            if is_tool_session(recording.configured):
+            for is_of, replayed, node in _OF_OTHER_NODES:
+                if not is_of(recording.configured):
+                    continue
                 if request.auto or request.cold or request.warm:
                     raise InputError(
-                        "the bag is of a tool node: --auto, --cold and --warm are for thermal ones"
+                        f"the bag is of a {node} node: --auto, --cold and --warm are for thermal "
+                        "ones"
                     )
-                return replay_tool(recording, arm, history, watch("replaying", recording))
+                return replayed(recording, arm, history, watch("replaying", recording))
             kept = _GOES_ON.format(history.path) if history.list(1) else ""
             session = _session(recording, arm, history)
             commands = _commands(request, recording, arm, history, watch)

@@ -6,7 +6,7 @@ from typing import Any
 from robocal_ros import __version__
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
+from robocal_ros.cli.replay_parts import commanded_document, seconds
 from robocal_ros.core.documents import transform_document
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
@@ -36,23 +36,10 @@ def replay_tool(
 
 
 def _document(report: ReplayReport, session: ToolSession, recording: Recording) -> Document:
-    topic = {kind: name for name, kind in recording.inputs.items()}
-    ignored = {topic.get(kind, kind): dict(why) for kind, why in session.ignored.items()}
-    return {
-        "robot": session.nominal.name,
-        "model_hash": session.nominal.model_hash,
-        "start_ns": recording.start_ns,
-        "topics": topic,
-        "recorded": True,
+    return commanded_document(report, session, recording) | {
         "runs": [_run(o) for o in report.outcomes if o.document is not None],
         "final_tool": transform_document(session.current.tool.T_flange_tool)
         | {"revision": session.in_force.revision},
-        "ignored": {name: sum(why.values()) for name, why in ignored.items()},
-        "ignored_reasons": ignored,
-        "gaps": gaps_document(session.stream, recording),
-        "commands": [command_document(outcome) for outcome in report.outcomes],
-        "differs": report.differs,
-        "warnings": recording.warnings,
     }
 
 

@@ -16,8 +16,14 @@ if TYPE_CHECKING:  # the history is listed without loading NumPy
 THERMAL = "thermal"
 TOOL = "tool"
 HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
-# What is in force before anything was accepted.
+HAND_EYE = "hand_eye"  # where a sensor sits; see `hand_eye_kind`
+# What is in force before anything was accepted; of other kinds nothing.
 BEFORE_ANY = {THERMAL: "the nominal model", TOOL: "the taught tool"}
+
+
+def hand_eye_kind(sensor_frame: str) -> str:
+    """Each sensor is calibrated on its own: the kind names its frame."""
+    return f"{HAND_EYE}/{sensor_frame}"
 
 
 class Action(StrEnum):

@@ -1,13 +1,11 @@
 """Parameters of the tool node."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.beam_edges import InputRule
 from robocal_ros.core.tool.crossed_model import RobotNoise
@@ -16,9 +14,9 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
 from robocal_ros.nodes.parameters import Setting, length
+from robocal_ros.nodes.pose_settings import given_pose, pose_settings
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 
-ORIGIN, UNTURNED = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]
 PROGRAM, TRAJECTORY = "program", "trajectory"
 
 
@@ -26,29 +24,13 @@ def _speed(name: str, default: float, what: str, high: float) -> Setting:
     return Setting(name, default, what, unit="mm/s", low=0.1, high=high)
 
 
-def _count_fault(length: int) -> Callable[[list[float]], str | None]:
-    return lambda values: None if len(values) == length else f"{length} numbers are wanted"
-
-
 SETTINGS = (
     Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
     Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
-    Setting(
-        "taught_xyz_mm",
-        ORIGIN,
+    *pose_settings(
+        "taught",
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",
-        unit="mm",
-        low=-5000.0,
-        high=5000.0,
-        check=_count_fault(3),
-    ),
-    Setting(
-        "taught_quat_xyzw",
-        UNTURNED,
         "Its orientation: z from flange to tip",
-        low=-1.0,
-        high=1.0,
-        check=_count_fault(4),
     ),
     Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
     Setting("base_frame", "base", "Name of the robot's base frame"),
@@ -141,13 +123,8 @@ def taught_tool(settings: Mapping[str, Any], nominal: SerialArm) -> NDArray[np.f
     InputError
         When the quaternion is not of unit length.
     """
-    xyz_mm, quat = settings["taught_xyz_mm"], settings["taught_quat_xyzw"]
-    if xyz_mm == ORIGIN and quat == UNTURNED:
-        return nominal.T_flange_tool
-    norm = float(np.linalg.norm(quat))
-    if abs(norm - 1.0) > 1e-3:
-        raise InputError(f"taught_quat_xyzw has length {norm:.6g}, not 1")
-    return frames.transform_from_quat(1e-3 * np.array(xyz_mm), np.array(quat) / norm)
+    given = given_pose(settings, "taught")
+    return nominal.T_flange_tool if given is None else given
 
 
 def session_config(

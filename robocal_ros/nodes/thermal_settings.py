@@ -3,12 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.samples import DEFAULT_TARGET
-from robocal_ros.core.streams import StandstillRule
 from robocal_ros.nodes.parameters import Setting
+from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
 from robocal_ros.sessions.thermal_config import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
 
 
@@ -80,31 +78,7 @@ SETTINGS = (
         high=0.9,
     ),
     Setting("seed", 0, "Which poses are held out", low=0, high=2**31 - 1),
-    Setting(
-        "standstill_before_s",
-        0.3,
-        "The robot stands still so long before a measurement's stamp",
-        unit="s",
-        low=0.0,
-        high=10.0,
-    ),
-    Setting("standstill_after_s", 0.1, "and so long after it", unit="s", low=0.0, high=10.0),
-    Setting(
-        "standstill_tolerance_deg",
-        0.02,
-        "Largest range of a joint that stands still",
-        unit="deg",
-        low=1e-4,
-        high=5.0,
-    ),
-    Setting(
-        "joint_gap_s",
-        0.25,
-        "Longest pause between two joint readings about a measurement",
-        unit="s",
-        low=1e-3,
-        high=10.0,
-    ),
+    *STANDSTILL,
     Setting(
         "cycle_timeout_s",
         300.0,
@@ -163,12 +137,7 @@ def session_config(settings: Mapping[str, Any]) -> ThermalConfig:
         lateness_s=settings["lateness_s"],
         measuring_frame=settings["measuring_frame"],
         target=settings["target"],
-        standstill=StandstillRule(
-            before_s=settings["standstill_before_s"],
-            after_s=settings["standstill_after_s"],
-            tolerance_rad=float(np.radians(settings["standstill_tolerance_deg"])),
-            gap_s=settings["joint_gap_s"],
-        ),
+        standstill=standstill_rule(settings),
         sphere=SphereRule(
             radius_m=settings["sphere_radius_mm"] * 1e-3,
             radius_tolerance_m=settings["sphere_tolerance_mm"] * 1e-3,

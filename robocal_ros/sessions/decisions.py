@@ -54,7 +54,7 @@ def decide(
     except RobocalError as error:
         return Outcome(command, error.code, str(error))
     chosen = head.calibration_id or 0
-    what = f"calibration {chosen}" if chosen else BEFORE_ANY[kind]
+    what = f"calibration {chosen}" if chosen else BEFORE_ANY.get(kind, "nothing")
     message = f"revision {head.revision}: {what} in force"
     return Outcome(command, Code.ACCEPT, message, None, chosen)
 

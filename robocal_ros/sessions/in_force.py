@@ -4,18 +4,18 @@ from collections.abc import Mapping
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of, reference_of
-from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, Decision, Head
+from robocal_ros.core.proposals import THERMAL, Decision
 from robocal_ros.core.thermal.reference import ColdReference
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.followed import Followed
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
 
 REFERENCE = "reference"
 
 
-class InForce:
+class InForce(Followed):
     """The thermal model and the cold reference in force, as of the last look.
 
     Attributes
@@ -23,51 +23,24 @@ class InForce:
     head : head of the thermal models.
     reference, reference_id, reference_model : the cold reference, its calibration, and what is
         kept of it; or None.
-    fault : why the history could not be read at the last look; empty when it could.
     """
 
     def __init__(self, history: History, nominal: SerialArm) -> None:
-        self._history = history
         self._nominal = nominal
-        self._version = history.data_version()
-        decided = history.decisions()
-        self._seen = decided[-1].seq if decided else 0
-        self.head: Head = history.head(THERMAL)
-        self._take_reference()
-        self.fault = ""
+        super().__init__(history, THERMAL)
+
+    def _read(self) -> None:
+        super()._read()
+        head = self._history.head(REFERENCE)
+        reference = None if head.model is None else reference_of(head.model, self._nominal)
+        self.reference: ColdReference | None = reference
+        self.reference_id, self.reference_model = head.calibration_id, head.model
 
     @property
     def arm(self) -> SerialArm:
         """The arm with the model in force."""
         model = self.head.model
         return self._nominal if model is None else arm_of(model, self._nominal)
-
-    def look(self, own_wall_ns: int | None = None) -> list[Decision]:
-        """Take over what was decided since the last look.
-
-        Returns others' decisions about the thermal model, oldest first; those stamped
-        ``own_wall_ns`` are the caller's own. Never raises for the history's sake: see ``fault``.
-        """
-        try:
-            version = self._history.data_version()
-            if version == self._version:
-                self.fault = ""
-                return []
-            decided = self._history.decisions(self._seen)
-            self.head = self._history.head(THERMAL)
-            self._take_reference()
-        except RobocalError as error:
-            self.fault = str(error)
-            return []
-        self._version, self.fault = version, ""
-        self._seen = decided[-1].seq if decided else self._seen
-        return [d for d in decided if d.kind == THERMAL and d.wall_ns != own_wall_ns]
-
-    def _take_reference(self) -> None:
-        head = self._history.head(REFERENCE)
-        reference = None if head.model is None else reference_of(head.model, self._nominal)
-        self.reference: ColdReference | None = reference
-        self.reference_id, self.reference_model = head.calibration_id, head.model
 
     @property
     def nominal(self) -> SerialArm:

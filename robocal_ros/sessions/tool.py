@@ -1,7 +1,6 @@
 """The tool session: edges, joint readings and commands in, measured tools out. No clock, no ROS."""
 
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -9,30 +8,24 @@ import numpy as np
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import TOOL, Head
+from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.samples import JointSample
-from robocal_ros.core.streams import JointStream
 from robocal_ros.core.tool.beam_edges import BeamError
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.sessions import events
-from robocal_ros.sessions.bounds import reached
-from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.commanded import Commanded, Handler
 from robocal_ros.sessions.edge_log import EDGES, MOST_EDGES, EdgeLog
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.ignored import Ignored
-from robocal_ros.sessions.in_force import outside_decision
-from robocal_ros.sessions.observations import JOINTS, JUMPS
+from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool_config import ToolConfig
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_results import MODES, QUICK, ToolResults
 from robocal_ros.sessions.tool_run import ToolRun
 
-GAP_NS = 250_000_000
 
-
-class ToolSession:
+class ToolSession(Commanded):
     """Measures the tool of one arm at one station of two crossed beams.
 
     A command ``measure_tool`` begins a run; each step that `recognised` sees the end of becomes a
@@ -41,35 +34,22 @@ class ToolSession:
     Attributes
     ----------
     run : the run that is open; None while there is none.
-    stream : the joint readings.
-    received, ignored : samples by topic, and those that were not used.
-    newest_ns : newest stamp of the joints and of each beam's edges.
     """
 
     def __init__(
         self, nominal: SerialArm, history: History, config: ToolConfig, software: str
     ) -> None:
-        self.nominal, self.config = nominal, config
-        self._history = history
+        self.config = config
         self._current = ToolInForce(history, nominal, config)
+        super().__init__(nominal, history, TOOL, self._current)
         self._results = ToolResults(nominal, history, config, software, self._current)
         self._laser = config.laser
-        self.stream = JointStream(nominal.joint_names)
         self._edges = EdgeLog()
-        self._queue: list[Command] = []
-        self._runs = self._jumps = 0
+        self._runs = 0
         self._over: Command | None = None
         self.run: ToolRun | None = None
-        self.newest_ns: dict[str, int] = {}
-        self.received: Counter[str] = Counter()
-        self.ignored = Ignored()
 
     # ---- what is in force -----------------------------------------------------------------------
-
-    @property
-    def in_force(self) -> Head:
-        """Head of the tools as the session last saw it."""
-        return self._current.head
 
     @property
     def current(self) -> ToolInForce:
@@ -80,16 +60,6 @@ class ToolSession:
     def awaited(self) -> PlannedStep | None:
         """The step to be driven now; None while nothing is awaited."""
         return None if self.run is None else self.run.awaited
-
-    @property
-    def marks(self) -> dict[str, int]:
-        """How far the samples have come: newest stamps, and jumps of the clock."""
-        return self.newest_ns | {JUMPS: self._jumps}
-
-    @property
-    def newest_joints_ns(self) -> int:
-        """Stamp of the newest joint reading; 0 before any."""
-        return self.newest_ns.get(JOINTS, 0)
 
     # ---- samples --------------------------------------------------------------------------------
 
@@ -107,18 +77,9 @@ class ToolSession:
             self._add_edge(sample)
 
     def _add_joints(self, sample: JointSample) -> None:
-        began = self.stream.add(sample, GAP_NS).began_ns
-        newest = self.stream.newest_ns
-        if newest is None:
-            return
-        before = self.newest_ns.get(JOINTS, newest)
-        self.received[JOINTS] += 1
-        self.newest_ns[JOINTS] = newest
-        run = self.run
-        if began is not None and newest < before:
+        jumped, run, newest = self._take_joints(sample), self.run, self.newest_joints_ns
+        if jumped:
             self._edges.clear()
-            self._jumps += 1
-            self.newest_ns = {JOINTS: newest}
             self._end_early("the clock jumped back")
         elif run is not None and self._over is None and newest > run.from_ns:
             _, q = self.stream.window(newest, newest)
@@ -165,54 +126,13 @@ class ToolSession:
         """Whether a cycle has ended: its answer is given again, and nothing is driven."""
         return self._results.of_cycle(mode, cycle_id) is not None
 
-    def submit(self, command: Command, clock_ns: int | None = None) -> None:
-        """Queue a command; ``step`` carries it out when its samples are complete.
-
-        A command without a stamp gets the newest stamp of the joints, where there is one, so that
-        a clock that is off does not matter.
-        """
-        if command.stamp_ns is None:
-            command = replace(command, stamp_ns=self.newest_joints_ns or clock_ns or 0)
-        self._queue.append(command)
-
-    @property
-    def waiting(self) -> int:
-        """Number of commands not yet carried out."""
-        return len(self._queue)
-
-    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
-        """Carry out one command: what was decided outside before it, and it."""
-        if not self._queue or not (force or self._ready(self._queue[0])):
-            return []
-        command = self._queue.pop(0)
-        outside = self.poll()
-        if command.marks is None:
-            command = replace(command, marks=self.marks)
-        outcome = self._carry_out(command, wall_ns)
-        outside += [outside_decision(d, self.marks) for d in self._current.look(wall_ns)]
-        return [*outside, replace(outcome, revision=self.in_force.revision)]
-
-    def poll(self) -> list[Outcome]:
-        """Take over what another process decided in the history since the last look."""
-        return [outside_decision(d, self.marks) for d in self._current.look()]
-
-    def _ready(self, command: Command) -> bool:
-        return command.marks is None or reached(command.marks, self.newest_ns, self._jumps)
-
-    def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
-        handlers: dict[str, Callable[[Command, int], Outcome]] = {
+    def _handlers(self) -> Mapping[str, Handler]:
+        return {
             events.MEASURE_TOOL: self._measure,
             events.STEP_BEGINS: self._step_begins,
             events.TOOL_STEP: self._take_step,
             events.BREAK_OFF: self._break_off,
-            events.ACCEPT: self._decide,
-            events.REJECT: self._decide,
-            events.ROLLBACK: self._decide,
         }
-        return events.carried_out(handlers, command, wall_ns)
-
-    def _decide(self, command: Command, wall_ns: int) -> Outcome:
-        return decide(self._history, command, self.in_force.revision, wall_ns, TOOL)
 
     def _measure(self, command: Command, wall_ns: int) -> Outcome:
         mode, cycle_id = str(command.arguments["mode"]), str(command.arguments.get("cycle_id", ""))

@@ -46,13 +46,14 @@ class PoseTable:
 
     Attributes
     ----------
-    names : (m,) of the shots; the file's name where the table gives none.
+    names : (m,) of the shots; where the table gives none the file's name, or the row's number.
     T_base_flange : (m, 4, 4), m.
-    files : (m,) relative to the folder of the shots.
+    files : (m,) relative to the folder of the shots; none where no such column was asked for.
     q : (m, n) joint readings, rad (prismatic: m); None without them, or where no arm is known.
     stamp_ns : (m,); None without a column.
     mark : (m,) of the target, through which the laser plane was laid; None without a column.
     path, rows, column : the table's file, the row of each shot there, the column of ``files``.
+    named : whether the table has a column ``sample``.
     """
 
     names: tuple[str, ...]
@@ -64,6 +65,7 @@ class PoseTable:
     path: str
     rows: tuple[int, ...]
     column: str
+    named: bool = False
 
     def __len__(self) -> int:
         return len(self.names)
@@ -96,9 +98,9 @@ class PoseTable:
 
 
 def read_pose_table(
-    path: Path, arm: SerialArm | None = None, file_column: str = "profile"
+    path: Path, arm: SerialArm | None = None, file_column: str | None = "profile"
 ) -> PoseTable:
-    """Read the table of shots.
+    """Read the table of shots; without ``file_column`` one of poses alone.
 
     Without flange poses they are those of ``arm`` at its joint readings. Joint readings beside
     poses are kept where ``arm`` is known.
@@ -109,24 +111,24 @@ def read_pose_table(
         With file, row and column, when the table is not as its contract says.
     """
     found: list[Layout] = []
-    words = ("sample", "stamp_s", "mark", file_column)
+    words = ("sample", "stamp_s", "mark", file_column or "image")
 
     def check(header: list[str], file: str) -> None:
         found.append(read_pose_columns(header, arm, file, words))
-        if file_column not in found[0].place:
+        if file_column and file_column not in found[0].place:
             raise InputError(
                 f"column {file_column} is missing: it names each shot's file", file=file, row=1
             )
 
     table = read_cells(path, check)
     layout = found[0]
-    files = _files(table, file_column)
+    files = _files(table, file_column) if file_column else ()
     q = None
     if layout.joints:
         q = np.column_stack([table.numbers(name) for name in layout.joints])
         q = q * layout.joint_factors
     return PoseTable(
-        names=read_samples(table, files),
+        names=read_samples(table, files or tuple(map(str, table.rows))),
         T_base_flange=_poses(table, layout, arm, q),
         files=files,
         q=q,
@@ -134,7 +136,8 @@ def read_pose_table(
         mark=table.words("mark") or None,
         path=table.file,
         rows=table.rows,
-        column=file_column,
+        column=file_column or "",
+        named="sample" in table.columns,
     )
 
 
@@ -244,7 +247,7 @@ def write_profile(path: Path, points: Array) -> None:
 def write_pose_table(
     path: Path,
     T_base_flange: Array,
-    files: Sequence[str],
+    files: Sequence[str] | None = None,
     *,
     file_column: str = "profile",
     names: Sequence[str] | None = None,
@@ -262,7 +265,8 @@ def write_pose_table(
     columns: dict[str, list[str]] = {}
     if names is not None:
         columns["sample"] = list(names)
-    columns[file_column] = list(files)
+    if files is not None:
+        columns[file_column] = list(files)
     if mark is not None:
         columns["mark"] = list(mark)
     if stamp_ns is not None:

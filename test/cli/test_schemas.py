@@ -3,14 +3,19 @@
 from pathlib import Path
 
 import pytest
+from camera_tables import camera_tables
 from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
+from hand_eye_bag import hand_eye_bag
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
 from tool_tables import tool_tables
+from tracker_files import SCAN, tracker_files
 
 from robocal_ros.cli.main import COMMANDS
+from robocal_ros.sim.tracker_cells import prp_cell
+from robocal_ros.storage.robots import load_description
 
 UR_NOMINAL = """[DH]
 a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
@@ -35,6 +40,9 @@ CROSSED = ["tool", "crossed", "--radius-mm", "12", "--period-s", "2", "--start-d
 RUN = ["tool", "crossed", "--robot", "ur10", "--laser", "laser.yaml", "--taught-mm", "0,0,150",
        "--sample-period-s", "0.002", "--joints", "joints.csv"]  # fmt: skip
 PARALLEL = ["tool", "parallel", "--up-mm", "400", "--down-mm", "360", "--x-mm", "800"]
+CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
+TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
+           "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -71,6 +79,12 @@ CASES = {
         "replay.tool.json",
         ["replay", TOOL_BAG],
         ["replay", TOOL_BAG, "--robot", "kr150_r3100"],
+        (2, "WRONG_ROBOT"),
+    ),
+    "replay hand-eye": (
+        "replay.hand_eye.json",
+        ["replay", "hand_eye.mcap"],
+        ["replay", "hand_eye.mcap", "--robot", "kr150_r3100"],
         (2, "WRONG_ROBOT"),
     ),
     "history list": (
@@ -157,6 +171,18 @@ CASES = {
         ["tool", "points", "--data", "few_touches.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
+    "hand-eye camera": (
+        "hand-eye.camera.json",
+        [*CAMERA, "--poses", "camera_poses.csv", "--check", "camera_check.csv"],
+        [*CAMERA, "--poses", "few_camera_poses.csv"],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "hand-eye tracker": (
+        "hand-eye.tracker.json",
+        [*TRACKER, "--target", "tracker_target.yaml"],
+        [*TRACKER, "--radius-mm", "19.05"],
+        (3, "RANK_DEFICIENT"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -174,9 +200,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     visits = shift()
     plain_bag(folder / "plain.mcap", visits)
     recorded_bag(folder / "live.mcap", folder / "state", visits)
+    hand_eye_bag(folder / "hand_eye.mcap")
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
+    camera_tables(folder)
+    tracker_files(folder, prp_cell(load_description("p1r2p3").arm))
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)
@@ -194,7 +223,7 @@ def placed(folder: Path, arguments: list[str]) -> list[str]:
     """Names of files become paths in the folder."""
     files = (".csv", ".mcap", ".conf", ".yaml")
     return [
-        str(folder / word) if word.endswith(files) or word in ("state", "nowhere") else word
+        str(folder / word) if word.endswith(files) or word in ("state", "nowhere", SCAN) else word
         for word in arguments
     ]
 

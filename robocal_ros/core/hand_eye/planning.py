@@ -111,46 +111,67 @@ def check_plan(
     ``limit_m``: largest expected error (rms) of a point at the working distance.
     """
     place = target.place(T_base_flange @ T_flange_sensor)
+    state = MountState(T_flange_sensor, (place,))
     whole = target.view(T_base_flange, T_flange_sensor, place)
     unseen = target.unseen(whole)
-    seen = np.array([i for i in range(len(T_base_flange)) if i not in unseen], dtype=np.int64)
-    state = MountState(T_flange_sensor, (place,))
-    k = 6 + len(whole.model.names)
-    rank, words = 0, ["no pose sees the target"]
-    covariance: Array | None = None
-    information = np.zeros((k, k))
-    if len(seen):
-        part = whole.take(np.isin(whole.sightings.pose, seen))
-        J = _samples(part, state, noise, sensor)[1].reshape(-1, k)
-        information = J.T @ J + _prior(whole)
-        found = observability(np.vstack([J, np.sqrt(_prior(whole))]))
-        rank = found.rank
-        poses = T_base_flange[seen]
-        open_ones = [moved_origin(d[:6], sensor.pivot) for d in found.null.T]
-        words = [describe_motion(d, poses) for d in open_ones if np.linalg.norm(d) > 1e-9]
-        if rank == k:
-            covariance = np.asarray(np.linalg.inv(information))
-            at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
-            words = open_directions(at_sensor, sensor.middle_m, poses)
+    rows = ~np.isin(whole.sightings.pose, list(unseen))
+    seen = len(T_base_flange) - len(unseen)
+    shown = _shown(whole.take(rows), state, noise, sensor)
     field = sensor.field_points - sensor.pivot
-    error = None if covariance is None else expected_error_m(covariance[:6, :6], field)
-    verdict = _verdict(len(seen), target.fewest, words, error, limit_m)
+    error = None
+    if shown.covariance is not None:
+        error = expected_error_m(shown.covariance[:6, :6], field)
+    verdict = _verdict(seen, target.fewest, shown.words, error, limit_m)
     proposed, better = np.empty((0, 4, 4)), None
     if not verdict.accept:
-        proposed, better = _propose(
-            target, T_base_flange, state, (information, noise, sensor, limit_m), len(seen)
-        )
+        known = shown.information, noise, sensor, limit_m
+        proposed, better = _propose(target, T_base_flange, state, known, seen)
     return PlanReport(
-        rank,
-        k,
-        tuple(words),
-        None if covariance is None else np.sqrt(np.diag(at_sensor)),
+        shown.rank,
+        len(shown.information),
+        tuple(shown.words),
+        shown.sigma(sensor),
         error,
         unseen,
         proposed,
         better,
         verdict,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What sightings show: information (k, k), its inverse where there is one, open directions."""
+
+    rank: int
+    information: Array
+    covariance: Array | None
+    words: list[str]
+
+    def sigma(self, sensor: SensorRange) -> Array | None:
+        """Expected standard deviations (6,) at the sensor's origin."""
+        if self.covariance is None:
+            return None
+        return np.sqrt(np.diag(at_origin(self.covariance[:6, :6], sensor.pivot)))
+
+
+def _shown(view: View, state: MountState, noise: PoseNoise, sensor: SensorRange) -> _Shown:
+    k = 6 + len(view.model.names)
+    if not view.sightings.names:
+        return _Shown(0, np.zeros((k, k)), None, ["no pose sees the target"])
+    J = _samples(view, state, noise, sensor)[1].reshape(-1, k)
+    prior = _prior(view)
+    found = observability(np.vstack([J, np.sqrt(prior)]))
+    information = J.T @ J + prior
+    poses = view.sightings.T_base_flange
+    if found.rank < k:
+        open_ones = [moved_origin(d[:6], sensor.pivot) for d in found.null.T]
+        words = [describe_motion(d, poses) for d in open_ones if np.linalg.norm(d) > 1e-9]
+        return _Shown(found.rank, information, None, words)
+    covariance = np.asarray(np.linalg.inv(information))
+    at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
+    words = open_directions(at_sensor, sensor.middle_m, poses)
+    return _Shown(found.rank, information, covariance, words)
 
 
 def _samples(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.frame_texts import fixed, urdf_joint, urdf_origin
 
 Array = NDArray[np.float64]
 Format = Literal["urdf", "kuka", "abb", "fanuc", "ur"]
@@ -42,31 +43,16 @@ def exported(T_flange_tool: Array, format: Format, load: Load | None = None) -> 
     return _FORMATS[format](T_flange_tool)
 
 
-def _numbers(values: Array, digits: int) -> list[str]:
-    """Fixed decimals; a zero has no sign."""
-    rounded = np.round(values, digits) + 0.0
-    return [f"{value:.{digits}f}" for value in rounded.tolist()]
-
-
 def _place_mm(T: Array) -> list[str]:
-    return _numbers(T[:3, 3] * 1e3, 4)
+    return fixed(T[:3, 3] * 1e3, 4)
 
 
 def _rpy_deg(T: Array) -> list[str]:
-    return _numbers(np.degrees(frames.rpy(T[:3, :3])), 5)
+    return fixed(np.degrees(frames.rpy(T[:3, :3])), 5)
 
 
 def _urdf(T: Array) -> str:
-    xyz = " ".join(_numbers(T[:3, 3], 7))
-    rpy = " ".join(_numbers(frames.rpy(T[:3, :3]), 8))
-    return (
-        '<link name="tcp"/>\n'
-        '<joint name="tool0-tcp" type="fixed">\n'
-        '  <parent link="tool0"/>\n'
-        '  <child link="tcp"/>\n'
-        f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
-        "</joint>"
-    )
+    return urdf_joint("tool0", "tcp", *urdf_origin(T))
 
 
 def _kuka(T: Array) -> str:
@@ -82,16 +68,16 @@ def _fanuc(T: Array) -> str:
 
 
 def _ur(T: Array) -> str:
-    pose = _numbers(T[:3, 3], 7) + _numbers(frames.log_rotation(T[:3, :3]), 8)
+    pose = fixed(T[:3, 3], 7) + fixed(frames.log_rotation(T[:3, :3]), 8)
     return f"set_tcp(p[{','.join(pose)}])"
 
 
 def _abb(T: Array, load: Load | None) -> str:
-    x, y, z, w = _numbers(frames.quat_xyzw(T), 9)
+    x, y, z, w = fixed(frames.quat_xyzw(T), 9)
     place, turn = ",".join(_place_mm(T)), ",".join((w, x, y, z))
     weight, remark = ABB_UNKNOWN, ABB_REMARK
     if load is not None:
-        centre = ",".join(_numbers(np.array(load.centre) * 1e3, 3))
+        centre = ",".join(fixed(np.array(load.centre) * 1e3, 3))
         weight, remark = f"{load.mass_kg:.3f},[{centre}]", ""
     frame = f"[[{place}],[{turn}]]"
     return f"{remark}PERS tooldata tcp:=[TRUE,{frame},[{weight},[1,0,0,0],0,0,0]];"

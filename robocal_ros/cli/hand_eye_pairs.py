@@ -1,0 +1,194 @@
+"""From the tables and images of ``robocal hand-eye camera`` to its result."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from robocal_ros.core.errors import InputError
+
+if TYPE_CHECKING:
+    from robocal_ros.core.hand_eye.board import Chessboard, Intrinsics, SeenBoards
+    from robocal_ros.core.hand_eye.camera import CameraSettings
+    from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.core.hand_eye.result import HandEyeResult
+    from robocal_ros.core.hand_eye.streams import PoseStream
+    from robocal_ros.core.kinematics import SerialArm
+    from robocal_ros.storage.hand_eye_tables import PoseTable
+
+
+def calibrate(args: argparse.Namespace) -> "HandEyeResult":
+    """Read what the options name and place the camera.
+
+    Raises
+    ------
+    InputError
+        When files or options are wrong.
+    TooFewSamplesError, RankDeficientError, ResidualError
+        As `robocal_ros.core.hand_eye.camera.calibrate_camera`.
+    """
+    settings = _settings(args)
+    if args.measured is not None:
+        for option in ("profiles", "board", "square_mm", "intrinsics"):
+            if getattr(args, option) is not None:
+                raise InputError(
+                    f"--{option.replace('_', '-')} belongs to images, --measured to poses: give "
+                    "one of both"
+                )
+        return _from_poses(args, settings)
+    if args.profiles is None or args.board is None or args.square_mm is None:
+        raise InputError(
+            "give --profiles, --board and --square-mm for images, or --measured for board poses"
+        )
+    return _from_images(args, settings)
+
+
+def _settings(args: argparse.Namespace) -> "CameraSettings":
+    from math import radians
+
+    from robocal_ros.core.hand_eye.camera import CameraSettings
+    from robocal_ros.core.hand_eye.camera_fit import GivenNoise
+
+    noise = GivenNoise(
+        robot_m=None if args.robot_sigma_mm is None else args.robot_sigma_mm * 1e-3,
+        robot_rad=None if args.robot_sigma_deg is None else radians(args.robot_sigma_deg),
+    )
+    return CameraSettings(args.method, noise, args.limit_mm * 1e-3)
+
+
+def _read(path: Path, args: argparse.Namespace, file_column: str | None) -> "PoseTable":
+    from robocal_ros.storage.hand_eye_tables import read_pose_table
+
+    return read_pose_table(path, _arm(args), file_column)
+
+
+def _arm(args: argparse.Namespace) -> "SerialArm | None":
+    from robocal_ros.storage.robots import load_robot
+
+    return None if args.robot is None else load_robot(args.robot)
+
+
+def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
+    from robocal_ros.core.hand_eye.board import Chessboard
+    from robocal_ros.core.hand_eye.camera import calibrate_camera
+    from robocal_ros.storage.camera_files import read_intrinsics
+
+    columns, rows = args.board
+    board = Chessboard(columns, rows, args.square_mm * 1e-3)
+    intrinsics = None if args.intrinsics is None else read_intrinsics(args.intrinsics)
+    pairs, seen = _pairs_of_images(args.poses, args, board, intrinsics)
+    check = None
+    if args.check is not None:
+        check = _pairs_of_images(args.check, args, board, seen.intrinsics)[0]
+    return calibrate_camera(
+        pairs,
+        settings,
+        check=check,
+        rejected=seen.rejected,
+        more={"intrinsics": _intrinsics_document(seen, intrinsics is None)},
+    )
+
+
+def _pairs_of_images(
+    path: Path, args: argparse.Namespace, board: "Chessboard", intrinsics: "Intrinsics | None"
+) -> "tuple[PosePairs, SeenBoards]":
+    from robocal_ros.core.hand_eye.board import see_boards
+    from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.storage.camera_files import read_images
+
+    table = _read(path, args, "image")
+    images, unread = read_images(args.profiles, table)
+    seen = see_boards(images, board, intrinsics)
+    row = {name: index for index, name in enumerate(table.names)}
+    pairs = PosePairs(
+        T_base_flange=table.T_base_flange[[row[name] for name in seen.names]],
+        T_camera_board=seen.T_camera_board,
+        names=seen.names,
+        mount=args.mount,
+        covariance=seen.covariance,
+        shared=seen.shared,
+    )
+    return pairs, replace(seen, rejected=unread | seen.rejected)
+
+
+def _intrinsics_document(seen: "SeenBoards", from_images: bool) -> dict[str, Any]:
+    camera = seen.intrinsics
+    return {
+        "from_images": from_images,
+        "fx_px": float(camera.matrix[0, 0]),
+        "fy_px": float(camera.matrix[1, 1]),
+        "cx_px": float(camera.matrix[0, 2]),
+        "cy_px": float(camera.matrix[1, 2]),
+        "distortion": camera.distortion.tolist(),
+        "width_px": camera.size[0],
+        "height_px": camera.size[1],
+        "sigma": None
+        if camera.covariance is None
+        else [float(variance) ** 0.5 for variance in camera.covariance.diagonal()],
+        "noise_px": seen.noise_px,
+    }
+
+
+def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
+    from robocal_ros.core.hand_eye.camera import calibrate_camera
+    from robocal_ros.core.hand_eye.streams import calibrate_streams
+    from robocal_ros.storage.hand_eye_tables import read_pose_table
+
+    robot = _read(args.poses, args, None)
+    camera = read_pose_table(args.measured, None, None)
+    check = None if args.check is None else _read(args.check, args, None)
+    tables = [robot, camera] if check is None else [robot, camera, check]
+    stamped = all(table.stamp_ns is not None for table in tables)
+    if stamped and not all(table.named for table in tables):
+        origin_ns = int(min(_stamps(table)[0] for table in tables))
+        streams = [_stream(table, origin_ns) for table in tables]
+        judge = None if check is None else streams[2]
+        return calibrate_streams(streams[0], streams[1], args.mount, settings, judge)
+    if check is not None and not check.named:
+        raise InputError("needs a column sample, as the measured poses", file=check.path, row=1)
+    pairs, alone = _paired(robot, camera, args.mount)
+    judges = None if check is None else _paired(check, camera, args.mount)[0]
+    if judges is not None:
+        alone = {name: why for name, why in alone.items() if name not in judges.names}
+    return calibrate_camera(pairs, settings, check=judges, rejected=alone)
+
+
+def _stamps(table: "PoseTable") -> Any:
+    if table.stamp_ns is None:
+        raise ValueError("a table without stamps is no stream")
+    return table.stamp_ns
+
+
+def _stream(table: "PoseTable", origin_ns: int) -> "PoseStream":
+    from robocal_ros.core.hand_eye.streams import stream_of
+
+    return stream_of(_stamps(table), table.T_base_flange, table.names, origin_ns, table.path)
+
+
+def _paired(
+    robot: "PoseTable", camera: "PoseTable", mount: Any
+) -> "tuple[PosePairs, dict[str, str]]":
+    """Pairs of the same sample, or row; and the samples that only one table has."""
+    from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+
+    if not robot.named and not camera.named and len(robot) != len(camera):
+        raise InputError(
+            f"has {len(camera)} rows, {robot.path} has {len(robot)}: name them in a column sample "
+            "in both tables, or give stamp_s in both",
+            file=camera.path,
+        )
+    place = {name: index for index, name in enumerate(camera.names)}
+    rows = [index for index, name in enumerate(robot.names) if name in place]
+    names = tuple(robot.names[index] for index in rows)
+    if not names:
+        raise InputError(f"has no sample of {robot.path}", file=camera.path, column="sample")
+    pairs = PosePairs(
+        robot.T_base_flange[rows],
+        camera.T_base_flange[[place[name] for name in names]],
+        names,
+        mount,
+    )
+    alone = {name: f"not in {camera.path}" for name in robot.names if name not in place}
+    known = set(robot.names)
+    alone |= {name: f"not in {robot.path}" for name in camera.names if name not in known}
+    return pairs, alone

@@ -1,0 +1,52 @@
+"""From the bag of a hand-eye node to its calibrations: what ``robocal replay`` computes of it."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from robocal_ros import __version__
+from robocal_ros.cli.output import Document
+from robocal_ros.cli.recording import Recording
+from robocal_ros.cli.replay_parts import commanded_document, seconds
+from robocal_ros.core.documents import transform_document
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import Head
+from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
+from robocal_ros.sessions.hand_eye_recorded import hand_eye_session_as_recorded
+from robocal_ros.sessions.replay import replay
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+
+def replay_hand_eye(
+    recording: Recording, arm: SerialArm, history: CalibrationHistory, samples: Iterable[Any]
+) -> Document:
+    """Replay what a hand-eye node recorded: each calibration with its figures.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag lacks what a replay needs.
+    """
+    if recording.configured is None:
+        raise InputError("the bag holds no configuration of a hand-eye node")
+    session = hand_eye_session_as_recorded(arm, history, recording.configured, __version__)
+    report = replay(session, samples, recording.commands, recording.inputs, take_hand_eye_message)
+    return commanded_document(report, session, recording) | {
+        "calibrations": [
+            {"stamp": seconds(o.command.stamp_ns), **(o.document or {})}
+            for o in report.outcomes
+            if o.document is not None and o.calibration_id
+        ],
+        "final_sensor": _sensor(session.in_force),
+    }
+
+
+def _sensor(head: Head) -> Document | None:
+    """What is in force at the end; None: nothing is."""
+    if head.model is None:
+        return None
+    frames = {name: head.model[name] for name in ("parent", "child")}
+    T = np.array(head.model["T_parent_sensor"])
+    return frames | transform_document(T) | {"revision": head.revision}

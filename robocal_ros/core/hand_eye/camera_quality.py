@@ -1,0 +1,81 @@
+"""How good a camera's place is: leave-one-out, the error to expect, the decision."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.camera_fit import PairFit
+from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
+
+Array = NDArray[np.float64]
+
+MOST_REJECTED = 1.0 / 3.0
+LARGEST_RMS_M = 5e-3
+LEAST_REST = 1e-6  # what the others say about a sample, where they say anything
+
+
+def distances(pairs: PosePairs, at: Placement) -> Array:
+    """How far the board, as seen, lies from where the robot has it (m,), m."""
+    miss = differences(predicted(pairs, at), pairs)
+    return np.asarray(np.linalg.norm(miss[:, :3], axis=1))
+
+
+def left_out(fit: PairFit) -> Array | None:
+    """How far each used sample (n,) lies from the solution without it, m; to first order.
+
+    By the leverage of each sample: (I - H_ii)^-1 r_i, as of linear least squares. None where a
+    sample alone determines a direction: nothing solves without it.
+    """
+    used = ~fit.rejected
+    root = np.linalg.cholesky(fit.expected[used])
+    J = np.linalg.solve(root, fit.jacobian[used])
+    M = fit.estimate.covariance / fit.estimate.scale**2
+    rest = np.eye(6) - J @ M @ J.swapaxes(1, 2)
+    if float(np.linalg.eigvalsh(rest).min()) < LEAST_REST:
+        return None
+    whitened = np.linalg.solve(root, fit.differences[used][..., None])
+    alone = root @ np.linalg.solve(rest, whitened)
+    return np.asarray(np.linalg.norm(alone[:, :3, 0], axis=1))
+
+
+def working_error(fit: PairFit) -> float:
+    """Rms error, m, to expect of a point where the boards were on average."""
+    where = fit.pairs.T_camera_board[:, :3, 3].mean(axis=0)
+    J = np.concatenate([np.eye(3), -frames.skew(where)], axis=1)
+    return float(np.sqrt(np.trace(J @ fit.covariance[:6, :6] @ J.T)))
+
+
+def verdict(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdict:
+    """Whether a fit may be used; ``size`` (n,) of the residuals used, m."""
+    count, total = len(size), len(fit.pairs)
+    words = (
+        f"{count} of {total} samples within {rms(size) * 1e3:.3f} mm rms; expected error "
+        f"{error_m * 1e3:.3f} mm at {fit.pairs.distance_m * 1e3:.0f} mm"
+    )
+    if fit.estimate.creeping:
+        return Verdict(Code.POSES_NOT_INFORMATIVE, f"{fit.estimate.creeping}; {words}")
+    if rms(size) > LARGEST_RMS_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
+            "intrinsics, the robot's model, and that board and camera sit tight",
+        )
+    if total - count > MOST_REJECTED * total:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words}; too many samples miss the others: check that board and camera sit tight",
+        )
+    if error_m > limit_m:
+        return Verdict(
+            Code.POSES_NOT_INFORMATIVE,
+            f"{words} (allowed {limit_m * 1e3:.4g}): measure at more poses, turned "
+            "further about two axes",
+        )
+    return Verdict(Code.ACCEPT, words)
+
+
+def rms(size: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(size**2)))

@@ -1,0 +1,62 @@
+"""Targets as plain documents (JSON, SI), exact to the last bit: as recordings carry them."""
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+Target = SphereTarget | StepTarget | LineTarget
+
+KIND_OF: dict[type[Target], str] = {SphereTarget: "sphere", StepTarget: "step", LineTarget: "line"}
+TYPE_OF = {kind: type_ for type_, kind in KIND_OF.items()}
+
+
+def target_document(kind: str, target: Target | None) -> Document:
+    """A target with its ``kind``; None where nothing is known of it beforehand.
+
+    Raises
+    ------
+    InputError
+        When the target is of another kind.
+    """
+    if target is None:
+        return {"kind": kind}
+    if KIND_OF[type(target)] != kind:
+        raise InputError(f"the target file describes a {KIND_OF[type(target)]}, not a {kind}")
+    return {"kind": kind} | {f.name: _plain(getattr(target, f.name)) for f in fields(target)}
+
+
+def target_of(document: Mapping[str, Any]) -> Target | None:
+    """Read what `target_document` gave, also after JSON.
+
+    Raises
+    ------
+    InputError
+        When it is no such document.
+    """
+    values = {name: _array(value) for name, value in document.items() if name != "kind"}
+    if not values:
+        return None
+    try:
+        return TYPE_OF[document["kind"]](**values)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the target cannot be read: {error}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _plain(part) for name, part in value.items()}
+    return np.asarray(value).tolist()
+
+
+def _array(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _array(part) for name, part in value.items()}
+    return np.array(value, dtype=np.float64) if isinstance(value, list) else value

@@ -1,0 +1,241 @@
+"""The hand-eye node: joints and what a sensor sees in, the sensor's place out.
+
+docs/hand_eye_node.md.
+"""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import JointState, PointCloud2
+
+from robocal_ros import __version__
+from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.proposals import hand_eye_kind
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.command_desk import CommandDesk
+from robocal_ros.nodes.decision_services import DecisionServices
+from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.frame_watch import FrameWatch
+from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
+from robocal_ros.nodes.hand_eye_services import HandEyeServices
+from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
+from robocal_ros.nodes.run import run
+from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
+from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
+from robocal_ros.sessions.hand_eye_recorded import configuration
+from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.silence import Silence
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+COMMAND_S = 1.0
+WATCH_S = 0.1
+INPUTS = {
+    JOINTS: (JointState, STREAM),
+    PROFILE: (PointCloud2, qos.SENSOR),
+    TARGET_POSE: (PoseStamped, qos.SENSOR),
+}
+
+
+class HandEyeNode(HouseNode):
+    """Drives a `HandEyeSession` with live messages and calls."""
+
+    NAME = "hand_eye_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._session: HandEyeSession | None = None
+        self._history: CalibrationHistory | None = None
+
+    def configure(self) -> None:
+        """Read the robot, open the history, then the topics and services."""
+        settings = self.settings
+        self._nominal = load_robot(settings["robot"])
+        self._config = session_config(settings)
+        self._serial_in_use = settings["serial"] or NO_SERIAL
+        folder = settings["state_dir"]
+        self._history = CalibrationHistory.open(
+            self._serial_in_use,
+            model_hash=self._nominal.model_hash,
+            state_dir=Path(folder) if folder else None,
+        )
+        self._kind = hand_eye_kind(self._config.sensor_frame)
+        self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
+        self._guard = SourceGuard(self, JOINTS)
+        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
+        for kind, (message_type, profile) in INPUTS.items():
+            self.add_input(message_type, kind, self._taker(kind), profile)
+        self._desk = CommandDesk(self, COMMAND_S, self._show)
+        HandEyeServices(self, settings, self._desk.ask, lambda: self._session, self._history)
+        DecisionServices(self.add_service, self._ask_decision, self._history, self._kind)
+        self.add_timer(POLL_S, self._poll, steady=True)
+        self.add_timer(WATCH_S, self._watch, steady=True)
+
+    def activate(self) -> None:
+        """Begin a session; it knows nothing of what was captured before."""
+        if self._history is None:
+            raise ValueError("activated before it was configured")
+        self._session = HandEyeSession(self._nominal, self._history, self._config, __version__)
+        self._desk.session = self._session
+        self._frames = FrameWatch(self, self._config.sensor_frame)
+        self._last: Outcome | None = None
+        self._shown: tuple[int, int] | None = None
+        self._silence, self._newest_ns = Silence(), 0
+        self._show_in_force()
+        self._outputs.status(self._session, None)
+
+    def deactivate(self) -> None:
+        """End the session; calls that wait are answered."""
+        self._session = None
+        self._frames.close()
+        self._desk.close()
+
+    def cleanup(self) -> None:
+        """Close the history."""
+        self._session = None
+        if self._history is not None:
+            self._history.close()
+        self._history = None
+
+    # ---- samples and commands -------------------------------------------------------------------
+
+    def _taker(self, kind: str) -> Any:
+        def take(message: Any) -> None:
+            session = self._session
+            if session is None:
+                return
+            if kind == JOINTS:
+                if not session.received[JOINTS]:
+                    self._guard.look()
+                if self._guard.fault:
+                    session.refuse(JOINTS, InputError(self._guard.fault))
+                    return
+            take_hand_eye_message(session, kind, message)
+            if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
+                self._newest_ns = session.newest_joints_ns
+                self._silence.heard(time.monotonic())
+            if (command := session.recognised()) is not None:
+                self._desk.ask(command)
+
+        return take
+
+    def _ask_decision(self, command: Command) -> Any:
+        if command.name == ACCEPT and (fault := self._frame_fault(command)):
+            raise InputError(fault)
+        return self._desk.ask(command)
+
+    def _frame_fault(self, command: Command) -> str:
+        """Why what a command would bring into force cannot stand on tf; empty when it can."""
+        history = self._history
+        if history is None or self._session is None:
+            return ""
+        pending = [entry.id for entry in history.pending(self._kind)]
+        chosen = [int(command.arguments["id"])] if "id" in command.arguments else pending[:1]
+        parents = [history.model(one).get("parent") for one in chosen]
+        return "".join(self._frames.conflict(parent) for parent in parents if parent)
+
+    def _watch(self) -> None:
+        """A capture ends too when the joint states do."""
+        session = self._session
+        if session is None:
+            return
+        silent_s = self._silence.look(time.monotonic())
+        if (command := session.silent(silent_s)) is not None:
+            self._desk.ask(command)
+
+    def _poll(self) -> None:
+        self._guard.look()
+        if self._session is None:
+            return
+        self._frames.look()
+        for outcome in self._session.poll():
+            self._show(outcome)
+        self._show_in_force()
+
+    # ---- outputs --------------------------------------------------------------------------------
+
+    def _show(self, outcome: Outcome) -> None:
+        name, session = outcome.command.name, self._session
+        words = f"{name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
+        if session is None:
+            return
+        self._last = outcome
+        try:
+            self._outputs.event(outcome.command, outcome)
+            if name == CALIBRATE:
+                self._show_quality(outcome)
+            self._show_in_force()
+        except (RobocalError, ValueError) as error:  # what is done stays done
+            self.get_logger().error(f"{name} was done but not published: {error}")
+        self._outputs.status(session, outcome)
+
+    def _show_quality(self, outcome: Outcome) -> None:
+        history, number = self._history, outcome.calibration_id
+        if history is None:
+            return
+        frame = str(history.model(number)["parent"]) if number else self._config.flange_frame
+        self._outputs.quality(outcome, frame, history.get(number) if number else None)
+
+    def _show_in_force(self) -> None:
+        """Put the sensor in force onto tf and record the new state, when either changed."""
+        session, history = self._session, self._history
+        if session is None or history is None:
+            return
+        head = session.in_force
+        shown = head.revision, session.current.thermal.revision
+        if self._shown == shown or self._conflict():
+            return
+        stamp_ns = 0 if head.calibration_id is None else history.get(head.calibration_id).stamp_ns
+        self._outputs.transform(head, stamp_ns)
+        if head.model is not None:
+            self._frames.own.add(head.model["parent"])
+        self._shown = shown
+        self._outputs.event(configuration(session, self._topics), None)
+        self._outputs.status(session, self._last)
+
+    def _conflict(self) -> str:
+        model = None if self._session is None else self._session.in_force.model
+        return "" if model is None else self._frames.conflict(model["parent"])
+
+    def health(self) -> Health:
+        """Tell what is in force, what is captured, what was lost or ignored, what is wrong."""
+        session, health = self._session, Health()
+        if session is None:
+            return health
+        values: dict[str, object] = {"revision in force": session.in_force.revision}
+        data = session.data
+        values["data set"] = (
+            "none"
+            if data is None
+            else f"{data.kind}, {len(data.samples)} samples of {len(data.captures)} captures"
+        )
+        for topic, reasons in session.ignored.items():
+            for reason, count in reasons.items():
+                last = session.ignored.last(topic, reason)
+                values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
+        for fault in (self._guard.fault, session.current.fault, self._conflict()):
+            if fault:
+                health.worsen(ERROR, fault)
+        if self._outputs.missing:
+            health.worsen(WARN, self._outputs.missing)
+        if self._serial_in_use == NO_SERIAL:
+            health.worsen(WARN, "no serial is set: the history is kept as 'unset'")
+        health.values = values
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(HandEyeNode)

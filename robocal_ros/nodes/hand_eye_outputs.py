@@ -1,0 +1,145 @@
+"""What the hand-eye node says: its topics, and how results get onto them."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from rclpy.qos import QoSProfile
+from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.proposals import Entry, Head
+from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_data import IN_HAND, TO_HAND, Capture
+
+AddOutput = Callable[[type, str, QoSProfile], Any]
+
+TARGETS = {
+    HandEyeStatus.SPHERE: "sphere",
+    HandEyeStatus.STEP: "step",
+    HandEyeStatus.LINE: "line",
+    HandEyeStatus.CAMERA: "camera",
+}
+MOUNTS = {HandEyeStatus.ON_FLANGE: IN_HAND, HandEyeStatus.FIXED: TO_HAND}
+NUMBER_OF = {name: number for number, name in (TARGETS | {}).items()}
+MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
+
+
+class HandEyeOutputs:
+    """Publishers of one sensor's results.
+
+    Parameters
+    ----------
+    add : creates a publisher.
+    robot, serial : as messages carry them.
+
+    Attributes
+    ----------
+    missing : what cannot be published on this machine; empty when everything can.
+    """
+
+    def __init__(self, add: AddOutput, robot: str, serial: str) -> None:
+        self._robot, self._serial = robot, serial
+        self._sequence = 0
+        self._status = add(HandEyeStatus, "~/status", qos.LATCHED)
+        self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
+        self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self._tf: Any = None
+        self.missing = ""
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError:
+            self.missing = "no /tf_static: tf2_msgs is missing (apt install ros-jazzy-tf2-msgs)"
+        else:
+            self._tf_message = TFMessage
+            self._tf = add(TFMessage, "/tf_static", qos.LATCHED)
+
+    def status(self, session: HandEyeSession, last: Outcome | None) -> None:
+        """Say how far the data set is, and what came of the last command."""
+        self._status.publish(status_message(session, last))
+
+    def transform(self, head: Head, stamp_ns: int) -> None:
+        """Put what is in force onto tf; nothing in force: late subscribers get no transform."""
+        if self._tf is None:
+            return
+        transforms = [] if head.model is None else [transform_message(head.model, stamp_ns)]
+        self._tf.publish(self._tf_message(transforms=transforms))
+
+    def quality(self, outcome: Outcome, frame: str, entry: Entry | None) -> None:
+        """Show the verdict on a calibration, or why there is none."""
+        message = CalibrationQuality(
+            header=conversions.header(outcome.command.stamp_ns or 0, frame),
+            robot=self._robot,
+            serial=self._serial,
+            candidate_id=outcome.calibration_id,
+            code=int(outcome.status),
+            accept=outcome.done,
+            reason=outcome.message,
+            samples=outcome.samples,
+        )
+        document = outcome.document or {}
+        message.unobservable = list(document.get("unobservable", ()))
+        message.rejected = list(document.get("rejected", ()))
+        if entry is not None:
+            left_out = document["leave_one_out_mm"]
+            message.predicted_rms_mm = float(document["working_error_mm"] or 0.0)
+            if left_out is not None:
+                message.held_out = outcome.samples
+                message.candidate_mean_mm = float(left_out["mean"])
+                message.candidate_max_mm = float(left_out["max"])
+                message.candidate_rms_mm = float(entry.candidate_rms_mm or 0.0)
+        self._quality.publish(message)
+
+    def event(self, command: Command, outcome: Outcome | None) -> None:
+        """Record a command and what came of it, None for the configuration."""
+        self._sequence += 1
+        self._events.publish(conversions.event_message(command, outcome, self._sequence))
+
+
+def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStatus:
+    """The state of a session."""
+    data, config = session.data, session.config
+    fixed = data is not None and data.mount == TO_HAND
+    message = HandEyeStatus(
+        header=conversions.header(
+            session.newest_joints_ns, config.base_frame if fixed else config.flange_frame
+        ),
+        child_frame_id=config.sensor_frame,
+        state=HandEyeStatus.IDLE,
+        revision=session.in_force.revision,
+    )
+    if data is not None:
+        waits = data.waiting is not None
+        message.state = HandEyeStatus.CAPTURING if waits else HandEyeStatus.COLLECTING
+        message.target, message.method = NUMBER_OF[data.kind], data.method
+        message.mount, message.candidate_id = MOUNT_NUMBER_OF[data.mount], data.candidate
+        message.samples = [_sample(one) for _, one in sorted(data.captures.items())]
+    if last is not None:
+        message.last_command, message.last_message = last.command.name, last.message
+        message.last_status = int(last.status)
+    return message
+
+
+def _sample(capture: Capture) -> HandEyeSample:
+    states = {Code.NONE: HandEyeSample.WAITING, Code.ACCEPT: HandEyeSample.CAPTURED}
+    return HandEyeSample(
+        handle=capture.handle,
+        mark=capture.mark,
+        state=states.get(capture.code, HandEyeSample.FAILED),
+        reason=capture.reason,
+        status=int(capture.code),
+        stamp=conversions.time_message(capture.stamp_ns),
+    )
+
+
+def transform_message(model: dict[str, Any], stamp_ns: int) -> TransformStamped:
+    """A calibration as a transform."""
+    return TransformStamped(
+        header=conversions.header(stamp_ns, model["parent"]),
+        child_frame_id=model["child"],
+        transform=conversions.transform_message(np.array(model["T_parent_sensor"])),
+    )

@@ -1,0 +1,177 @@
+"""The services of the hand-eye node: each call becomes a command to the session."""
+
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from robocal_msgs.srv import (
+    CalibrateHandEye,
+    CaptureHandEye,
+    HandEyeFile,
+    RemoveHandEye,
+    StartHandEye,
+)
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.nodes.conversions import transform_message, trigger_text
+from robocal_ros.nodes.decision_services import answer, twin
+from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
+from robocal_ros.nodes.hand_eye_outputs import MOUNTS, TARGETS
+from robocal_ros.nodes.hand_eye_plan import HandEyePlan
+from robocal_ros.nodes.hand_eye_settings import start_arguments
+from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+Ask = Callable[[Command], Awaitable[Outcome]]
+
+
+class HandEyeServices:
+    """Data set, captures, calibration and files, with their Trigger twins.
+
+    Parameters
+    ----------
+    ask : gives a command to the session and awaits its outcome.
+    session : the one that runs; None while the node is inactive.
+    """
+
+    def __init__(
+        self,
+        node: EndpointNode,
+        settings: Mapping[str, Any],
+        ask: Ask,
+        session: Callable[[], HandEyeSession | None],
+        history: CalibrationHistory,
+    ) -> None:
+        self._settings, self._ask = settings, ask
+        self._session_now, self._history = session, history
+        add = node.add_service
+        add(StartHandEye, "~/start", self._start)
+        add(Trigger, "~/start_trigger", self._start_twin)
+        add(CaptureHandEye, "~/capture", self._capture)
+        add(Trigger, "~/capture_trigger", self._capture_twin)
+        add(Trigger, "~/result_trigger", self._result_twin)
+        add(RemoveHandEye, "~/remove", self._remove)
+        add(Trigger, "~/remove_trigger", twin(ask, REMOVE, {"handle": 0}))
+        add(CalibrateHandEye, "~/calibrate", self._calibrate)
+        add(Trigger, "~/calibrate_trigger", twin(ask, CALIBRATE, {}))
+        add(HandEyeFile, "~/load", self._load)
+        add(HandEyeFile, "~/save", self._save)
+        HandEyePlan(node, settings, lambda: self._session, history)
+
+    @property
+    def _session(self) -> HandEyeSession:
+        session = self._session_now()
+        if session is None:
+            raise NotActiveError("no session: activate the node")
+        return session
+
+    async def _start(self, request: Any, response: Any) -> Any:
+        kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
+        given = kind, request.target_file, request.feature, request.method, mount
+        arguments = start_arguments(self._settings, *given)
+        return answer(response, await self._ask(Command(START, arguments)))
+
+    async def _start_twin(self, request: Any, response: Any) -> Any:
+        try:
+            arguments = start_arguments(self._settings)
+        except RobocalError as error:
+            response.message = trigger_text(0, error.code, str(error))
+            return response
+        return await twin(self._ask, START, arguments)(request, response)
+
+    async def _capture(self, request: Any, response: Any) -> Any:
+        outcome = await self._ask(Command(CAPTURE, {"mark": request.mark}))
+        response.handle = _handle(outcome)
+        return answer(response, outcome)
+
+    async def _capture_twin(self, request: Any, response: Any) -> Any:
+        try:
+            outcome = await self._ask(Command(CAPTURE, {}))
+        except RobocalError as error:  # deactivated meanwhile
+            response.message = trigger_text(0, error.code, str(error))
+            return response
+        response.success = outcome.done
+        response.message = trigger_text(_handle(outcome), outcome.status, outcome.message)
+        return response
+
+    def _result_twin(self, request: Any, response: Any) -> Any:
+        """How the newest capture ended; while it waits: no success, with CONFLICT."""
+        data = self._session.data
+        if data is None or not data.captures:
+            response.message = trigger_text(0, Code.CONFLICT, "nothing was captured yet")
+            return response
+        last = data.captures[max(data.captures)]
+        response.success = last.code is Code.ACCEPT
+        code = Code.CONFLICT if last.code is Code.NONE else last.code
+        response.message = trigger_text(last.handle, code, last.reason)
+        return response
+
+    async def _remove(self, request: Any, response: Any) -> Any:
+        if request.handle == 0:
+            raise InputError("remove needs the handle of a capture; look at the status")
+        outcome = await self._ask(Command(REMOVE, {"handle": request.handle}))
+        response.samples = outcome.samples
+        return answer(response, outcome)
+
+    async def _calibrate(self, request: Any, response: Any) -> Any:
+        arguments = {"method": request.method, "handles": list(request.handles)}
+        outcome = await self._ask(Command(CALIBRATE, arguments))
+        document = outcome.document or {}
+        response.candidate_id, response.samples = outcome.calibration_id, outcome.samples
+        response.expected_error_mm = -1.0
+        response.unobservable = list(document.get("unobservable", ()))
+        if outcome.calibration_id:
+            model = self._history.model(outcome.calibration_id)
+            response.sensor = transform_message(np.array(model["T_parent_sensor"]))
+            if document["covariance"] is not None:
+                response.covariance = np.ravel(document["covariance"]).tolist()
+            if document["working_error_mm"] is not None:
+                response.expected_error_mm = float(document["working_error_mm"])
+            response.residual_mm = float(document["residual_mm"]["rms"])
+            because = document["rejected_because"]
+            response.rejected = [f"{name}: {why}" for name, why in because.items()]
+        return answer(response, outcome)
+
+    async def _load(self, request: Any, response: Any) -> Any:
+        from robocal_ros.storage.hand_eye_bags import read_data_set  # heavy: not at a node's start
+
+        document = read_data_set(_path(request), self._session.nominal)
+        outcome = await self._ask(Command(LOAD, {"path": request.path, "set": document}))
+        response.samples = outcome.samples
+        return answer(response, outcome)
+
+    def _save(self, request: Any, response: Any) -> Any:
+        from robocal_ros.storage.hand_eye_bags import write_data_set
+
+        session, path = self._session, _path(request)
+        data = session.data
+        if data is None or not data.samples:
+            raise ConflictError("nothing was captured yet: there is nothing to save")
+        frame = session.config.sensor_frame
+        write_data_set(path, data.document(), data.topic, frame, session.nominal)
+        response.success, response.status = True, int(Code.ACCEPT)
+        response.samples = len(data.samples)
+        response.message = f"{response.samples} samples saved in {path}"
+        return response
+
+
+def _handle(outcome: Outcome) -> int:
+    return int(outcome.command.arguments["handle"]) if outcome.done else 0
+
+
+def _path(request: Any) -> Path:
+    if not request.path:
+        raise InputError("path is empty: name the file")
+    return Path(request.path)
+
+
+def _named(names: Mapping[int, str], number: int) -> str:
+    """The name of a constant of HandEyeStatus; empty for 0."""
+    if number and number not in names:
+        known = ", ".join(f"{n} ({name})" for n, name in names.items())
+        raise InputError(f"{number} is none of {known}")
+    return names.get(number, "")

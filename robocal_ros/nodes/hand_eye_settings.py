@@ -1,0 +1,124 @@
+"""Parameters of the hand-eye node."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.hand_eye.target_documents import target_document
+from robocal_ros.nodes.parameters import Setting, length
+from robocal_ros.nodes.pose_settings import pose_settings
+from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
+from robocal_ros.sessions.hand_eye_config import HandEyeConfig
+from robocal_ros.sessions.hand_eye_data import FEATURES, TOPIC_OF
+from robocal_ros.sessions.hand_eye_solving import METHODS, MOUNTS, WITHOUT_FILE
+from robocal_ros.storage.hand_eye_targets import read_target
+
+
+def _range_fault(values: list[float]) -> str | None:
+    if len(values) != 3:
+        return "three lengths are wanted"
+    return None if values[0] < values[1] else "the nearest distance must be below the farthest"
+
+
+SETTINGS = (
+    Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
+    Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    Setting("base_frame", "base", "Name of the robot's base frame"),
+    Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
+    Setting("sensor_frame", "sensor", "Name of the sensor's frame, in its messages and on tf"),
+    Setting("target", "sphere", "Target where a call names none", choices=tuple(TOPIC_OF)),
+    Setting("target_file", "", "File of the target where a call names none"),
+    Setting("feature", FEATURES[0], "What a line is in a profile", choices=FEATURES),
+    Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
+    Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
+    *STANDSTILL,
+    Setting(
+        "capture_timeout_s",
+        10.0,
+        "A capture without standstill or without a measurement for so long fails",
+        unit="s",
+        low=0.5,
+        high=600.0,
+    ),
+    length(
+        "robot_sigma_mm", 0.0, "Error of a reported pose in each axis; 0: from the data", 0.0, 10.0
+    ),
+    Setting(
+        "robot_sigma_deg",
+        0.0,
+        "And of its turn about each axis, where robot_sigma_mm is given",
+        unit="deg",
+        low=0.0,
+        high=1.0,
+    ),
+    length("limit_mm", 0.5, "Largest expected error at the working distance", 1e-3, 100.0),
+    *pose_settings(
+        "rough",
+        "About where the sensor sits on the flange, for check_plan before any calibration",
+        "Its orientation: x along the laser line, z along the beam",
+    ),
+    Setting(
+        "sensor_range_mm",
+        [190.0, 210.0, 60.0],
+        "Nearest and farthest distance of the sensor, and its width; for check_plan",
+        unit="mm",
+        low=1.0,
+        high=20000.0,
+        check=_range_fault,
+    ),
+    length("sensor_noise_mm", 0.037, "Noise of a point along the beam; for check_plan", 1e-4, 10.0),
+)
+
+
+def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
+    """Settings of the session, in SI.
+
+    Raises
+    ------
+    InputError
+        When the sensor's frame has no name of its own.
+    """
+    names = settings["base_frame"], settings["flange_frame"], settings["sensor_frame"]
+    if not all(names) or len(set(names)) < len(names):
+        told = ", ".join(f"'{name}'" for name in names)
+        raise InputError(f"base, flange and sensor need frames of different names, not {told}")
+    return HandEyeConfig(
+        base_frame=settings["base_frame"],
+        flange_frame=settings["flange_frame"],
+        sensor_frame=settings["sensor_frame"],
+        standstill=standstill_rule(settings),
+        capture_timeout_s=settings["capture_timeout_s"],
+        robot_sigma_m=settings["robot_sigma_mm"] * 1e-3 or None,
+        robot_sigma_rad=float(np.radians(settings["robot_sigma_deg"])) or None,
+        limit_m=settings["limit_mm"] * 1e-3,
+    )
+
+
+def start_arguments(
+    settings: Mapping[str, Any],
+    kind: str = "",
+    file: str = "",
+    feature: str = "",
+    method: str = "",
+    mount: str = "",
+) -> dict[str, Any]:
+    """Arguments of the command that begins a data set; what is empty comes from the settings.
+
+    Raises
+    ------
+    InputError
+        When the target's file is missing, or describes another target.
+    """
+    kind, name = kind or settings["target"], file or settings["target_file"]
+    if not name and kind not in WITHOUT_FILE:
+        raise InputError(f"target_file is empty: name the file that describes the {kind}")
+    target = read_target(Path(name)) if name else None
+    return {
+        "target": target_document(kind, target),
+        "feature": feature or settings["feature"],
+        "method": method or settings["method"],
+        "mount": mount or settings["mount"],
+    }

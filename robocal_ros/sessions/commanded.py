@@ -1,0 +1,122 @@
+"""A session's commands in their turn, and the joint readings whose stamps they go by."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import Head
+from robocal_ros.core.samples import JointSample
+from robocal_ros.core.streams import JointStream
+from robocal_ros.sessions import events
+from robocal_ros.sessions.bounds import reached
+from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.followed import Followed
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.ignored import Ignored
+from robocal_ros.sessions.in_force import outside_decision
+from robocal_ros.sessions.observations import JOINTS, JUMPS
+
+GAP_NS = 250_000_000
+Handler = Callable[[Command, int], Outcome]
+
+
+class Commanded:
+    """Base of the sessions that carry out a command as soon as it is given.
+
+    A subclass gives its handlers. A recorded command waits for its marks.
+
+    Parameters
+    ----------
+    kind : of the calibrations that it decides about.
+    current : follows what is in force.
+
+    Attributes
+    ----------
+    stream : the joint readings.
+    received, ignored : samples by topic, and those that were not used.
+    newest_ns : newest stamp of each topic.
+    """
+
+    def __init__(self, nominal: SerialArm, history: History, kind: str, current: Followed) -> None:
+        self.nominal, self._history, self._kind = nominal, history, kind
+        self._followed = current
+        self._queue: list[Command] = []
+        self._jumps = 0
+        self.stream = JointStream(nominal.joint_names)
+        self.newest_ns: dict[str, int] = {}
+        self.received: Counter[str] = Counter()
+        self.ignored = Ignored()
+
+    def _handlers(self) -> Mapping[str, Handler]:
+        """What carries out each command beside the decisions."""
+        raise NotImplementedError
+
+    @property
+    def in_force(self) -> Head:
+        """Head of its kind as the session last saw it."""
+        return self._followed.head
+
+    @property
+    def marks(self) -> dict[str, int]:
+        """How far the samples have come: newest stamps, and jumps of the clock."""
+        return self.newest_ns | {JUMPS: self._jumps}
+
+    @property
+    def newest_joints_ns(self) -> int:
+        """Stamp of the newest joint reading; 0 before any."""
+        return self.newest_ns.get(JOINTS, 0)
+
+    def _take_joints(self, sample: JointSample) -> bool:
+        """Take a reading; tells whether the clock jumped back, which begins everything anew."""
+        began = self.stream.add(sample, GAP_NS).began_ns
+        newest = self.stream.newest_ns
+        if newest is None:
+            return False
+        before = self.newest_ns.get(JOINTS, newest)
+        self.received[JOINTS] += 1
+        self.newest_ns[JOINTS] = newest
+        if began is None or newest >= before:
+            return False
+        self._jumps += 1
+        self.newest_ns = {JOINTS: newest}
+        return True
+
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command; ``step`` carries it out when its samples are complete.
+
+        A command without a stamp gets the newest stamp of the joints, where there is one, so that
+        a clock that is off does not matter.
+        """
+        if command.stamp_ns is None:
+            command = replace(command, stamp_ns=self.newest_joints_ns or clock_ns or 0)
+        self._queue.append(command)
+
+    @property
+    def waiting(self) -> int:
+        """Number of commands not yet carried out."""
+        return len(self._queue)
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command: what was decided outside before it, and it."""
+        if not self._queue or not (force or self._ready(self._queue[0])):
+            return []
+        command = self._queue.pop(0)
+        outside = self.poll()
+        if command.marks is None:
+            command = replace(command, marks=self.marks)
+        decisions = dict.fromkeys((events.ACCEPT, events.REJECT, events.ROLLBACK), self._decide)
+        outcome = events.carried_out({**self._handlers(), **decisions}, command, wall_ns)
+        outside += [outside_decision(d, self.marks) for d in self._followed.look(wall_ns)]
+        return [*outside, replace(outcome, revision=self.in_force.revision)]
+
+    def poll(self) -> list[Outcome]:
+        """Take over what another process decided in the history since the last look."""
+        return [outside_decision(d, self.marks) for d in self._followed.look()]
+
+    def _ready(self, command: Command) -> bool:
+        return command.marks is None or reached(command.marks, self.newest_ns, self._jumps)
+
+    def _decide(self, command: Command, wall_ns: int) -> Outcome:
+        return decide(self._history, command, self.in_force.revision, wall_ns, self._kind)

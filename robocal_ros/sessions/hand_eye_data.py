@@ -1,0 +1,187 @@
+"""The data set of a hand-eye calibration: its target, and what was captured of it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+
+Mount = Literal["in-hand", "to-hand"]
+Feature = Literal["edge", "groove"]
+
+IN_HAND: Mount = "in-hand"
+TO_HAND: Mount = "to-hand"
+FEATURES: tuple[Feature, ...] = ("edge", "groove")
+TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
+
+
+@dataclass(eq=False)
+class HandEyeSample:
+    """What was seen at one standstill.
+
+    Attributes
+    ----------
+    handle : its name.
+    mark : of a step target the mark that the laser plane lies through; else empty.
+    stamp_ns : of the shot.
+    q : (n,) mean of the joint readings at standstill, rad (prismatic: m).
+    T_base_flange : (4, 4) of q, with the model then in force.
+    values : see `hand_eye_shots.Shot`.
+    """
+
+    handle: int
+    mark: str
+    stamp_ns: int
+    q: Array
+    T_base_flange: Array
+    values: Array
+
+
+@dataclass(eq=False)
+class Capture:
+    """One capture as it is told: without ``code`` it waits; ``from_ns``: its shot is no older."""
+
+    handle: int
+    mark: str
+    from_ns: int
+    reason: str
+    code: Code = Code.NONE
+    stamp_ns: int = 0
+
+
+@dataclass(eq=False)
+class DataSet:
+    """A target and its captures.
+
+    Attributes
+    ----------
+    target : document of the target, with its ``kind``.
+    method : best or classic; ``mount`` in-hand or to-hand; ``feature`` of a line, in a profile.
+    captures, samples : by handle; a capture that failed or waits has no sample.
+    candidate : the last calibration in the history; 0 without.
+    """
+
+    target: Document
+    method: str
+    mount: Mount
+    feature: Feature
+    captures: dict[int, Capture] = field(default_factory=dict)
+    samples: dict[int, HandEyeSample] = field(default_factory=dict)
+    candidate: int = 0
+
+    @property
+    def kind(self) -> str:
+        """Kind of the target."""
+        return str(self.target["kind"])
+
+    @property
+    def topic(self) -> str:
+        """The input that shows the target."""
+        return TOPIC_OF[self.kind]
+
+    @property
+    def waiting(self) -> Capture | None:
+        """The capture that waits; None while there is none."""
+        return next((c for c in self.captures.values() if c.code is Code.NONE), None)
+
+    def require_mark(self, mark: str) -> None:
+        """Refuse a mark that the target does not have; only a step has any.
+
+        Raises
+        ------
+        InputError
+            Naming those that there are.
+        """
+        known = tuple(self.target.get("corners", ("",)))
+        if mark not in known:
+            words = ", ".join(known) if any(known) else "none"
+            raise InputError(f"mark '{mark}' is none of the target's: {words}")
+
+    def put(self, sample: HandEyeSample) -> str:
+        """Add a sample; says what it is."""
+        count = len(sample.values)
+        seen = f"{count} points" if self.topic == PROFILE else "the target's pose"
+        words = f"{seen}, sample {len(self.samples) + 1}"
+        capture = Capture(
+            sample.handle, sample.mark, sample.stamp_ns, words, Code.ACCEPT, sample.stamp_ns
+        )
+        self.samples[sample.handle], self.captures[sample.handle] = sample, capture
+        return words
+
+    def chosen(self, handles: Sequence[int]) -> list[HandEyeSample]:
+        """The samples of these handles, all without any, in the order of their handles.
+
+        Raises
+        ------
+        InputError
+            When one has no sample.
+        """
+        unknown = sorted(set(handles) - set(self.samples))
+        if unknown:
+            raise InputError(
+                f"no sample {', '.join(map(str, unknown))}; there are "
+                f"{', '.join(map(str, sorted(self.samples))) or 'none'}"
+            )
+        wanted = set(handles) or set(self.samples)
+        return [self.samples[handle] for handle in sorted(wanted)]
+
+    def document(self) -> Document:
+        """Plain values; `data_set_of` reads them back to the last bit."""
+        return {
+            "target": self.target,
+            "method": self.method,
+            "mount": self.mount,
+            "feature": self.feature,
+            "samples": [
+                {
+                    "handle": sample.handle,
+                    "mark": sample.mark,
+                    "stamp_ns": sample.stamp_ns,
+                    "q": sample.q.tolist(),
+                    "values": sample.values.tolist(),
+                }
+                for _, sample in sorted(self.samples.items())
+            ],
+        }
+
+
+def data_set_begun(document: Mapping[str, Any]) -> DataSet:
+    """A data set without samples; its names are not checked."""
+    return DataSet(
+        dict(document["target"]),
+        str(document["method"]),
+        cast(Mount, document["mount"]),
+        cast(Feature, document["feature"]),
+    )
+
+
+def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
+    """Read what `DataSet.document` gave, also after JSON; flange poses are those of ``arm``.
+
+    Raises
+    ------
+    InputError
+        When it is no such document.
+    """
+    try:
+        found = data_set_begun(document)
+        columns = 7 if found.topic == TARGET_POSE else 2
+        for row in document["samples"]:
+            q = np.array(row["q"], dtype=np.float64)
+            values = np.array(row["values"], dtype=np.float64).reshape(-1, columns)
+            if not (np.all(np.isfinite(q)) and np.all(np.isfinite(values))):
+                raise InputError(f"sample {row['handle']} of the data set holds what is no number")
+            mark, at_ns = str(row["mark"]), int(row["stamp_ns"])
+            found.put(HandEyeSample(int(row["handle"]), mark, at_ns, q, arm.fk(q), values))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"the data set cannot be read: {error}") from error
+    return found

@@ -1,0 +1,60 @@
+"""A hand-eye session's settings for the record, and a session that starts where one did."""
+
+from collections.abc import Mapping
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import THERMAL, hand_eye_kind
+from robocal_ros.sessions.events import CONFIGURE, Command
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_config import HandEyeConfig
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.seeding import bring_into_force, require_robot
+
+OWN = "sensor"  # only a hand-eye session's configuration has it
+
+
+def configuration(session: HandEyeSession, topics: Mapping[str, str]) -> Command:
+    """Settings and what is in force, so that a replay can start from the same.
+
+    ``topics``: name of each input's topic.
+    """
+    arguments = {
+        "robot": session.nominal.name,
+        "model_hash": session.nominal.model_hash,
+        "topics": dict(topics),
+        "config": session.config.document(),
+        "model": session.current.thermal.model,
+        OWN: session.current.head.model,
+    }
+    return Command(CONFIGURE, arguments, session.newest_joints_ns, session.marks)
+
+
+def is_hand_eye_session(configured: Command | None) -> bool:
+    """Whether a configuration was recorded by a hand-eye session."""
+    return configured is not None and OWN in configured.arguments
+
+
+def hand_eye_session_as_recorded(
+    nominal: SerialArm, history: History, configured: Command, software: str
+) -> HandEyeSession:
+    """Make a session with the recorded settings; an empty history gets what was in force.
+
+    Raises
+    ------
+    WrongRobotError
+        The recording was made with another nominal model.
+    InputError
+        The configuration cannot be read.
+    """
+    require_robot(nominal, configured)
+    arguments = configured.arguments
+    missing = [name for name in ("config", "model") if name not in arguments]
+    if missing:
+        raise InputError(f"the recorded configuration lacks {', '.join(missing)}")
+    config = HandEyeConfig.of_document(arguments["config"])
+    if not history.list(1):
+        own = hand_eye_kind(config.sensor_frame)
+        bring_into_force(history, THERMAL, nominal, arguments["model"], software)
+        bring_into_force(history, own, nominal, arguments[OWN], software)
+    return HandEyeSession(nominal, history, config, software)

@@ -1,0 +1,64 @@
+"""``robocal replay`` of a hand-eye session's bag."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import robocal, robocal_json
+from hand_eye_bag import hand_eye_bag
+from hand_eye_driver import FRAME, sphere_set
+
+SCHEMA = "replay.hand_eye.json"
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "hand_eye.mcap"
+    hand_eye_bag(path)
+    return path
+
+
+def test_replay_equals_the_recording_bit_for_bit(bag):
+    document = robocal_json(SCHEMA, "replay", bag)
+    assert document["differs"] == []
+    assert document["warnings"] == []
+    names = [c["command"] for c in document["commands"]]
+    assert names == [
+        "start", *["capture", "sample"] * 10, "capture", "break_off", "calibrate", "accept", "load",
+        "calibrate",
+    ]  # fmt: skip
+    assert "Every recorded result comes out equal" in robocal("replay", bag).stdout
+
+
+def test_the_document_tells_the_calibrations_and_what_is_in_force(bag):
+    document = robocal_json(SCHEMA, "replay", bag)
+    whole, part = document["calibrations"]
+    assert len(whole["residual_mm"]["per_sample"]) == 10
+    assert len(part["residual_mm"]["per_sample"]) == 8
+    final = document["final_sensor"]
+    assert (final["parent"], final["child"], final["revision"]) == ("tool0", FRAME, 1)
+    assert final["xyz_mm"] == whole["T_flange_sensor"]["xyz_mm"]
+    truth_mm = 1e3 * sphere_set()[0].T_flange_sensor[:3, 3]
+    assert np.linalg.norm(np.array(final["xyz_mm"]) - truth_mm) < 1.0  # at 0.2 m less
+    (failed,) = [c for c in document["commands"] if c["command"] == "break_off"]
+    assert failed["code"] == "TOO_FEW_SAMPLES"
+    assert "within 1 s" in failed["message"]
+
+
+def test_windows_are_for_thermal_recordings(bag):
+    refused = robocal_json("error.json", "replay", bag, "--auto", status=2)
+    assert "hand-eye node" in refused["error"]["message"]
+
+
+def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
+    robocal_json(SCHEMA, "replay", bag, "--state", tmp_path)
+    listed = robocal_json("history.list.json", "history", "list", "--state", tmp_path)
+    kinds = {entry["kind"] for entry in listed["calibrations"]}
+    assert kinds == {f"hand_eye/{FRAME}"}
+    back = robocal("history", "rollback", "--kind", f"hand_eye/{FRAME}", "--to", "nominal",
+                   "--state", tmp_path, "--by", "me", "--reason", "another sensor")  # fmt: skip
+    assert back.returncode == 0, back.stderr
+    assert f"nothing is in force again, as hand_eye/{FRAME} revision 2" in back.stdout.lower()
+    unknown = robocal("history", "rollback", "--kind", "hand_eye/", "--state", tmp_path)
+    assert unknown.returncode == 2
+    assert "none of thermal, reference" in unknown.stderr

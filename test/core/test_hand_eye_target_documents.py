@@ -1,0 +1,46 @@
+"""Targets as documents: the same bits come back, also through JSON."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.hand_eye.target_documents import target_document, target_of
+from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+
+T = frames.transform(frames.exp_rotation([0.1, 0.2, 0.3]), [0.7, 0.1, 1 / 3])
+STAIRS = Staircase(5, 0.09, 0.01, 0.01, "both")
+STEP = StepTarget(T, STAIRS.marked_corners(), STAIRS.edge_user, 1e-5, 2e-4, 1e-3)
+LINE = LineTarget(T[:3, 3], T[:3, 0])
+TARGETS = {"sphere": SphereTarget(0.1 / 3), "step": STEP, "line": LINE}
+
+
+@pytest.mark.parametrize("kind", list(TARGETS))
+def test_a_target_comes_back_to_the_last_bit(kind):
+    target = TARGETS[kind]
+    document = json.loads(json.dumps(target_document(kind, target), allow_nan=False))
+    assert document["kind"] == kind
+    found = target_of(document)
+    assert type(found) is type(target)
+    for field in fields(target):
+        before, after = getattr(target, field.name), getattr(found, field.name)
+        if field.name == "corners":
+            assert list(after) == list(before)
+            before, after = list(before.values()), list(after.values())
+        assert np.array_equal(after, before)
+
+
+def test_nothing_known_stays_nothing_known():
+    assert target_of(target_document("line", None)) is None
+    assert target_of({"kind": "camera"}) is None
+
+
+def test_another_target_than_named_is_refused():
+    with pytest.raises(InputError, match="describes a line, not a sphere"):
+        target_document("sphere", LINE)
+    for broken in ({"kind": "cone", "x": 1}, {"kind": "sphere", "width_m": 1}, {"radius_m": 1}):
+        with pytest.raises(InputError, match="cannot be read"):
+            target_of(broken)

@@ -1,0 +1,347 @@
+"""hand_eye_node over DDS: a simulated robot brings a laser sensor before a sphere."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import robocal_json
+from geometry_msgs.msg import TransformStamped
+from hand_eye_driver import ARM, FRAME, TYPE, Recorded, joints, profile, sphere_set
+from hand_eye_live import NAME, SHOTS, LiveSensor, settings_of
+from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
+from robocal_msgs.srv import (
+    CheckHandEyePlan,
+    Decide,
+    HandEyeFile,
+    ListCalibrations,
+    RemoveHandEye,
+)
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.diagnostics import ERROR
+from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.tool_messages import pose_message
+from robocal_ros.storage.bags import BagWriter, read_bag
+
+
+def matrix(transform: Any) -> np.ndarray:
+    t, r = transform.translation, transform.rotation
+    return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
+
+
+@pytest.fixture
+def sensor(graph: Any, tmp_path: Path) -> LiveSensor:
+    return LiveSensor(graph, tmp_path)
+
+
+def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
+    graph: Any, sensor: LiveSensor, tmp_path: Path
+) -> None:
+    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", qos.LATCHED)
+    sensor.sphere()
+    result = sensor.calibrate()
+    assert result.success, result.message
+    assert (result.status, result.samples) == (CalibrationQuality.ACCEPT, 10)
+    truth, found = sphere_set()[0].T_flange_sensor, matrix(result.sensor)
+    away_m = np.linalg.norm(((found - truth) @ [0.0, 0.0, 0.2, 1.0])[:3])
+    assert away_m < 2e-4  # at the working distance; the limit of what is accepted is 0.5 mm
+    covariance = np.array(result.covariance).reshape(6, 6)
+    assert np.linalg.eigvalsh(covariance).min() > 0.0
+    graph.spin_until(lambda: quality, "the verdict")
+    assert (quality[-1].candidate_id, quality[-1].accept) == (result.candidate_id, True)
+    assert quality[-1].predicted_rms_mm == pytest.approx(result.expected_error_mm)
+    assert quality[-1].header.frame_id == "tool0"
+    # Nothing is in force before somebody accepts it.
+    assert [m for m in tf if m.transforms] == []
+    done = graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me")
+    assert (done.success, done.revision) == (True, 1), done.message
+    graph.spin_until(lambda: tf and tf[-1].transforms, "the transform")
+    (transform,) = tf[-1].transforms
+    assert (transform.header.frame_id, transform.child_frame_id) == ("tool0", FRAME)
+    assert transform.transform == result.sensor
+    graph.spin_until(lambda: sensor.status[-1].revision == 1, "the status")
+    # A node that starts anew publishes it again.
+    sensor.node.trigger_deactivate()
+    sensor.node.trigger_cleanup()
+    again = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    settings = {n: v for n, v in settings_of(tmp_path).items() if n != "target_file"}
+    process = graph.start("hand_eye_node", settings, {"__node": "second_node"})
+    graph.spin_until(lambda: again and again[-1].transforms, f"after the start {process.output}")
+    assert again[-1].transforms == [transform]
+    back = graph.call(Trigger, "/second_node/rollback_trigger")
+    assert back.message == "0 ACCEPT revision 2: nothing in force"
+    late = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    graph.spin_until(lambda: late, "what a late subscriber gets")
+    assert late[-1].transforms == []
+
+
+def test_a_moving_robot_is_not_captured_and_a_sample_is_removed(graph: Any, tmp_path: Path) -> None:
+    sensor = LiveSensor(graph, tmp_path, capture_timeout_s=2.0)
+    (q, shot), (other, _) = SHOTS[:2]
+    assert sensor.start().success
+    asked = sensor.ask_capture()
+    assert (asked.success, asked.handle) == (True, 1)
+    graph.spin_until(lambda: sensor.status[-1].state == HandEyeStatus.CAPTURING, "it waits")
+    assert sensor.of(1).state == HandEyeSample.WAITING
+    second = sensor.ask_capture()
+    assert (second.success, second.status, second.handle) == (False, Code.CONFLICT, 0)
+    for _ in range(4):  # never at rest for the 0.4 s that a sample takes
+        for there in (other, q):
+            sensor.robot.move(there, 0.2)
+            sensor.robot.rest(0.1, shot)
+    failed = sensor.ended(1)
+    assert (failed.state, failed.status) == (HandEyeSample.FAILED, Code.BAD_INPUT)
+    assert "moved by" in failed.reason
+    for handle in (2, 3):
+        assert sensor.capture(shot).handle == handle
+    removed = graph.call(RemoveHandEye, f"{NAME}/remove", handle=2)
+    assert (removed.success, removed.samples) == (True, 1)
+    assert not graph.call(RemoveHandEye, f"{NAME}/remove", handle=2).success
+    assert not graph.call(RemoveHandEye, f"{NAME}/remove", handle=0).success
+    graph.spin_until(lambda: [s.handle for s in sensor.status[-1].samples] == [1, 3], "the status")
+    few = sensor.calibrate()
+    assert (few.success, few.status, few.candidate_id) == (False, Code.TOO_FEW_SAMPLES, 0)
+    assert sensor.calibrate(handles=[2]).status == Code.BAD_INPUT
+
+
+def test_a_saved_data_set_gives_the_identical_result_in_a_fresh_node(
+    graph: Any, sensor: LiveSensor, tmp_path: Path
+) -> None:
+    path = str(tmp_path / "set.mcap")
+    nothing = graph.call(HandEyeFile, f"{NAME}/save", path=path)
+    assert (nothing.success, nothing.status) == (False, Code.CONFLICT)
+    sensor.sphere(8)
+    first = sensor.calibrate()
+    saved = graph.call(HandEyeFile, f"{NAME}/save", path=path)
+    assert (saved.success, saved.samples) == (True, 8), saved.message
+    assert not graph.call(HandEyeFile, f"{NAME}/save", path=path).success
+    topics = [m.topic for m in read_bag(path)]
+    assert topics == ["data_set", *["joint_states", "profile"] * 8]
+    for step in ("deactivate", "cleanup", "configure", "activate"):  # as a fresh start
+        getattr(sensor.node, f"trigger_{step}")()
+    missing = graph.call(HandEyeFile, f"{NAME}/load", path=path + "x")
+    assert (missing.success, missing.status) == (False, Code.BAD_INPUT)
+    assert not sensor.calibrate().success
+    loaded = graph.call(HandEyeFile, f"{NAME}/load", path=path)
+    assert (loaded.success, loaded.samples) == (True, 8), loaded.message
+    again = sensor.calibrate()
+    assert again.sensor == first.sensor
+    assert again.covariance == first.covariance
+    assert (again.message, again.residual_mm) == (first.message, first.residual_mm)
+
+
+def test_a_plan_without_turns_is_refused_in_words(graph: Any, tmp_path: Path) -> None:
+    truth = sphere_set()[0].T_flange_sensor
+    rough_mm = (truth[:3, 3] * 1e3 + 2.0).round(1).tolist()
+    rough = {"rough_xyz_mm": rough_mm, "rough_quat_xyzw": frames.quat_xyzw(truth).tolist()}
+    sensor = LiveSensor(graph, tmp_path, **rough)
+    name = f"{NAME}/check_plan"
+    good = [JointState(name=list(ARM.joint_names), position=q.tolist()) for q, _ in SHOTS]
+    early = graph.call(CheckHandEyePlan, name, joints=good)
+    assert (early.success, early.status) == (False, Code.CONFLICT)
+    assert sensor.start().success
+    plan = graph.call(CheckHandEyePlan, name, joints=good)
+    assert plan.success, plan.message
+    assert (plan.rank, plan.unknowns) == (9, 9)
+    assert 0.0 < plan.expected_error_mm < 0.5
+    T = ARM.fk(SHOTS[0][0])
+    poses = [pose_message(frames.transform(np.eye(3), [1e-3 * i, 0, 0]) @ T) for i in range(8)]
+    bad = graph.call(CheckHandEyePlan, name, flange=poses)
+    assert (bad.success, bad.status) == (False, Code.RANK_DEFICIENT), bad.message
+    assert bad.unobservable
+    assert "the poses do not turn" in bad.message
+    assert len(bad.proposed) > 0
+    both = graph.call(CheckHandEyePlan, name, flange=poses + list(bad.proposed))
+    assert both.success, both.message
+    for wrong in ({}, {"joints": good, "flange": poses}):
+        assert graph.call(CheckHandEyePlan, name, **wrong).status == Code.BAD_INPUT
+
+
+def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
+    sensor = LiveSensor(graph, tmp_path, capture_timeout_s=2.0)
+
+    def call(name: str) -> tuple[bool, str]:
+        told = graph.call(Trigger, f"{NAME}/{name}_trigger", within_s=30.0)
+        return told.success, told.message
+
+    sensor.robot.rest(0.1)
+    assert call("capture")[1].startswith("0 CONFLICT no data set is open")
+    assert call("result")[1].startswith("0 CONFLICT nothing was captured yet")
+    assert call("start") == (True, "0 ACCEPT data set of a sphere (best) begun")
+    for number, (q, shot) in enumerate(SHOTS[:8], 1):
+        sensor.robot.move(q, 0.2)
+        sensor.robot.rest(0.1)
+        assert call("capture")[1].startswith(f"{number} ACCEPT")
+        waits = call("result")
+        assert (waits[0], waits[1].split()[:2]) == (False, [str(number), "CONFLICT"])
+        sensor.robot.rest(0.7, shot)
+        sensor.ended(number)
+        done = call("result")
+        assert (done[0], done[1].split()[:2]) == (True, [str(number), "ACCEPT"])
+    assert call("calibrate")[1].startswith("1 ACCEPT")
+    assert call("accept") == (True, "1 ACCEPT revision 1: calibration 1 in force")
+    assert call("rollback") == (True, "0 ACCEPT revision 2: nothing in force")
+    assert call("remove") == (True, "0 ACCEPT capture 8 removed, 7 samples are left")
+
+
+def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSensor) -> None:
+    sensor.sphere(8)
+    result = sensor.calibrate()
+    others = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    wrong = TransformStamped(child_frame_id=FRAME)
+    wrong.header.frame_id = "camera_rail"
+    wrong.transform.rotation.w = 1.0
+    others.publish(TFMessage(transforms=[wrong]))
+    graph.spin_until(lambda: sensor.node._frames.conflict("tool0"), "the transform is seen")
+    refused = graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me")
+    assert (refused.success, refused.status) == (False, Code.BAD_INPUT)
+    assert "'camera_rail'" in refused.message
+    assert "'tool0'" in refused.message
+    twin = graph.call(Trigger, f"{NAME}/accept_trigger")
+    assert twin.message.startswith("0 BAD_INPUT tf shows")
+    listed = graph.call(ListCalibrations, f"{NAME}/list").calibrations
+    assert [entry.state for entry in listed] == ["pending"]
+    # Once the other publisher has gone, nothing stands in the way.
+    graph.probe.destroy_publisher(others)
+    graph.spin_until(lambda: not sensor.node._frames.conflict("tool0"), "it is forgotten")
+    assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
+
+
+def test_what_another_process_accepts_is_not_put_below_two_parents(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    sensor.sphere(8)
+    result = sensor.calibrate()
+    others = graph.publisher(TFMessage, "/tf", qos.RELIABLE)
+    wrong = TransformStamped(child_frame_id=FRAME)
+    wrong.header.frame_id = "camera_rail"
+    others.publish(TFMessage(transforms=[wrong]))
+    graph.spin_until(lambda: sensor.node._frames.conflict("tool0"), "the transform is seen")
+    # Accepted elsewhere it is in force, but not put onto tf, and that is said.
+    tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
+    sensor.node._history.accept(result.candidate_id, by="cli", reason="", wall_ns=1)
+    graph.spin_until(lambda: sensor.status[-1].revision == 1, "it is taken over")
+    graph.spin_for(0.6)
+    below = [t.header.frame_id for m in tf for t in m.transforms if t.child_frame_id == FRAME]
+    assert "tool0" not in below
+    health = sensor.node.health()
+    assert health.level == ERROR
+    assert "camera_rail" in health.message
+
+
+def test_bad_input_never_ends_the_node(graph: Any, tmp_path: Path) -> None:
+    sensor = LiveSensor(graph, tmp_path, capture_timeout_s=2.0)
+    points = sphere_set()[1].profiles[0]
+    assert sensor.start().success
+
+    def broken(stamp_ns: int) -> Recorded:
+        cloud = profile(stamp_ns, points)
+        cloud.fields["data"] = cloud.fields["data"][:40]
+        return cloud
+
+    def nameless(stamp_ns: int) -> Recorded:
+        cloud = profile(stamp_ns, points)
+        cloud.fields["fields"] = cloud.fields["fields"][:1]
+        return cloud
+
+    told = {
+        broken: "do not hold",
+        nameless: "has no field y, z",
+        lambda stamp_ns: profile(stamp_ns, np.empty((0, 2))): "has 0 points",
+        lambda stamp_ns: profile(stamp_ns, np.full((9, 2), np.nan)): "has 0 points",
+        lambda stamp_ns: profile(stamp_ns, points, y=0.01): "beside the plane y = 0",
+        lambda stamp_ns: profile(stamp_ns, points, frame=""): "the sensor's frame is 'laser'",
+    }
+    for shot, words in told.items():
+        failed = sensor.capture(shot, 2.3)
+        assert failed.state == HandEyeSample.FAILED
+        assert words in failed.reason
+    for request in ({"target": 9}, {"mount": 9}, {"method": "x"}, {"target_file": "none.yaml"},
+                    {"feature": "x"}, {"target": HandEyeStatus.STEP}, {"mount": 2}):  # fmt: skip
+        refused = sensor.start(**request)
+        assert (refused.success, refused.status) == (False, Code.BAD_INPUT), request
+    assert sensor.node.is_active
+    assert sensor.capture(SHOTS[0][1]).state == HandEyeSample.CAPTURED
+
+
+def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    """The third profile is one of another pose."""
+    assert sensor.start().success
+    for number, (q, shot) in enumerate(SHOTS[:10], 1):
+        sensor.robot.move(q, 0.2)
+        assert sensor.capture(SHOTS[11][1] if number == 3 else shot).handle == number
+    result = sensor.calibrate()
+    assert result.candidate_id, result.message
+    assert [told.partition(":")[0] for told in result.rejected] == ["3"]
+    assert result.samples == 9
+
+
+def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
+    for frame in ("", "tool0"):
+        node = graph.add(HandEyeNode, settings_of(tmp_path, sensor_frame=frame))
+        assert node.state == "unconfigured"
+
+
+def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> None:
+    sensor = LiveSensor(graph, tmp_path, capture_timeout_s=1.0)
+    assert sensor.start().success
+    assert sensor.ask_capture().success
+    failed = sensor.ended(1)
+    assert failed.status == Code.TOO_FEW_SAMPLES
+    assert "joint states are silent" in failed.reason
+    # A gripper on the same topic is no reading of this arm, and the reason says so.
+    assert sensor.ask_capture().success
+    for i in range(60):
+        gripper = joints(sensor.robot.now_ns + i * 10**7, np.zeros(1))
+        gripper.fields["name"] = ["finger"]
+        sensor.give(gripper)
+        graph.spin_for(0.02)
+    assert "joint state lacks" in sensor.ended(2).reason
+
+
+def test_nothing_is_left_of_an_earlier_session(graph: Any, sensor: LiveSensor) -> None:
+    assert sensor.start().success
+    assert sensor.ask_capture().success
+    sensor.node.trigger_deactivate()
+    inactive = sensor.ask_capture()
+    assert (inactive.success, inactive.status) == (False, Code.CONFLICT)
+    sensor.node.trigger_activate()
+    graph.spin_until(lambda: sensor.status[-1].state == HandEyeStatus.IDLE, "it is idle")
+    sensor.robot.rest(0.8, SHOTS[0][1])
+    assert list(sensor.status[-1].samples) == []
+    assert sensor.ask_capture().status == Code.CONFLICT
+
+
+def test_live_equals_replay_bit_for_bit(graph: Any, sensor: LiveSensor, tmp_path: Path) -> None:
+    live = graph.collect(SessionEvent, f"{NAME}/session_events", EVENTS)
+    sensor.sphere(8)
+    result = sensor.calibrate()
+    assert result.success
+    assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
+    assert sensor.calibrate(handles=[1, 2, 3, 4, 5, 6, 7]).samples == 7
+    commands = 1 + 2 * 8 + 1 + 1 + 1
+    graph.spin_until(lambda: len(live) >= commands + 2, "all events, with two configurations")
+    path = tmp_path / "live.mcap"
+    with BagWriter(path, latched=[f"{NAME}/session_events"]) as bag:
+        now_ns = 0
+        for message in sensor.sent:
+            now_ns = max(now_ns, message.stamp_ns)
+            bag.write(f"/{message.kind}", TYPE[message.kind], message.fields, now_ns)
+        for event in live:
+            bag.write(f"{NAME}/session_events", "robocal_msgs/msg/SessionEvent", event, now_ns)
+    document = robocal_json("replay.hand_eye.json", "replay", path)
+    assert document["differs"] == []
+    assert len(document["commands"]) == commands
+    found_mm = document["calibrations"][0]["T_flange_sensor"]["xyz_mm"]
+    assert found_mm == pytest.approx(1e3 * matrix(result.sensor)[:3, 3], abs=1e-12)
+    assert document["final_sensor"]["revision"] == 1

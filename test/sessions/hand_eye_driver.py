@@ -1,0 +1,184 @@
+"""A simulated robot with a sensor before a target; all that it says are messages of ROS types."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.target_documents import target_document
+from robocal_ros.core.hand_eye.targets import SphereTarget
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
+from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
+from robocal_ros.sim.hand_eye_sets import sphere_shots
+from robocal_ros.sim.profile_sensor import ProfileSensor
+from robocal_ros.sim.robot import Effects
+from robocal_ros.storage.bag_writer import ros_time
+from robocal_ros.storage.robots import load_robot
+
+NS = 1_000_000_000
+START_NS = 1_700_000_000 * NS
+ARM = load_robot("ur10")
+CENTRE, RADIUS_M = np.array([0.75, -0.1, 0.15]), 0.02
+Q_NEAR = np.radians([-30.0, -100.0, -110.0, -60.0, 90.0, 20.0])
+FRAME = "laser"
+TYPE = {
+    JOINTS: "sensor_msgs/msg/JointState",
+    PROFILE: "sensor_msgs/msg/PointCloud2",
+    TARGET_POSE: "geometry_msgs/msg/PoseStamped",
+}
+SPHERE = {
+    "target": target_document("sphere", SphereTarget(RADIUS_M)),
+    "method": "best",
+    "mount": "in-hand",
+    "feature": "edge",
+}
+CAMERA = SPHERE | {"target": {"kind": "camera"}}
+T_BASE_BOARD = frames.transform(frames.exp_rotation([0.1, 0.2, -0.4]), [0.75, -0.1, 0.1])
+
+
+class Recorded(NamedTuple):
+    """A message with its input; its fields as a mapping."""
+
+    kind: str
+    stamp_ns: int
+    fields: dict[str, Any]
+
+
+@cache
+def sphere_set(count: int = 14) -> tuple[HandEyeCell, Shots]:
+    """Shots of a sphere by a UR10 that repeats to a hundredth of a millimetre."""
+    rng = np.random.default_rng(8)
+    noise = replace(Effects.none(), noise=True)
+    true = replace(rigid_robot(ARM, 0.0, rng), repeatability=1e-5, effects=noise)
+    robot = ArmRobot(true, Q_NEAR)
+    cell = HandEyeCell(ProfileSensor(columns=320), robot, roll_rad=0.5)
+    return cell, sphere_shots(cell, CENTRE, RADIUS_M, count, rng)
+
+
+def namespace(value: Any) -> Any:
+    """Fields with the attributes of their message."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{name: namespace(part) for name, part in value.items()})
+    return [namespace(part) for part in value] if isinstance(value, list) else value
+
+
+def joints(stamp_ns: int, q: np.ndarray) -> Recorded:
+    header = {"stamp": ros_time(stamp_ns), "frame_id": ""}
+    fields = {"header": header, "name": list(ARM.joint_names), "position": q.tolist()}
+    return Recorded(JOINTS, stamp_ns, fields)
+
+
+def profile(stamp_ns: int, points: np.ndarray, frame: str = FRAME, y: float = 0.0) -> Recorded:
+    """A cloud (32 bit) of points (n, 2)."""
+    data = np.insert(np.asarray(points, dtype="<f4"), 1, y, axis=1)
+    cloud = {
+        "header": {"stamp": ros_time(stamp_ns), "frame_id": frame},
+        "height": 1,
+        "width": len(data),
+        "fields": [
+            {"name": name, "offset": 4 * i, "datatype": 7, "count": 1}
+            for i, name in enumerate("xyz")
+        ],
+        "is_bigendian": False,
+        "point_step": 12,
+        "row_step": 12 * len(data),
+        "data": data.tobytes(),
+        "is_dense": False,
+    }
+    return Recorded(PROFILE, stamp_ns, cloud)
+
+
+def target_pose(stamp_ns: int, T: np.ndarray, frame: str = FRAME) -> Recorded:
+    x, y, z = T[:3, 3].tolist()
+    turn = dict(zip("xyzw", frames.quat_xyzw(T).tolist(), strict=True))
+    pose = {"position": {"x": x, "y": y, "z": z}, "orientation": turn}
+    header = {"stamp": ros_time(stamp_ns), "frame_id": frame}
+    return Recorded(TARGET_POSE, stamp_ns, {"header": header, "pose": pose})
+
+
+class Robot:
+    """Moves from pose to pose; `give` takes each message as it arises."""
+
+    def __init__(self, give: Callable[[Recorded], None]) -> None:
+        self._give = give
+        self._rng = np.random.default_rng(4)
+        self.now_ns, self.q = START_NS, Q_NEAR
+
+    def move(self, q: np.ndarray, seconds: float = 0.5) -> None:
+        """Drive to joints; the sensor sees something else meanwhile."""
+        for share in np.linspace(0.0, 1.0, int(seconds * 50)):
+            self._joints((1.0 - share) * self.q + share * q)
+        self.q = q
+
+    def rest(
+        self, seconds: float = 0.6, shot: Callable[[int], Recorded] | None = None, hz: int = 10
+    ) -> None:
+        """Stand still; the sensor sends a shot ``hz`` times a second."""
+        for i in range(int(seconds * 50)):
+            self._joints(self.q + 1e-7 * self._rng.standard_normal(len(self.q)))
+            if shot is not None and i % (50 // hz) == 0:
+                self._give(shot(self.now_ns - 7_000_000))
+
+    def _joints(self, q: np.ndarray) -> None:
+        self.now_ns += NS // 50
+        self._give(joints(self.now_ns, q))
+
+
+class Driver:
+    """A robot, a session and all that happened."""
+
+    def __init__(self, session: HandEyeSession) -> None:
+        self.session = session
+        self.robot = Robot(self.give)
+        self.recorded: list[Recorded | Outcome] = []
+
+    def give(self, message: Recorded) -> None:
+        """One message, and what follows from it."""
+        self.recorded.append(message)
+        take_hand_eye_message(self.session, message.kind, namespace(message.fields))
+        if (command := self.session.recognised()) is not None:
+            self.command(command)
+
+    def ask(self, name: str, **arguments: Any) -> Outcome:
+        """Give a command by its name."""
+        return self.command(Command(name, arguments))
+
+    def command(self, command: Command) -> Outcome:
+        """Give a command and carry it out."""
+        self.session.submit(command)
+        self.recorded += self.session.step(wall_ns=START_NS + len(self.recorded))
+        assert isinstance(self.recorded[-1], Outcome)
+        return self.recorded[-1]
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """What came of all commands."""
+        return [one for one in self.recorded if isinstance(one, Outcome)]
+
+    def sphere(self, count: int = 14) -> None:
+        """Start, and capture the sphere from each pose."""
+        self.robot.rest(0.1)
+        assert self.ask(events.START, **SPHERE).done
+        for q, shot in sphere_shots_of(count):
+            self.robot.move(q)
+            self.robot.rest(0.1)
+            assert self.ask(events.CAPTURE).done
+            self.robot.rest(0.7, shot)
+
+
+def sphere_shots_of(count: int) -> Iterator[tuple[np.ndarray, Callable[[int], Recorded]]]:
+    """Joints of each shot, and the profile there at a stamp."""
+    _, shots = sphere_set()
+    assert shots.q is not None
+    for q, points in zip(shots.q[:count], shots.profiles, strict=False):
+        yield q, lambda stamp_ns, points=points: profile(stamp_ns, points)
