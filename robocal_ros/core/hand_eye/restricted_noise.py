@@ -22,7 +22,7 @@ NODES = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # standard deviations of a noise'
 WIDEST = 1.0  # of them
 
 
-class _Restricted:
+class RestrictedLikelihood:
     """The restricted likelihood of noises that are not known, by their logarithms."""
 
     def __init__(
@@ -90,7 +90,7 @@ def restricted_noise(
     """
     from scipy.optimize import minimize
 
-    likely = _Restricted(problem, state, keep, given)
+    likely = RestrictedLikelihood(problem, state, keep, given)
     if not likely.unknown:
         return problem.noise
     best = minimize(
@@ -112,7 +112,7 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
     noise's logarithm, summed over a grid around the problem's own noise, which is the likeliest.
     """
     keep = np.ones(len(problem.poses), dtype=np.bool_)
-    likely = _Restricted(problem, state, keep, given)
+    likely = RestrictedLikelihood(problem, state, keep, given)
     best = likely.now
     least, normal, _ = likely.at(best)
     if not likely.unknown:
