@@ -38,6 +38,7 @@ Array = NDArray[np.float64]
 FARTHEST_M = 20.0  # no arm's flange is farther from its base
 NEAREST_M = 0.01  # nor do all poses of one lie so near to it
 PROFILE = ("x_mm", "z_mm")
+FILE_COLUMNS = ("profile", "image")
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +112,7 @@ def read_pose_table(
         With file, row and column, when the table is not as its contract says.
     """
     found: list[Layout] = []
-    words = ("sample", "stamp_s", "mark", file_column or "image")
+    words = ("sample", "stamp_s", "mark", *((file_column,) if file_column else FILE_COLUMNS))
 
     def check(header: list[str], file: str) -> None:
         found.append(read_pose_columns(header, arm, file, words))

@@ -36,6 +36,24 @@ def test_the_thermal_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.Monk
     assert printed in (ROOT / "docs/thermal.md").read_text()
 
 
+def test_the_hand_eye_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make = [sys.executable, ROOT / "bags/make_hand_eye.py", "--csv", "out/hand_eye"]
+    subprocess.run(make, check=True, env=environment())
+    page = (ROOT / "docs/hand_eye.md").read_text()
+    typed = re.findall(rf"^{re.escape(PREFIX)}(.*)$", page, re.MULTILINE)
+    assert len(typed) == 8
+    printed = []
+    for line in typed:
+        words, _, file = line.partition(" > ")
+        done = robocal(*shlex.split(words))
+        assert done.returncode == 0, (words, done.stderr)
+        printed.append(done.stdout)
+        if file:
+            Path(file).write_text(done.stdout)
+    assert printed[0].splitlines()[0] in page
+
+
 @pytest.mark.parametrize("page", [*PAGES, "docs/replay.md"])
 def test_commands_run_as_typed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("docs", "bags"):

@@ -1,5 +1,6 @@
 """Every command, as a process of its own: its document follows its schema, well or ill."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -8,12 +9,14 @@ from campaign import ROBOT, measured, table
 from command import ROOT, SCHEMAS, conforms, robocal, robocal_json
 from drift_tables import fixed_tables
 from hand_eye_bag import hand_eye_bag
+from hand_eye_tables import TRUE, hand_eye_tables
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
 from tool_tables import tool_tables
 from tracker_files import SCAN, tracker_files
 
 from robocal_ros.cli.main import COMMANDS
+from robocal_ros.core.documents import transform_document
 from robocal_ros.sim.tracker_cells import prp_cell
 from robocal_ros.storage.robots import load_description
 
@@ -40,6 +43,11 @@ CROSSED = ["tool", "crossed", "--radius-mm", "12", "--period-s", "2", "--start-d
 RUN = ["tool", "crossed", "--robot", "ur10", "--laser", "laser.yaml", "--taught-mm", "0,0,150",
        "--sample-period-s", "0.002", "--joints", "joints.csv"]  # fmt: skip
 PARALLEL = ["tool", "parallel", "--up-mm", "400", "--down-mm", "360", "--x-mm", "800"]
+SPHERE = ["--radius-mm", "20", "--poses", "sphere/poses.csv", "--profiles", "sphere/profiles"]
+FEW_SPHERE = [*SPHERE[:2], "--poses", "sphere/few.csv", *SPHERE[4:]]
+STEP = ["--target", "step/target.yaml", "--poses", "step/poses.csv", "--profiles", "step/profiles"]
+LINE = ["--poses", "line/poses.csv", "--profiles", "line/profiles"]
+PLANNED = ["hand-eye", "check-plan", "--target-kind", "sphere", "--radius-mm", "20"]
 CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
 TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
            "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
@@ -171,6 +179,48 @@ CASES = {
         ["tool", "points", "--data", "few_touches.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
+    "hand-eye sphere": (
+        "hand-eye.sphere.json",
+        ["hand-eye", "sphere", *SPHERE, "--check", "sphere/check.csv"],
+        ["hand-eye", "sphere", *FEW_SPHERE],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "hand-eye step": (
+        "hand-eye.step.json",
+        ["hand-eye", "step", *STEP],
+        ["hand-eye", "step", *STEP[2:]],
+        (2, "BAD_INPUT"),
+    ),
+    "hand-eye line": (
+        "hand-eye.line.json",
+        ["hand-eye", "line", *LINE, "--kind", "edge", "--method", "classic"],
+        ["hand-eye", "line", *LINE, "--target", "step/target.yaml"],
+        (2, "BAD_INPUT"),
+    ),
+    "hand-eye joint": (
+        "hand-eye.joint.json",
+        ["hand-eye", "joint", "--sphere", "sphere", "--line", "line"],
+        ["hand-eye", "joint", "--sphere", "sphere"],
+        (2, "BAD_INPUT"),
+    ),
+    "hand-eye check-plan": (
+        "hand-eye.check-plan.json",
+        [*PLANNED, "--poses", "sphere/few.csv", "--mount", "mount.yaml"],
+        [*PLANNED, "--poses", "sphere/few.csv", "--mount", "nowhere.yaml"],
+        (2, "BAD_INPUT"),
+    ),
+    "hand-eye verify": (
+        "hand-eye.verify.json",
+        ["hand-eye", "verify", "--result", "mount.yaml", "--kind", "sphere", *SPHERE],
+        ["hand-eye", "verify", "--result", "mount.yaml", "--kind", "sphere", *FEW_SPHERE],
+        (3, "TOO_FEW_SAMPLES"),
+    ),
+    "hand-eye export": (
+        "hand-eye.export.json",
+        ["hand-eye", "export", "--result", "mount.yaml", "--format", "static-transform"],
+        ["hand-eye", "export", "--result", "sphere/target.yaml", "--format", "urdf"],
+        (2, "BAD_INPUT"),
+    ),
     "hand-eye camera": (
         "hand-eye.camera.json",
         [*CAMERA, "--poses", "camera_poses.csv", "--check", "camera_check.csv"],
@@ -204,6 +254,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fixed_tables(folder)
     tool_tables(folder)
     run_tables(folder)
+    for kind in ("sphere", "step", "line"):
+        hand_eye_tables(folder / kind, kind)
+    shots = (folder / "sphere" / "poses.csv").read_text().splitlines()
+    (folder / "sphere" / "few.csv").write_text("\n".join(shots[:4]) + "\n")
+    (folder / "mount.yaml").write_text(json.dumps({"T_flange_sensor": transform_document(TRUE)}))
     camera_tables(folder)
     tracker_files(folder, prp_cell(load_description("p1r2p3").arm))
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
@@ -220,11 +275,12 @@ def test_every_command_and_schema_has_a_case() -> None:
 
 
 def placed(folder: Path, arguments: list[str]) -> list[str]:
-    """Names of files become paths in the folder."""
+    """Names of files, and of folders after an option for one, become paths in the folder."""
     files = (".csv", ".mcap", ".conf", ".yaml")
+    folders = ("--state", "--profiles", "--sphere", "--step", "--line")
     return [
-        str(folder / word) if word.endswith(files) or word in ("state", "nowhere", SCAN) else word
-        for word in arguments
+        str(folder / word) if word.endswith(files) or before in folders else word
+        for before, word in zip(["", *arguments], arguments, strict=False)
     ]
 
 

@@ -58,6 +58,17 @@ def test_a_static_transform_is_read_back(turn):
     agrees([t[name] for name in "xyz"], rotation, turn)
 
 
+@pytest.mark.parametrize("turn", TURNS)
+def test_a_command_line_is_read_back(turn):
+    text = exported(frames.transform(turn, PLACE), "tool0", "laser", "static-transform")
+    program, *words = text.split(" --")
+    assert program == "ros2 run tf2_ros static_transform_publisher"
+    given = dict(word.split() for word in words)
+    assert (given.pop("frame-id"), given.pop("child-frame-id")) == ("tool0", "laser")
+    rotation = Rotation.from_quat([float(given[f"q{axis}"]) for axis in "xyzw"])
+    agrees([float(given[axis]) for axis in "xyz"], rotation, turn)
+
+
 @pytest.mark.parametrize("name", ["", 'a"b', "two words", "a: b", "<x>"])
 def test_a_name_that_would_break_the_text_is_refused(name):
     with pytest.raises(InputError, match="no name of a frame"):

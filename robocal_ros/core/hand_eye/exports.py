@@ -15,7 +15,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.frame_texts import fixed, urdf_joint, urdf_origin
 
 Array = NDArray[np.float64]
-Format = Literal["urdf", "xacro", "yaml"]
+Format = Literal["urdf", "xacro", "yaml", "static-transform"]
 
 
 def exported(T_parent_sensor: Array, parent: str, child: str, format: Format) -> str:
@@ -60,8 +60,20 @@ def _yaml(T: Array, parent: str, child: str) -> str:
     )
 
 
+def _static_transform(T: Array, parent: str, child: str) -> str:
+    """The command that publishes it."""
+    values = [*fixed(T[:3, 3], 7), *fixed(frames.quat_xyzw(T), 10)]
+    words = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True)
+    place = " ".join(f"--{name} {value}" for name, value in words)
+    return (
+        f"ros2 run tf2_ros static_transform_publisher {place} "
+        f"--frame-id {parent} --child-frame-id {child}"
+    )
+
+
 _FORMATS: Mapping[Format, Callable[[Array, str, str], str]] = {
     "urdf": _urdf,
     "xacro": _xacro,
     "yaml": _yaml,
+    "static-transform": _static_transform,
 }

@@ -11,7 +11,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
-from robocal_ros.core.hand_eye.step_task import StepTask
+from robocal_ros.core.hand_eye.step_task import StepTask, require_marks
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import StepTarget
 
@@ -153,25 +153,30 @@ class PlannedLine:
 
 @dataclass(frozen=True, eq=False)
 class PlannedStep:
-    """A staircase; ``marks``: on which each planned pose lays the light, None for the first."""
+    """A staircase; ``marks`` of the planned poses: None where all lay the light on the first.
+
+    Raises
+    ------
+    InputError
+        For a mark that the target does not have.
+    """
 
     target: StepTarget
     sensor: SensorRange
     marks: Sequence[str] | None = None
     fewest: int = field(default=1, init=False)
 
+    def __post_init__(self) -> None:
+        require_marks(self.target, self.marks or ())
+
     def place(self, T_base_sensor: Array) -> Array:
         """The taught user frame."""
         return self.target.T_base_user
 
     def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
-        """All corners of each pose's mark; poses that are not planned take the marks in turn."""
-        known = list(self.target.corners)
-        planned = self.marks is not None and len(self.marks) == len(T_base_flange)
-        turn = (
-            self.marks if planned and self.marks else (known[:1] if self.marks is None else known)
-        )
-        corners = [self.target.corners[turn[i % len(turn)]] for i in range(len(T_base_flange))]
+        """All corners of the mark on which each pose lays the light."""
+        marks = self.lit(T_base_flange @ T_flange_sensor)
+        corners = [self.target.corners[mark] for mark in marks]
         pose = np.repeat(np.arange(len(corners)), [len(each) for each in corners])
         model = StepTask(self.target).model(np.concatenate(corners))
         seen = model.see((T_base_flange @ T_flange_sensor)[pose], place)
@@ -186,6 +191,19 @@ class PlannedStep:
             ),
         )
 
+    def lit(self, T_base_sensor: Array) -> tuple[str, ...]:
+        """The mark that is nearest to the laser plane of each sensor pose (m, 4, 4)."""
+        known = self._known()
+        middles = np.array([self.target.corners[mark].mean(axis=0) for mark in known])
+        base = middles @ self.target.T_base_user[:3, :3].T + self.target.T_base_user[:3, 3]
+        away = base[None] - T_base_sensor[:, None, :3, 3]
+        y = np.abs(np.einsum("mki,mi->mk", away, T_base_sensor[:, :3, 1]))
+        return tuple(known[nearest] for nearest in np.argmin(y, axis=1))
+
+    def _known(self) -> list[str]:
+        known = list(self.target.corners)
+        return known[:1] if self.marks is None else known
+
     def unseen(self, view: View) -> dict[int, str]:
         """Poses that see less than two corners."""
         x, z, _ = view.sightings.value.T
@@ -199,7 +217,7 @@ class PlannedStep:
 
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
         """Light through the marks: tilted about their line, and within the plane of the light."""
-        every = list(self.target.corners.values())
+        every = [self.target.corners[mark] for mark in self._known()]
         along = place[:3, :3] @ (every[0][-1] - every[0][0])
         along /= np.linalg.norm(along)
         mean = frames.nearest_rotation(T_base_sensor[:, :3, :3].mean(axis=0))
@@ -212,7 +230,6 @@ class PlannedStep:
         for number, (about_x, about_y, at) in enumerate(product(TILTS_RAD, TILTS_RAD, places)):
             R = level @ frames.rotation_from_rpy([about_x, 0.0, 0.0])
             R = R @ frames.rotation_from_rpy([0.0, about_y, 0.0])
-            marks = every[number % len(every)] if self.marks is not None else every[0]
-            middle = place[:3, :3] @ marks.mean(axis=0) + place[:3, 3]
+            middle = place[:3, :3] @ every[number % len(every)].mean(axis=0) + place[:3, 3]
             poses.append(_looking(R[None], at[None], middle)[0])
         return np.array(poses)

@@ -36,9 +36,17 @@ class StepTask:
     kind: Literal["step"] = field(default="step", init=False)
     fewest: int = field(default=1, init=False)
 
-    def read(self, data: HandEyeData) -> Read:
+    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Corners, each with its mark."""
         reader = _Reader(self, data)
+        if T_flange_sensor is None:
+            T_flange_sensor = self._rough(reader)
+        view = reader.view(reader.predicted(T_flange_sensor))
+        usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
+        return Read(view, reader.rejected)
+
+    def _rough(self, reader: "_Reader") -> Array:
+        """Where the sensor sits, by the profiles that show the whole target."""
         matches = reader.sure()
         both = [matches, {name: match.turned for name, match in matches.items()}]
         views = [reader.view(each) for each in both]
@@ -46,10 +54,7 @@ class StepTask:
         miss = [float(np.median(_distances(v, X))) for v, X in zip(views, starts, strict=True)]
         turned = miss[0] > TURNED_M and miss[1] < TURNED * miss[0]
         start = MountState(starts[int(turned)], (self.target.T_base_user,))
-        near = first_look((views[int(turned)],), start)
-        view = reader.view(reader.predicted(near.T_flange_sensor))
-        usable(view.sightings.names, reader.rejected, self.fewest, "the corners")
-        return Read(view, reader.rejected)
+        return first_look((views[int(turned)],), start).T_flange_sensor
 
     def posed(self, view: View, data: HandEyeData) -> View:
         """Which corner is which depends on the poses."""
@@ -101,9 +106,7 @@ class _Reader:
         self._task, self._data = task, data
         known = task.target.corners
         marks = data.marks or (next(iter(known)),) * len(data.names)
-        strange = next((mark for mark in marks if mark not in known), None)
-        if strange is not None:
-            raise InputError(f"mark '{strange}' is not one of {', '.join(known)}")
+        require_marks(task.target, marks)
         self._corners = {name: known[m] for name, m in zip(data.names, marks, strict=True)}
         self.rejected: dict[str, str] = {}
         self._fits: dict[str, CornerFit] = {}
@@ -165,6 +168,19 @@ class _Reader:
             np.array(covariances).reshape(-1, 3, 3),
         )
         return View(self._task.model(np.array(corners).reshape(-1, 3)), sightings)
+
+
+def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
+    """Refuse marks that the target does not have.
+
+    Raises
+    ------
+    InputError
+        Naming the first of them.
+    """
+    strange = next((mark for mark in marks if mark not in target.corners), None)
+    if strange is not None:
+        raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
 
 
 def _corner_model(view: View) -> CornerModel:

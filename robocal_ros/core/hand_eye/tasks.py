@@ -69,8 +69,11 @@ class Task(Protocol):
     def fewest(self) -> int:
         """Profiles without which nothing is solved."""
 
-    def read(self, data: HandEyeData) -> Read:
-        """Features of profiles. Raises `RobocalError` when too few give any."""
+    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
+        """Features of profiles. Raises `RobocalError` when fewer give any than solving needs.
+
+        Where the sensor is known to sit, one will do.
+        """
 
     def posed(self, view: View, data: HandEyeData) -> View:
         """The same features from other poses, those of ``data``."""
@@ -120,7 +123,7 @@ class SphereTask:
     kind: Literal["sphere"] = field(default="sphere", init=False)
     fewest: int = field(default=5, init=False)
 
-    def read(self, data: HandEyeData) -> Read:
+    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Circles."""
         rule = ArcRule(self.target.radius_m)
         found: dict[str, tuple[int, Array, Array]] = {}
@@ -133,7 +136,8 @@ class SphereTask:
                 continue
             points[name] = seen(profile)[arc.used]
             found[name] = i, np.array([*arc.centre, arc.radius_m]), arc.covariance
-        usable(found, rejected, self.fewest, "the sphere")
+        fewest = self.fewest if T_flange_sensor is None else 1
+        usable(found, rejected, fewest, "the sphere")
         view = View(SphereModel(self.target.radius_m), _gathered(data, found))
         return Read(view, rejected, points)
 
@@ -189,7 +193,7 @@ class LineTask:
         """Two equations each."""
         return 5 if self.target is None else 3
 
-    def read(self, data: HandEyeData) -> Read:
+    def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Points of the edge."""
         found: dict[str, tuple[int, Array, Array]] = {}
         rejected = {}
@@ -202,7 +206,8 @@ class LineTask:
             covariance = np.eye(3)
             covariance[:2, :2] = edge.covariance
             found[name] = i, np.array([*edge.point, 0.0]), covariance
-        usable(found, rejected, self.fewest, "the line")
+        fewest = self.fewest if T_flange_sensor is None else 1
+        usable(found, rejected, fewest, "the line")
         return Read(View(LineModel(self.target is not None), _gathered(data, found)), rejected)
 
     def posed(self, view: View, data: HandEyeData) -> View:

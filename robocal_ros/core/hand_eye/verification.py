@@ -67,7 +67,7 @@ def held_out(task: Task, data: HandEyeData, T_flange_sensor: Array, place: Array
     TooFewSamplesError
         When no shot shows the target.
     """
-    read = task.read(data)
+    read = task.read(data, T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     return HeldOut(read.view.sightings.names, distances((read.view,), state), read.rejected)
 

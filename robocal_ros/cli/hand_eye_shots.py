@@ -1,0 +1,193 @@
+"""Options and files of a line laser that the actions of ``robocal hand-eye`` share."""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robocal_ros.cli.arguments import ROBOT_HELP, positive
+from robocal_ros.core.errors import InputError
+
+if TYPE_CHECKING:
+    from robocal_ros.core.hand_eye.quality import HandEyeSettings
+    from robocal_ros.core.hand_eye.tasks import HandEyeData, Task
+    from robocal_ros.core.kinematics import SerialArm
+    from robocal_ros.storage.hand_eye_tables import PoseTable
+    from robocal_ros.storage.hand_eye_targets import Target
+
+KINDS = ("sphere", "step", "line")
+FEATURES = ("edge", "groove")
+LIMIT_MM = 1.0
+
+
+def add_shots(parser: argparse.ArgumentParser) -> None:
+    """Offer the tables of a calibration."""
+    parser.add_argument(
+        "--poses",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="flange poses in base, or joints with --robot; column profile names each shot's file",
+    )
+    parser.add_argument(
+        "--profiles",
+        required=True,
+        type=Path,
+        metavar="DIR",
+        help="folder of the profiles, tables of x_mm and z_mm",
+    )
+    add_robot(parser)
+
+
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Offer the robot."""
+    parser.add_argument("--robot", metavar="NAME", help=f"{ROBOT_HELP}; for tables of joints")
+
+
+def add_target(parser: argparse.ArgumentParser) -> None:
+    """Offer what is known of a target of any kind."""
+    add_target_file(parser)
+    add_radius(parser)
+
+
+def add_target_file(parser: argparse.ArgumentParser, help: str = "what is known of it") -> None:
+    """Offer a target file."""
+    parser.add_argument("--target", type=Path, metavar="YAML", help=help)
+
+
+def add_radius(parser: argparse.ArgumentParser) -> None:
+    """Offer a sphere's radius."""
+    parser.add_argument("--radius-mm", type=positive, metavar="R", help="of a sphere, true")
+
+
+def add_feature(parser: argparse.ArgumentParser, name: str) -> None:
+    """Offer, as option ``name``, what a line is."""
+    parser.add_argument(
+        name,
+        dest="feature",
+        choices=FEATURES,
+        default=FEATURES[0],
+        help="the line: nearer to the sensor than the surfaces beside it (edge, the default), or "
+        "farther (groove)",
+    )
+
+
+def add_limits(parser: argparse.ArgumentParser, sigma_default: str) -> None:
+    """Offer the robot's scatter, and what is good enough."""
+    for unit, of in (("mm", "position"), ("deg", "orientation")):
+        parser.add_argument(
+            f"--robot-sigma-{unit}",
+            type=positive,
+            metavar="S",
+            help=f"noise of a reported pose's {of} in each axis; {sigma_default}",
+        )
+    parser.add_argument(
+        "--limit-mm",
+        type=positive,
+        default=LIMIT_MM,
+        metavar="L",
+        help="largest expected error (rms) in the field of view that is accepted; default "
+        f"{LIMIT_MM:g}",
+    )
+
+
+def settings_of(args: argparse.Namespace) -> "HandEyeSettings":
+    """What is known of the robot, and what is good enough.
+
+    Raises
+    ------
+    InputError
+        For an orientation's noise alone.
+    """
+    from math import radians
+
+    from robocal_ros.core.hand_eye.quality import HandEyeSettings
+
+    if args.robot_sigma_mm is None and args.robot_sigma_deg is not None:
+        raise InputError("--robot-sigma-deg goes with --robot-sigma-mm: give both, or the latter")
+    return HandEyeSettings(
+        robot_sigma_m=None if args.robot_sigma_mm is None else args.robot_sigma_mm * 1e-3,
+        robot_sigma_rad=None if args.robot_sigma_deg is None else radians(args.robot_sigma_deg),
+        limit_m=args.limit_mm * 1e-3,
+    )
+
+
+def arm_of(args: argparse.Namespace) -> "SerialArm | None":
+    """The robot that is named, if any. Raises as `load_robot`."""
+    from robocal_ros.storage.robots import load_robot
+
+    return None if args.robot is None else load_robot(args.robot)
+
+
+@dataclass(frozen=True, eq=False)
+class Shots:
+    """A table of shots and what they show."""
+
+    table: "PoseTable"
+    data: "HandEyeData"
+
+
+def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
+    """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
+    from robocal_ros.core.hand_eye.tasks import HandEyeData
+    from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
+
+    table = read_pose_table(poses, arm)
+    seen = read_profiles(profiles, table)
+    return Shots(table, HandEyeData(table.names, table.T_base_flange, seen, table.mark))
+
+
+def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Target | None":
+    """What is known of a target: from its file, or a sphere's radius; None for an unknown line.
+
+    Raises
+    ------
+    InputError
+        When too little or too much is given, or the file is of another kind; further as
+        `read_target`.
+    """
+    from robocal_ros.core.hand_eye.targets import SphereTarget
+
+    if radius_mm is not None:
+        if kind != "sphere":
+            raise InputError(f"--radius-mm is a sphere's: a {kind} has none")
+        if target is not None:
+            raise InputError("the sphere is given twice: --radius-mm and --target; keep one")
+        return SphereTarget(radius_mm * 1e-3)
+    if target is not None:
+        return read_target_of(kind, target)
+    if kind == "line":
+        return None
+    missing = {"sphere": "give the sphere: --radius-mm or --target", "step": "give --target"}
+    raise InputError(missing[kind])
+
+
+def read_target_of(kind: str, path: Path) -> "Target":
+    """Read a target file of this kind. Raises as `given_target`."""
+    from robocal_ros.core.hand_eye.target_documents import KIND_OF
+    from robocal_ros.storage.hand_eye_targets import read_target
+
+    target = read_target(path)
+    found = KIND_OF[type(target)]
+    if found != kind:
+        raise InputError(f"describes a {found}, not a {kind}", file=str(path))
+    return target
+
+
+def task_of(target: "Target | None", feature: str | None, classic: bool = False) -> "Task":
+    """The estimator's view of a target, of a line by its ``feature``.
+
+    ``classic``: corners and edges in the published form.
+    """
+    from robocal_ros.core.fitting.edge import EdgeRule
+    from robocal_ros.core.fitting.polyline import CornerRule
+    from robocal_ros.core.hand_eye.step_task import StepTask
+    from robocal_ros.core.hand_eye.targets import SphereTarget, StepTarget
+    from robocal_ros.core.hand_eye.tasks import LineTask, SphereTask
+
+    if isinstance(target, SphereTarget):
+        return SphereTask(target)
+    if isinstance(target, StepTarget):
+        return StepTask(target, CornerRule(classic=classic))
+    rule = EdgeRule(kind="groove" if feature == "groove" else "edge", classic=classic)
+    return LineTask(target, rule)

@@ -1,0 +1,78 @@
+"""``robocal hand-eye verify``: a line laser's place against other shots, of any target."""
+
+import argparse
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robocal_ros.cli.hand_eye_shots import (
+    KINDS,
+    add_feature,
+    add_limits,
+    add_shots,
+    add_target,
+    arm_of,
+    given_target,
+    read_shots,
+    settings_of,
+    task_of,
+)
+from robocal_ros.cli.hand_eye_view import show_held_out, show_pose, show_verdict
+from robocal_ros.cli.output import Document, Outcome
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+NAME = "verify"
+HELP = "judge a line laser's place by shots that did not give it, of the same target or another"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "--result",
+        required=True,
+        type=Path,
+        metavar="FILE",
+        help="JSON that sphere, step, line, joint or tracker printed",
+    )
+    parser.add_argument("--kind", required=True, choices=KINDS, help="target of these shots")
+    add_shots(parser)
+    add_target(parser)
+    add_feature(parser, "--line-kind")
+    add_limits(parser, "default 0.05 mm, 0.003 deg")
+
+
+def run(args: argparse.Namespace) -> Outcome:
+    """Do it. Raises `RobocalError` for what a user can mend."""
+    from robocal_ros.core.assessment import summarise
+    from robocal_ros.core.documents import (
+        errors_document,
+        transform_document,
+        verdict_document,
+    )
+    from robocal_ros.core.hand_eye.verification import verify
+    from robocal_ros.storage.hand_eye_files import read_flange_mount
+
+    settings = settings_of(args)
+    T_flange_sensor = read_flange_mount(args.result)
+    task = task_of(given_target(args.kind, args.target, args.radius_mm), args.feature)
+    shots = read_shots(args.poses, args.profiles, arm_of(args))
+    found = verify(task, shots.data, T_flange_sensor, settings)
+    errors = errors_document(summarise(found.distance_m))
+    document: Document = {
+        "kind": args.kind,
+        "T_flange_sensor": transform_document(T_flange_sensor),
+        "target": found.target,
+        "held_out": errors
+        | {"rejected": list(found.rejected), "rejected_because": dict(found.rejected)},
+        "per_sample_mm": dict(zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)),
+        "verdict": verdict_document(found.verdict),
+    }
+    return Outcome(document, partial(_show, document=document))
+
+
+def _show(console: "Console", document: Document) -> None:
+    show_verdict(console, document)
+    show_pose(console, "Sensor in the flange frame, as given", document["T_flange_sensor"])
+    show_held_out(console, document["held_out"])

@@ -1,0 +1,540 @@
+"""``robocal hand-eye``: sphere, stairs, edge and groove from tables; what is refused, by name."""
+
+import json
+import shutil
+from contextlib import redirect_stdout
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import conforms
+from hand_eye_tables import (
+    CELL,
+    CENTRE,
+    RADIUS_M,
+    ROBOT_M,
+    SHOTS,
+    T_BASE_USER,
+    TRUE,
+    hand_eye_tables,
+    shots_of,
+    write_part,
+)
+from scipy.stats import chi2
+
+from robocal_ros.cli.main import main
+from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.targets import LineTarget
+from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.hand_eye_cell import ArmRobot, Shots, View, view
+from robocal_ros.sim.hand_eye_sets import DOWN, sphere_shots
+from robocal_ros.sim.profile_targets import ball_on_table
+from robocal_ros.sim.ur10_station import Q_NEAR
+from robocal_ros.storage.hand_eye_tables import write_pose_table
+from robocal_ros.storage.hand_eye_targets import write_target
+from robocal_ros.storage.robots import load_robot
+
+FOLDERS = ("sphere", "step", "line", "groove")
+LEFT_HANDED = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, -1.0], *np.ones((2, 4))])
+FAR_OFF = float(chi2.ppf(0.9999, 6))  # one in ten thousand is farther from the truth
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("hand_eye")
+    for kind in FOLDERS:
+        hand_eye_tables(root / kind, kind)
+    return root
+
+
+def robocal(action: str, *words: object, status: int = 0) -> Any:
+    """Run a command in this process: its document follows the schema."""
+    with redirect_stdout(StringIO()) as printed:
+        found = main(["hand-eye", action, *map(str, words), "--json"])
+    document = json.loads(printed.getvalue())
+    assert found == status, document
+    conforms(document, f"hand-eye.{action}.json")
+    return document
+
+
+@pytest.fixture(scope="module")
+def sphere(made) -> Any:
+    """The document of the sphere."""
+    return robocal("sphere", *shots(made / "sphere"), "--radius-mm", 20)
+
+
+def shots(folder: Path, table: str = "poses") -> list[object]:
+    return ["--poses", folder / f"{table}.csv", "--profiles", folder / "profiles"]
+
+
+def target(folder: Path) -> list[object]:
+    return ["--target", folder / "target.yaml"]
+
+
+def line_of(kind: str) -> tuple[str, list[str]]:
+    return ("line", ["--kind", "groove"]) if kind == "groove" else (kind, [])
+
+
+def pose_of(document: Any, key: str = "T_flange_sensor") -> np.ndarray:
+    pose = document[key]
+    return frames.transform_from_quat(1e-3 * np.array(pose["xyz_mm"]), np.array(pose["quat_xyzw"]))
+
+
+def chi_square(document: Any) -> float:
+    """Distance from the truth in units of the covariance that the document tells."""
+    T = pose_of(document)
+    turn = frames.log_rotation(TRUE[:3, :3] @ T[:3, :3].T)
+    error = np.concatenate([TRUE[:3, 3] - T[:3, 3], turn])
+    return float(error @ np.linalg.solve(np.array(document["covariance"]), error))
+
+
+class TestRecovered:
+    @pytest.mark.parametrize("kind", FOLDERS)
+    def test_the_truth_lies_within_what_the_covariance_says(self, made, kind):
+        folder = made / kind
+        action, more = line_of(kind)
+        known = [] if action == "line" else target(folder)
+        judges = ["--check", folder / "check.csv"]
+        found = robocal(action, *shots(folder), *known, *more, *judges)
+        assert found["verdict"]["accept"]
+        assert chi_square(found) < FAR_OFF
+        sigma = np.sqrt(np.diag(found["covariance"]))
+        assert found["sigma"]["xyz_mm"] == pytest.approx(sigma[:3] * 1e3)
+        assert found["sigma"]["rot_deg"] == pytest.approx(np.degrees(sigma[3:]))
+        assert found["rejected"] == found["held_out"]["rejected"] == []
+        # three axes of the robot's scatter, the corners' machining and the mount's own error
+        expected = np.hypot(np.sqrt(3.0) * ROBOT_M * 1e3, found["working_error_mm"])
+        aim = found.get("aim_sigma_mm", 0.0) * np.sqrt(2.0)
+        assert found["held_out"]["rms_mm"] < 2.0 * np.hypot(expected, aim)
+
+    def test_the_sphere_and_the_line_that_were_found(self, made, sphere):
+        centre_mm = sphere["target"]["center_mm"]
+        assert np.linalg.norm(centre_mm - CENTRE * 1e3) < 4.0 * ROBOT_M * 1e3
+        document = robocal("line", *shots(made / "line"))
+        found, expected_mm = document["target"], document["working_error_mm"]
+        assert not found["known"]
+        direction = np.array(found["line"]["direction"])
+        aside = np.array(found["line"]["point_mm"]) - T_BASE_USER[:3, 3] * 1e3
+        along = abs(direction @ T_BASE_USER[:3, 0])
+        assert 40.0 * np.arccos(min(along, 1.0)) < 3.0 * expected_mm  # at the ends of what was seen
+        assert np.linalg.norm(np.cross(T_BASE_USER[:3, 0], aside)) < 3.0 * expected_mm
+
+    def test_a_radius_and_a_target_file_say_the_same(self, made, sphere):
+        assert robocal("sphere", *shots(made / "sphere"), *target(made / "sphere")) == sphere
+
+    @pytest.mark.parametrize("kind", FOLDERS)
+    def test_classic_tells_no_covariance_and_is_near(self, made, kind):
+        action, more = line_of(kind)
+        words = [*shots(made / kind), *target(made / kind), *more, "--method", "classic"]
+        found = robocal(action, *words)
+        assert (found["covariance"], found["sigma"]) == (None, None)
+        away = pose_of(found)[:3, 3] - TRUE[:3, 3]
+        assert 0.0 < np.linalg.norm(away) < 1e-2  # a closed form: a start, not a result
+
+    def test_several_targets_together_are_better_than_each(self, made, sphere):
+        words = [word for kind in ("sphere", "step", "line") for word in (f"--{kind}", made / kind)]
+        found = robocal("joint", *words)
+        assert chi_square(found) < FAR_OFF
+        assert found["working_error_mm"] < sphere["working_error_mm"]
+        names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
+        assert names == set(found["target"]) == {"sphere", "step", "line"}
+
+    def test_a_line_without_a_target_file_is_unknown_in_joint(self, made, tmp_path):
+        shutil.copytree(made / "groove", tmp_path / "groove")
+        (tmp_path / "groove" / "target.yaml").unlink()
+        both = ["--sphere", made / "sphere", "--line", tmp_path / "groove"]
+        found = robocal("joint", *both, "--line-kind", "groove")
+        assert not found["target"]["line"]["known"]
+        assert chi_square(found) < FAR_OFF
+
+    def test_joints_of_a_robot_instead_of_poses(self, tmp_path):
+        arm = load_robot("ur10")
+        rng = np.random.default_rng(0)
+        cell = replace(CELL, robot=ArmRobot(rigid_robot(arm, 0.0, rng), Q_NEAR))
+        some = sphere_shots(cell, CENTRE, RADIUS_M, 8, rng)
+        path = write_part(tmp_path, "poses", some, range(8), joints=(arm, some.q))
+        table = np.genfromtxt(path, delimiter=",", dtype=str)
+        path.write_text("\n".join(",".join(row) for row in table[:, :-7]) + "\n")
+        found = robocal("sphere", *shots(tmp_path), "--radius-mm", 20, "--robot", "ur10")
+        assert chi_square(found) < FAR_OFF
+        refused = robocal("sphere", *shots(tmp_path), "--radius-mm", 20, status=2)
+        assert "name the robot" in refused["error"]["message"]
+
+    def test_people_read_the_verdict_first(self, made, capsys):
+        words = ["sphere", *shots(made / "sphere"), "--radius-mm", 20]
+        judges = ["--check", made / "sphere" / "check.csv"]
+        assert main(["hand-eye", *map(str, [*words, *judges])]) == 0
+        printed = capsys.readouterr().out.splitlines()
+        assert printed[0].startswith("ACCEPT: ")
+        assert any(line.startswith("Sensor in the flange frame, mm: ") for line in printed)
+        assert any(line.startswith("Not used to solve, 4 samples") for line in printed)
+
+
+class TestMistakes:
+    """Each is refused, or left out, by code and words."""
+
+    def refused(self, code: str, *words: str, run: tuple[Any, ...]) -> Any:
+        status = 2 if code == "BAD_INPUT" else 3
+        found = robocal(*run, status=status)
+        assert found["error"]["code"] == found["verdict"]["code"] == code
+        for word in words:
+            assert word in found["error"]["message"]
+        return found
+
+    def sphere(self, folder: Path, radius_mm: float = 20.0) -> tuple[Any, ...]:
+        return ("sphere", *shots(folder), "--radius-mm", radius_mm)
+
+    def copy(self, made: Path, folder: Path) -> Path:
+        return Path(shutil.copytree(made / "sphere", folder / "sphere"))
+
+    def test_one_line_of_corners_from_one_pose(self, made, tmp_path):
+        write_part(tmp_path, "poses", shots_of("step", 1), [0])
+        run = ("step", *shots(tmp_path), *target(made / "step"))
+        found = self.refused("RANK_DEFICIENT", "from several poses", run=run)
+        assert found["unobservable"] == ["rotation about the line of the corners"]
+
+    def test_turns_about_one_axis(self, tmp_path):
+        cell = replace(CELL, tilt_rad=0.0)
+        some = sphere_shots(cell, CENTRE, RADIUS_M, SHOTS, np.random.default_rng(0))
+        write_part(tmp_path, "poses", some, range(SHOTS))
+        words = ("all poses turn about", "another axis")
+        found = self.refused("RANK_DEFICIENT", *words, run=self.sphere(tmp_path))
+        assert any("translation along" in words for words in found["unobservable"])
+
+    def test_the_sphere_always_at_the_same_place_of_the_profile(self, tmp_path):
+        """At one distance, in the middle: the sensor may turn about the sphere."""
+        write_part(tmp_path, "poses", same_place(), range(SHOTS))
+        words = ("rotation about", "other distances")
+        self.refused("RANK_DEFICIENT", *words, run=self.sphere(tmp_path))
+
+    @pytest.mark.parametrize(
+        ("factor", "columns", "words"),
+        [(1e-3, "mm", "thousand times too near, m where mm"), (1.0, "m", "thousand times too far")],
+    )
+    def test_poses_in_another_unit(self, made, tmp_path, factor, columns, words):
+        folder = self.copy(made, tmp_path)
+        T = shots_of("sphere").T_base_flange[:SHOTS].copy()
+        T[:, :3, 3] *= factor
+        path = write_part(folder, "poses", shots_of("sphere"), range(SHOTS), T)
+        header, rest = path.read_text().split("\n", 1)
+        path.write_text(f"{header.replace('_mm', f'_{columns}')}\n{rest}")
+        found = self.refused("BAD_INPUT", words, run=self.sphere(folder))
+        assert found["error"]["row"] is not None
+
+    def test_profiles_in_another_unit(self, made, tmp_path):
+        folder = self.copy(made, tmp_path)
+        file = folder / "profiles" / "s3.csv"
+        table = np.genfromtxt(file, delimiter=",", skip_header=1) * 1e-3
+        np.savetxt(file, table, delimiter=",", header="x_mm,z_mm", comments="")
+        found = self.refused("BAD_INPUT", "a thousand times too small", run=self.sphere(folder))
+        assert found["error"]["file"].endswith("s3.csv")
+
+    @pytest.mark.parametrize(
+        ("undone", "words"),
+        [
+            (lambda T: np.roll(T, 1, axis=0), "shifted by one"),
+            (lambda T: T * LEFT_HANDED, "y of their positions negated: they come from a left-hand"),
+        ],
+    )
+    def test_poses_that_fit_when_put_right(self, tmp_path, undone, words):
+        some = shots_of("sphere")
+        write_part(tmp_path, "poses", some, range(SHOTS), undone(some.T_base_flange[:SHOTS]))
+        self.refused("RESIDUAL_TOO_LARGE", words, run=self.sphere(tmp_path))
+
+    def test_a_left_handed_target(self, made, tmp_path):
+        target = tmp_path / "target.yaml"
+        target.write_text(
+            "kind: step\nT_base_user: {xyz_mm: [1, 2, 3], rotation: [[1, 0, 0], [0, 1, 0], "
+            "[0, 0, -1]]}\nstaircase: {steps: 5, length_mm: 90, height_mm: 10, depth_mm: 10}\n"
+            "user_sigma_mm: 0\nuser_sigma_deg: 0\n"
+        )
+        run = ("step", *shots(made / "step"), "--target", target)
+        self.refused("BAD_INPUT", "left-handed", run=run)
+
+    def test_two_swapped_pairs_are_left_out_by_name(self, tmp_path):
+        some = shots_of("sphere")
+        T = some.T_base_flange[:SHOTS].copy()
+        T[[2, 7]] = T[[7, 2]]
+        write_part(tmp_path, "poses", some, range(SHOTS), T)
+        found = robocal(*self.sphere(tmp_path))
+        assert set(found["rejected"]) == {"s3", "s8"}
+        assert "fits the pose of s8" in found["rejected_because"]["s3"]
+        assert chi_square(found) < FAR_OFF
+
+    def test_another_radius_is_named(self, made):
+        run = self.sphere(made / "sphere", 21.0)
+        found = self.refused("RESIDUAL_TOO_LARGE", "check which sphere", run=run)
+        named = float(found["error"]["message"].split("radius ")[1].split(" mm")[0])
+        assert named == pytest.approx(20.0, abs=0.2)
+
+    def test_an_empty_profile_stops_no_other(self, made, tmp_path):
+        folder = self.copy(made, tmp_path)
+        (folder / "profiles" / "s4.csv").write_text("x_mm,z_mm\n")
+        found = robocal(*self.sphere(folder))
+        assert found["rejected"] == ["s4"]
+        assert "profile s4 is empty" in found["rejected_because"]["s4"]
+        assert len(found["residual_mm"]["per_sample"]) == SHOTS - 1
+        assert chi_square(found) < FAR_OFF
+
+    def test_only_empty_profiles(self, made, tmp_path):
+        folder = self.copy(made, tmp_path)
+        for file in (folder / "profiles").iterdir():
+            file.write_text("x_mm,z_mm\n")
+        words = ("0 profiles show the sphere", "12 show none", "empty")
+        self.refused("TOO_FEW_SAMPLES", *words, run=self.sphere(folder))
+
+    @pytest.mark.parametrize(("kind", "fewest"), [("sphere", 5), ("line", 5)])
+    def test_fewer_shots_than_unknowns(self, made, tmp_path, kind, fewest):
+        write_part(tmp_path, "poses", shots_of(kind), range(fewest - 1))
+        known = ["--radius-mm", 20] if kind == "sphere" else []
+        words = f"{fewest - 1} profiles show the {kind}, at least {fewest} are needed"
+        run = (kind, *shots(tmp_path), *known)
+        self.refused("TOO_FEW_SAMPLES", words, run=run)
+
+    def test_a_quaternion_that_is_none(self, made, tmp_path):
+        folder = self.copy(made, tmp_path)
+        rows = (folder / "poses.csv").read_text().splitlines()
+        cells = rows[3].split(",")
+        rows[3] = ",".join([*cells[:-1], "1.5"])
+        (folder / "poses.csv").write_text("\n".join(rows) + "\n")
+        found = self.refused("BAD_INPUT", "quaternion", run=self.sphere(folder))
+        assert found["error"]["row"] == 4
+
+    def test_a_missing_profile(self, made, tmp_path):
+        folder = self.copy(made, tmp_path)
+        (folder / "profiles" / "s5.csv").unlink()
+        found = self.refused("BAD_INPUT", "no file 's5.csv'", run=self.sphere(folder))
+        assert (found["error"]["row"], found["error"]["column"]) == (6, "profile")
+
+    def test_judges_that_were_used(self, made):
+        folder = made / "sphere"
+        run = (*self.sphere(folder), "--check", folder / "poses.csv")
+        self.refused("BAD_INPUT", "'s1.csv' is in --poses too", run=run)
+
+    def test_judges_of_a_sphere_that_was_touched_refuse(self, made, tmp_path):
+        folder = self.copy(made, tmp_path)
+        T = shots_of("sphere").T_base_flange[SHOTS:].copy()
+        T[:, 0, 3] += 5e-3
+        write_part(folder, "check", shots_of("sphere"), range(SHOTS, SHOTS + len(T)), T)
+        found = robocal(*self.sphere(folder), "--check", folder / "check.csv")
+        assert found["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
+        assert "not used to solve" in found["verdict"]["reason"]
+        assert found["held_out"]["rms_mm"] == pytest.approx(5.0, abs=0.5)
+
+    @pytest.mark.parametrize(
+        ("action", "more", "words"),
+        [
+            ("sphere", [], "--radius-mm or --target"),
+            ("sphere", ["--radius-mm", 20, "--target", "target.yaml"], "twice"),
+            ("step", [], "give --target"),
+            ("step", ["--target", "target.yaml"], "describes a sphere, not a step"),
+            ("sphere", ["--radius-mm", 20, "--robot-sigma-deg", 1], "--robot-sigma-mm"),
+        ],
+    )
+    def test_options_that_do_not_go_together(self, made, action, more, words):
+        folder = made / "sphere"
+        more = [folder / word if word == "target.yaml" else word for word in more]
+        self.refused("BAD_INPUT", words, run=(action, *shots(folder), *more))
+
+    def test_one_target_is_not_several(self, made):
+        run = ("joint", "--sphere", made / "sphere")
+        self.refused("BAD_INPUT", "at least two", run=run)
+
+
+def step(T: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """A pose (4, 4) moved by (3,) along its own axes."""
+    return T @ frames.transform(np.eye(3), p)
+
+
+def same_place() -> Shots:
+    """Shots with the sphere always at one place of the profile."""
+    rng = np.random.default_rng(4)
+    at = [0.0, 0.6 * RADIUS_M, 0.2 + 0.8 * RADIUS_M]
+
+    def wanted():
+        while True:
+            yield View(
+                view(DOWN, np.radians([25.0, 25.0, 60.0]) * rng.uniform(-1, 1, 3), CENTRE, at)
+            )
+
+    return CELL.shoot(ball_on_table(CENTRE, RADIUS_M), wanted(), SHOTS, rng)
+
+
+class TestPlan:
+    @pytest.fixture
+    def mount(self, tmp_path) -> Path:
+        """As drawn: off by 1 mm and 0.5 deg about each axis."""
+        path = tmp_path / "mount.yaml"
+        T = TRUE @ frames.transform(frames.exp_rotation([9e-3, -9e-3, 9e-3]), [1e-3, -1e-3, 1e-3])
+        rpy = np.degrees(frames.rpy(T[:3, :3])).tolist()
+        xyz = (T[:3, 3] * 1e3).tolist()
+        path.write_text(f"T_flange_sensor: {{xyz_mm: {xyz}, rpy_deg: {rpy}}}\n")
+        return path
+
+    def plan(self, kind: str, poses: Path, mount: Path, *more: object) -> list[object]:
+        return ["check-plan", "--target-kind", kind, "--poses", poses, "--mount", mount, *more]
+
+    def centre(self) -> list[object]:
+        return ["--radius-mm", 20, "--center-mm", ",".join(str(1e3 * v) for v in CENTRE)]
+
+    def test_a_good_plan_tells_what_comes_of_it(self, made, mount, sphere):
+        """The expected error is that of the same poses, solved, but for the noise estimated there:
+        its scatter from 12 samples of 3 numbers, and the sensor's place, leave half of it open."""
+        plan = robocal(*self.plan("sphere", made / "sphere" / "poses.csv", mount, *self.centre()))
+        assert plan["verdict"]["accept"]
+        assert (plan["rank"], plan["unknowns"]) == (9, 9)
+        assert (plan["unobservable"], plan["proposed"], plan["unseen"]) == ([], [], {})
+        ratio = plan["working_error_mm"] / sphere["working_error_mm"]
+        assert 0.5 < ratio < 2.0
+
+    @pytest.mark.parametrize("kind", ["sphere", "step", "line"])
+    def test_the_poses_that_it_proposes_will_do(self, made, mount, tmp_path, kind):
+        """One pose is too few; with those that are proposed the plan is accepted."""
+        known = self.centre() if kind == "sphere" else target(made / kind)
+        poses = (made / kind / "poses.csv").read_text().splitlines()[:2]
+        one, more = tmp_path / "one.csv", tmp_path / "more.csv"
+        one.write_text("\n".join(poses) + "\n")
+        run = self.plan(kind, one, mount, *known, "--limit-mm", 0.3, "--propose", more)
+        found = robocal(*run)
+        expected = "RANK_DEFICIENT" if kind == "step" else "TOO_FEW_SAMPLES"
+        assert found["verdict"]["code"] == expected
+        assert found["rank"] < found["unknowns"]
+        assert found["unobservable"]
+        proposed = more.read_text().splitlines()
+        assert len(proposed) - 1 == len(found["proposed"]) > 0
+        header, *rows = poses
+        place = [header.split(",").index(name) for name in proposed[0].split(",")]
+        merged = [proposed[0], *(",".join(row.split(",")[i] for i in place) for row in rows)]
+        one.write_text("\n".join([*merged, *proposed[1:]]) + "\n")
+        again = robocal(*self.plan(kind, one, mount, *known, "--limit-mm", 0.3))
+        assert again["verdict"]["accept"], again["verdict"]
+        assert again["working_error_mm"] == pytest.approx(found["proposed_error_mm"], rel=0.02)
+
+    def test_turns_about_one_axis_are_named(self, mount, tmp_path):
+        cell = replace(CELL, tilt_rad=0.0)
+        some = sphere_shots(cell, CENTRE, RADIUS_M, SHOTS, np.random.default_rng(0))
+        poses = write_part(tmp_path, "poses", some, range(SHOTS))
+        found = robocal(*self.plan("sphere", poses, mount, *self.centre()))
+        assert found["verdict"]["code"] == "RANK_DEFICIENT"
+        assert "all poses turn about" in found["verdict"]["reason"]
+        assert found["sigma"] is None or found["unobservable"]
+
+    def test_one_place_of_the_profile_is_not_enough(self, mount, tmp_path):
+        poses = write_part(tmp_path, "poses", same_place(), range(SHOTS))
+        found = robocal(*self.plan("sphere", poses, mount, *self.centre()))
+        assert found["verdict"]["code"] in ("RANK_DEFICIENT", "POSES_NOT_INFORMATIVE")
+        assert found["proposed"]
+
+    def test_light_square_to_a_line_shows_three_of_six(self, made, tmp_path):
+        """Shifts along the line and turns out of the plane stay open, in poses as they are drawn.
+
+        Rounding must not count as something seen.
+        """
+        mount = tmp_path / "mount.yaml"
+        mount.write_text("T_flange_sensor: {xyz_mm: [0, 0, 100], rpy_deg: [0, 0, 0]}\n")
+        T_base_user = frames.transform(np.diag([1.0, -1.0, -1.0]), [0.8, 0.0, 0.03])
+        known = tmp_path / "line.yaml"
+        write_target(known, LineTarget(T_base_user[:3, 3], T_base_user[:3, 1]))
+        at = np.random.default_rng(0).uniform([-0.01, -0.05, 0.29], [0.01, 0.05, 0.31], (10, 3))
+        poses = tmp_path / "plan.csv"
+        write_pose_table(poses, np.stack([step(T_base_user, -p) for p in at]))
+        found = robocal(*self.plan("line", poses, mount, "--target", known))
+        assert (found["rank"], found["unknowns"]) == (3, 6)
+        assert len(found["unobservable"]) == 3
+        assert found["verdict"]["code"] == "RANK_DEFICIENT"
+        assert (found["sigma"], found["working_error_mm"]) == (None, None)
+
+    def test_poses_out_of_range_are_named(self, made, mount, tmp_path):
+        some = shots_of("sphere")
+        T = some.T_base_flange[:SHOTS].copy()
+        T[4, 2, 3] += 0.5
+        poses = write_part(tmp_path, "poses", some, range(SHOTS), T)
+        found = robocal(*self.plan("sphere", poses, mount, *self.centre()))
+        assert list(found["unseen"]) == ["s5"]
+        assert "the sensor sees 190 to 210 mm" in found["unseen"]["s5"]
+
+    @pytest.mark.parametrize(
+        ("text", "words"),
+        [
+            ("T_flange_sensor: {xyz_mm: [1, 2, 3], quat_xyzw: [0, 0, 0, 1.2]}", "length 1.2"),
+            ("T_flange_sensor: {xyz_mm: [1, 2, 3]}", "needs an orientation"),
+            ("T_flange_sensor: {xyz_mm: [60000, 2, 3], rpy_deg: [0, 0, 0]}", "a thousand times"),
+            ("T_base_sensor: {xyz_mm: [1, 2, 3], rpy_deg: [0, 0, 0]}", "beside the robot"),
+            ("xyz_mm: [1, 2, 3]", "either T_flange_sensor or T_base_sensor"),
+        ],
+    )
+    def test_a_mount_file_that_is_none(self, made, tmp_path, text, words):
+        path = tmp_path / "mount.yaml"
+        path.write_text(text)
+        run = self.plan("sphere", made / "sphere" / "poses.csv", path, "--radius-mm", 20)
+        found = robocal(*run, status=2)
+        assert found["error"]["code"] == "BAD_INPUT"
+        assert words in found["error"]["message"]
+
+    def test_a_mark_that_the_stairs_do_not_have(self, made, mount, tmp_path):
+        poses = tmp_path / "poses.csv"
+        poses.write_text((made / "step" / "poses.csv").read_text().replace("far", "left"))
+        found = robocal(*self.plan("step", poses, mount, *target(made / "step")), status=2)
+        assert "mark 'left' is not one of near, far" in found["error"]["message"]
+
+
+class TestVerify:
+    @pytest.fixture
+    def result(self, sphere, tmp_path) -> Path:
+        path = tmp_path / "result.json"
+        path.write_text(json.dumps(sphere))
+        return path
+
+    def run(self, result: Path, kind: str, folder: Path, *more: object) -> list[object]:
+        return ["verify", "--result", result, "--kind", kind, *shots(folder), *more]
+
+    @pytest.mark.parametrize("kind", FOLDERS)
+    def test_a_sphere_s_result_holds_on_every_target(self, made, result, kind):
+        more = ["--line-kind", "groove"] if kind == "groove" else target(made / kind)
+        found = robocal(*self.run(result, line_of(kind)[0], made / kind, *more))
+        assert found["verdict"]["accept"]
+        assert found["held_out"]["n"] == len(found["per_sample_mm"])
+
+    @pytest.mark.parametrize("kind", ["sphere", "step", "line"])
+    def test_another_mount_is_refused(self, made, result, kind):
+        """Turned by 2 deg about the flange: 7 mm at the working distance."""
+        document = json.loads(result.read_text())
+        T = frames.transform(frames.exp_rotation([0.035, 0.0, 0.0]), np.zeros(3)) @ TRUE
+        document["T_flange_sensor"] = {
+            "xyz_mm": (T[:3, 3] * 1e3).tolist(),
+            "quat_xyzw": frames.quat_xyzw(T).tolist(),
+        }
+        result.write_text(json.dumps(document))
+        found = robocal(*self.run(result, kind, made / kind, *target(made / kind)))
+        assert found["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
+
+    def test_a_result_that_is_no_pose_of_the_flange(self, made, result):
+        document = json.loads(result.read_text())
+        long = {**document["T_flange_sensor"], "quat_xyzw": [0.0, 0.0, 0.0, 1.2]}
+        result.write_text(json.dumps(document | {"T_flange_sensor": long}))
+        run = self.run(result, "line", made / "line")
+        assert "has length 1.2, not 1" in robocal(*run, status=2)["error"]["message"]
+        pose = document.pop("T_flange_sensor")
+        result.write_text(json.dumps(document | {"T_base_sensor": pose}))
+        assert "beside the robot" in robocal(*run, status=2)["error"]["message"]
+
+    @pytest.mark.parametrize("format", ["urdf", "xacro", "yaml", "static-transform"])
+    def test_export(self, result, format):
+        run = ["export", "--result", result, "--format", format]
+        found = robocal(*run, "--child", "scanner")
+        assert (found["parent"], found["child"]) == ("tool0", "scanner")
+        assert "scanner" in found["text"]
+        assert (
+            f"{json.loads(result.read_text())['T_flange_sensor']['xyz_mm'][0] * 1e-3:.7f}"
+            in (found["text"])
+        )
+
+    def test_only_what_was_accepted_is_exported(self, result):
+        document = json.loads(result.read_text())
+        document["verdict"] = {"accept": False, "code": "POSES_NOT_INFORMATIVE", "reason": "few"}
+        result.write_text(json.dumps(document))
+        found = robocal("export", "--result", result, "--format", "urdf", status=2)
+        assert "POSES_NOT_INFORMATIVE" in found["error"]["message"]
