@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from bench.hand_eye_worlds import (
     AIM_M,
     CENTRE,
+    MACHINING_M,
     RADIUS_M,
     STAIRCASE,
     STAIRS,
@@ -95,8 +96,9 @@ def step_set(
     poses: int = 5,
     aim_m: float = AIM_M,
     machining_m: float = 0.0,
+    told_m: float = MACHINING_M,
 ) -> Calibration:
-    """Stairs; what is known of their corners is off by the machining error, the same throughout."""
+    """Stairs; what is known of their corners is off by ``machining_m`` throughout."""
     shots = step_shots(cell, STAIRS, poses, rng, aim_m=aim_m)
     corners = {
         mark: points + machining_m * rng.standard_normal(points.shape)
@@ -105,6 +107,6 @@ def step_set(
     T = known_to(cell.robot) @ T_BASE_USER
     told = (TAUGHT_M, TAUGHT_RAD) if isinstance(cell.robot, ArmRobot) else (0.0, 0.0)
     target = StepTarget(
-        T, corners, STAIRCASE.edge_user, user_sigma_m=told[0], user_sigma_rad=told[1]
+        T, corners, STAIRCASE.edge_user, told_m, user_sigma_m=told[0], user_sigma_rad=told[1]
     )
     return Calibration(StepTask(target), data_of(shots))

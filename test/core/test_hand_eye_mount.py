@@ -9,6 +9,7 @@ from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_ta
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.mount_fit import fit_mount
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.restricted_noise import RestrictedLikelihood
 from robocal_ros.core.hand_eye.result import increment
 from robocal_ros.core.hand_eye.sightings import Sightings
 from robocal_ros.core.hand_eye.step_task import StepTask
@@ -153,6 +154,30 @@ def test_noise_of_poses_is_found_from_the_profiles():
     view, place = sphere_view(np.random.default_rng(5), 20)
     found = fit_mount((view,), MountState(X, (place,))).noise.sigma_m
     assert abs(np.log(found / POSE_M)) < 0.4
+
+
+def test_covariance_counts_that_few_poses_tell_their_noise_badly():
+    """With n numbers to spare the errors are Student's t: wider by n / (n - 2), here by 2 / 7."""
+    view, place = sphere_view(np.random.default_rng(10), 6)
+    exact = replace(view.sightings, covariance=np.tile(1e-18 * np.eye(3), (6, 1, 1)))
+    fit = fit_mount((View(view.model, exact),), MountState(X, (place,)))
+    assert not fit.rejected
+    jacobian = MountProblem(fit.views, fit.noise, fit.state).linearise(fit.state)[1]
+    rows = jacobian.reshape(-1, jacobian.shape[2])
+    likeliest = np.linalg.inv(rows.T @ rows)
+    wider = np.diag(fit.covariance) / np.diag(likeliest)
+    assert np.allclose(wider, 9.0 / 7.0, rtol=0.02)
+
+
+def test_slope_of_the_noise_is_the_numeric_one():
+    view, place = step_view(np.random.default_rng(11), 6)
+    state = MountState(X, (place,))
+    problem = MountProblem((view,), NOISE, state)
+    likely = RestrictedLikelihood(problem, state, np.ones(6, dtype=bool), None)
+    for log_sigma in (likely.now - 0.5, likely.now + 0.5):
+        ends = [[likely.at(log_sigma + h)[0] for h in s * 1e-4 * np.eye(2)] for s in (1.0, -1.0)]
+        numeric = np.subtract(*ends) / 2e-4
+        assert np.allclose(likely.with_slope(log_sigma)[1], numeric, rtol=1e-5)
 
 
 def test_one_wrong_profile_is_named_and_left_out():

@@ -10,19 +10,19 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise
+from robocal_ros.core.hand_eye.mount_problem import COMMON, MountProblem, MountState, PoseNoise
 
 Array = NDArray[np.float64]
 
 FIRST_NOISE = PoseNoise(5e-5, 5e-5, 1e-4)  # turns count as shifts at an arm's length of 1 m
 NOISE_RANGE_M = (1e-6, 1e-2)
-TOLERANCE = 0.005  # of the noise
+FLAT = 0.02  # slope of the likelihood: a hundredth of the noise's own uncertainty
 NEAR = 0.2  # relative step in which the likelihood's bend is seen
 NODES = (-2.0, -1.0, 0.0, 1.0, 2.0, 3.0, 4.0)  # standard deviations of a noise's logarithm
 WIDEST = 1.0  # of them
 
 
-class _Restricted:
+class RestrictedLikelihood:
     """The restricted likelihood of noises that are not known, by their logarithms."""
 
     def __init__(
@@ -35,8 +35,8 @@ class _Restricted:
         r, J, G, C = (part[keep] for part in problem.grouped(problem.linear(state)))
         self.unknown = ["sigma_m"] if given is None else []
         self.unknown += ["aim_m"] if np.any(G[..., 6:]) else []
-        self._common, self._own, self._noise = G, C, problem.noise
-        self._both = np.concatenate([r[..., None], J], axis=2)
+        self._own, self._noise = C, problem.noise
+        self._all = np.concatenate([r[..., None], J, G], axis=2)
         prior, k = problem.prior(), J.shape[2]
         self._known = np.zeros((k, k)) if prior is None else prior
         self._pull = self._known @ problem.deviation(state)
@@ -52,15 +52,33 @@ class _Restricted:
 
     def at(self, log_sigma: Array) -> tuple[float, Array, Array]:
         """-2 log likelihood, normal matrix (k, k) and the step (k,) to the best state there."""
-        G, common = self._common, self.noise(log_sigma).covariance()
+        cost, normal, step, _, _ = self._whitened(log_sigma)
+        return cost, normal, step
+
+    def with_slope(self, log_sigma: Array) -> tuple[float, Array]:
+        """-2 log likelihood and its slope (n,)."""
+        cost, normal, step, white, common = self._whitened(log_sigma)
+        J, G = white[..., 1:-COMMON], white[..., -COMMON:]
+        left = white[..., 0] + J @ step
+        JG = np.swapaxes(J, 1, 2) @ G
+        grown = np.sum(G**2, axis=(0, 1)) - np.sum(JG * np.linalg.solve(normal, JG), axis=(0, 1))
+        fitted = np.sum((left[:, None, :] @ G) ** 2, axis=(0, 1))
+        each = 2.0 * np.diag(common) * (grown - fitted)
+        parts = {"sigma_m": each[:6].sum(), "aim_m": each[6:].sum()}
+        return cost, np.array([parts[field] for field in self.unknown])
+
+    def _whitened(self, log_sigma: Array) -> tuple[float, Array, Array, Array, Array]:
+        common = self.noise(log_sigma).covariance()
+        G = self._all[..., -COMMON:]
         L = np.linalg.cholesky(self._own + G @ common @ np.swapaxes(G, 1, 2))
-        white = np.linalg.solve(L, self._both).reshape(-1, self._both.shape[2])
-        normal = white[:, 1:].T @ white[:, 1:] + self._known
-        gradient = white[:, 1:].T @ white[:, 0] + self._pull
+        white = np.linalg.solve(L, self._all)
+        r, J = white[..., 0].ravel(), white[..., 1:-COMMON].reshape(-1, len(self._known))
+        normal = J.T @ J + self._known
+        gradient = J.T @ r + self._pull
         step = -np.linalg.solve(normal, gradient)
         spread = 2.0 * np.sum(np.log(np.diagonal(L, axis1=1, axis2=2)))
-        cost = white[:, 0] @ white[:, 0] + gradient @ step + spread + np.linalg.slogdet(normal)[1]
-        return float(cost), normal, np.asarray(step)
+        cost = r @ r + gradient @ step + spread + np.linalg.slogdet(normal)[1]
+        return float(cost), normal, np.asarray(step), white, common
 
 
 def restricted_noise(
@@ -72,20 +90,16 @@ def restricted_noise(
     """
     from scipy.optimize import minimize
 
-    likely = _Restricted(problem, state, keep, given)
+    likely = RestrictedLikelihood(problem, state, keep, given)
     if not likely.unknown:
         return problem.noise
-    start = likely.now
     best = minimize(
-        lambda log_sigma: likely.at(log_sigma)[0],
-        start,
-        method="Nelder-Mead",
-        bounds=[tuple(np.log(NOISE_RANGE_M))] * len(start),
-        options={
-            "xatol": TOLERANCE,
-            "fatol": 1e-3,
-            "initial_simplex": np.vstack([start, start + np.log(1.5) * np.eye(len(start))]),
-        },
+        likely.with_slope,
+        likely.now,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[tuple(np.log(NOISE_RANGE_M))] * len(likely.unknown),
+        options={"gtol": FLAT},
     )
     return likely.noise(best.x)
 
@@ -98,7 +112,7 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
     noise's logarithm, summed over a grid around the problem's own noise, which is the likeliest.
     """
     keep = np.ones(len(problem.poses), dtype=np.bool_)
-    likely = _Restricted(problem, state, keep, given)
+    likely = RestrictedLikelihood(problem, state, keep, given)
     best = likely.now
     least, normal, _ = likely.at(best)
     if not likely.unknown:

@@ -48,13 +48,17 @@ class StepTask:
     def _rough(self, reader: "_Reader") -> Array:
         """Where the sensor sits, by the profiles that show the whole target."""
         matches = reader.sure()
-        both = [matches, {name: match.turned for name, match in matches.items()}]
-        views = [reader.view(each) for each in both]
-        starts = [robust_corners(view.sightings.value, _in_flange(view)) for view in views]
-        miss = [float(np.median(_distances(v, X))) for v, X in zip(views, starts, strict=True)]
-        turned = miss[0] > TURNED_M and miss[1] < TURNED * miss[0]
-        start = MountState(starts[int(turned)], (self.target.T_base_user,))
-        return first_look((views[int(turned)],), start).T_flange_sensor
+        view = reader.view(matches)
+        near = self._look(view)
+        if (miss := _miss(view, near)) > TURNED_M:
+            other = reader.view({name: match.turned for name, match in matches.items()})
+            turned = self._look(other)
+            near = turned if _miss(other, turned) < TURNED * miss else near
+        return near
+
+    def _look(self, view: View) -> Array:
+        """Where the closed form leads: alone it may be far off where corners are nearly in line."""
+        return first_look((view,), self.starts(view)[0]).T_flange_sensor
 
     def posed(self, view: View, data: HandEyeData) -> View:
         """Which corner is which depends on the poses."""
@@ -194,6 +198,10 @@ def _in_flange(view: View) -> Array:
     model = _corner_model(view)
     T = frames.invert(view.sightings.T_base_flange) @ model.T_base_user
     return np.asarray(np.einsum("mij,mj->mi", T[:, :3, :3], model.corner_user) + T[:, :3, 3])
+
+
+def _miss(view: View, X: Array) -> float:
+    return float(np.median(_distances(view, X)))
 
 
 def _distances(view: View, X: Array) -> Array:
