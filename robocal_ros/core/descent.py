@@ -62,13 +62,17 @@ class Run(Generic[S]):
 class Descent(Generic[S]):
     """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known.
 
-    ``sizes`` (m,): how many of its c components each sample has; the others are zero.
+    Attributes
+    ----------
+    sizes : (m,) how many of its c components each sample has; the others are zero.
+    freedom : how many numbers the noise was found from, where it was found from these data.
     """
 
     problem: Problem[S]
     prior: Array
     scale_components: int
     sizes: NDArray[np.int64]
+    freedom: float = np.inf
 
     def run(
         self,
@@ -144,13 +148,21 @@ class Descent(Generic[S]):
         if self.scale_components:
             return 1.0
         share = squared[keep] / self.quantiles(0.5)[keep]
-        stretch = float(np.sqrt(np.median(share)))
+        stretch = float(np.sqrt(max(float(np.median(share)), 0.0)))
         return stretch if stretch > CLEAR_STRETCH else 1.0
 
     def quantiles(self, probability: float) -> Array:
         """Quantile (m,) of each sample's chi-square distribution."""
         values = {int(n): chi2_quantile(probability, int(n)) for n in np.unique(self.sizes)}
         return np.array([values[int(n)] for n in self.sizes])
+
+    def _largest(self, probability: float) -> Array:
+        """Quantile (m,) of each sample's squared distance, with noise that may be uncertain."""
+        from scipy.special import fdtri
+
+        if self.freedom == np.inf:
+            return self.quantiles(probability)
+        return np.asarray(self.sizes * fdtri(self.sizes, self.freedom, probability))
 
     def _normal(
         self,
@@ -204,7 +216,7 @@ class Descent(Generic[S]):
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
         whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
         squared = np.sum(run.residual * whitened, axis=1)
-        limit = self.quantiles(1.0 - FALSE_REJECTION / m) * self._stretch(squared, keep) ** 2
+        limit = self._largest(1.0 - FALSE_REJECTION / m) * self._stretch(squared, keep) ** 2
         inlier = squared < limit
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep

@@ -71,6 +71,7 @@ def solve(
     noise_known: bool = True,
     robust: bool = True,
     sizes: NDArray[np.int64] | None = None,
+    freedom: float = np.inf,
 ) -> Estimate[S]:
     """Find the most likely state.
 
@@ -82,6 +83,8 @@ def solve(
     robust : whether to look for outliers.
     sizes : (m,) how many of its c components each sample has, where they differ; the residuals
         and Jacobians of the others are zero.
+    freedom : how many numbers the sigmas were found from, where they come from these data: then
+        a sample must be farther off to be an outlier (F distribution).
 
     Raises
     ------
@@ -102,7 +105,9 @@ def solve(
     if flat:
         _require_enough(jacobian, int(np.sum(sizes)), problem.names)
     prior = np.zeros((k, k)) if prior_information is None else prior_information
-    descent = Descent(problem, prior, 0 if noise_known else problem.scale_components, sizes)
+    descent = Descent(
+        problem, prior, 0 if noise_known else problem.scale_components, sizes, freedom
+    )
     run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
     information = information_of(run.jacobian, keep)
     seen = observability(rows_of(run.jacobian, keep), information)

@@ -28,6 +28,7 @@ Array = NDArray[np.float64]
 
 LOOKS = 3
 ROUNDS = 8
+POSE_NUMBERS = 6
 SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 
@@ -135,7 +136,7 @@ def _settle(
     """Solve, take weights and noise anew, until both stay: which sightings (m,) are wrong, too."""
     for _ in range(ROUNDS):
         problem = MountProblem(views, noise, state, together)
-        estimate = _solved(problem, state)
+        estimate = _solved(problem, state, _freedom(problem) if given is None else np.inf)
         away = _away(problem.pivot, state, estimate)
         state, before = estimate.state, noise
         noise = restricted_noise(problem, state, ~estimate.rejected, given)
@@ -151,9 +152,24 @@ def _away(pivot: Array, before: MountState, estimate: Estimate[MountState]) -> f
     return float(np.sqrt(step @ np.linalg.solve(estimate.covariance[:6, :6], step)))
 
 
-def _solved(problem: MountProblem, state: MountState) -> Estimate[MountState]:
+def _freedom(problem: MountProblem) -> float:
+    """How many numbers tell the noise of poses: at most six of a pose, less the unknowns."""
+    poses = np.unique(np.concatenate([view.sightings.pose for view in problem.views]))
+    told = min(POSE_NUMBERS * len(poses), int(problem.sizes.sum()))
+    return float(max(told - len(problem.names), 1))
+
+
+def _solved(
+    problem: MountProblem, state: MountState, freedom: float = np.inf
+) -> Estimate[MountState]:
     try:
-        estimate = solve(problem, state, prior_information=problem.prior(), sizes=problem.sizes)
+        estimate = solve(
+            problem,
+            state,
+            prior_information=problem.prior(),
+            sizes=problem.sizes,
+            freedom=freedom,
+        )
     except RankDeficientError as error:
         raise _in_words(problem, state) or error from error
     return estimate
