@@ -12,7 +12,7 @@ from robocal_ros.core.hand_eye.mount_fit import MountFit
 
 Array = NDArray[np.float64]
 
-CLEARLY = 0.2  # of the misfit as given: below it the undone data are the right ones
+CLEARLY = 0.4  # of the misfit as given: below it the undone data are the right ones
 FITS = 5.0  # times the rms of the others
 
 LEFT_HANDED = "they come from a left-handed frame: turn one axis round"

@@ -60,6 +60,22 @@ def expected_error_m(covariance: Array, points: Array) -> float:
     return float(np.sqrt(np.trace(spread, axis1=1, axis2=2).mean()))
 
 
+def apart(T_one: Array, T_other: Array, points: Array) -> float:
+    """Root mean square distance of sensor points (n, 3), m, under two poses of the sensor."""
+    away = points @ (T_one - T_other)[:3, :3].T + (T_one - T_other)[:3, 3]
+    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+
+
+def judge_classic(apart_m: float, error_m: float, settings: HandEyeSettings) -> Verdict:
+    """The verdict on a classic estimate that is so far from the best one in the field of view."""
+    words = f"a closed form, {apart_m * 1e3:.3f} mm from the best estimate in the field of view; "
+    words += f"a point there is expected to be off by {error_m * 1e3:.3f} mm rms"
+    if error_m > settings.limit_m:
+        words = f"{words} (allowed {settings.limit_m * 1e3:g} mm): use method best"
+        return Verdict(Code.POSES_NOT_INFORMATIVE, words)
+    return Verdict(Code.ACCEPT, words)
+
+
 def judge_residuals(
     distances_m: Array, shots: int, lost: int, settings: HandEyeSettings
 ) -> Verdict | None:

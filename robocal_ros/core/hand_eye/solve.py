@@ -8,8 +8,6 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict
-from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.fitting.edge import EdgeRule
 from robocal_ros.core.hand_eye.mistakes import explain, swapped, undone
@@ -26,9 +24,11 @@ from robocal_ros.core.hand_eye.mount_problem import MountState, View, pivot_of
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.quality import (
     HandEyeSettings,
+    apart,
     expected_error_m,
     field_points,
     judge,
+    judge_classic,
     judge_residuals,
 )
 from robocal_ros.core.hand_eye.result import HandEyeResult, Method
@@ -39,7 +39,7 @@ from robocal_ros.core.hand_eye.tasks import HandEyeData, LineTask, Read, SphereT
 
 Array = NDArray[np.float64]
 
-DOUBTFUL_M = 5e-4  # median distance from which a mistake in the data is looked for
+DOUBTFUL_M = 2e-4  # median distance from which a mistake in the data is looked for
 
 
 def solve_sphere(
@@ -91,7 +91,7 @@ def solve_task(
     require_radius(fit)
     require_seen(fit, float(np.abs(read.view.sightings.value[:, 1]).mean()))
     if method == "classic":
-        return _classic(task, read, fit.state, len(data.names), settings)
+        return _classic(task, read, fit, data, settings)
     return result_of([task], fit, [read], data, settings)
 
 
@@ -206,14 +206,20 @@ def _poses(views: tuple[View, ...]) -> int:
 
 
 def _classic(
-    task: Task, read: Read, near: MountState, shots: int, settings: HandEyeSettings
+    task: Task, read: Read, best: MountFit, data: HandEyeData, settings: HandEyeSettings
 ) -> HandEyeResult:
-    """The classic estimate from all profiles that gave a feature; it tells no covariance."""
-    views = (read.view,)
-    state = task.classic(read.view, near)
+    """The classic estimate from all profiles that gave a feature; it tells no covariance.
+
+    Its error is its distance from the best estimate, with that one's own.
+    """
+    views, shots = (read.view,), len(data.names)
+    state = task.classic(read.view, best.state)
     residual = distances(views, state)
+    field, pivot = field_of(data), pivot_of(best.views)
+    own_m = expected_error_m(best.covariance[:6, :6], field - pivot)
+    apart_m = apart(state.T_flange_sensor, best.state.T_flange_sensor, field)
+    error_m = float(np.hypot(apart_m, own_m))
     refused = judge_residuals(residual, shots, shots - _poses(views), settings)
-    words = "closed form: no covariance, no outlier is left out; compare with method best"
     return HandEyeResult(
         kind=task.kind,
         method="classic",
@@ -221,9 +227,10 @@ def _classic(
         covariance=None,
         samples=read.view.sightings.names,
         residual_m=residual,
-        leave_one_out_m=leave_one_out(views, lambda part: task.classic(part[0], near)),
+        leave_one_out_m=leave_one_out(views, lambda part: task.classic(part[0], best.state)),
         rejected=dict(read.rejected),
         target=task.found(state.places[0]),
         place=state.places[0],
-        verdict=refused or Verdict(Code.ACCEPT, words),
+        working_error_m=error_m,
+        verdict=refused or judge_classic(apart_m, error_m, settings),
     )

@@ -23,7 +23,22 @@ from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
-RADII = (0.8, 0.9, 0.95, 1.05, 1.1, 1.25)  # shares of the radius as told
+RADII = (
+    0.8,
+    0.85,
+    0.9,
+    0.93,
+    0.96,
+    0.98,
+    0.99,
+    1.01,
+    1.02,
+    1.04,
+    1.07,
+    1.1,
+    1.15,
+    1.25,
+)  # shares of the radius as told
 
 
 @dataclass(frozen=True, eq=False)
