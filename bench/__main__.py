@@ -27,7 +27,9 @@ KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
     from bench import (
         files,
+        hand_eye,
         hand_eye_camera,
+        hand_eye_tracker,
         monte_carlo,
         real_data,
         speed,
@@ -47,7 +49,9 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "monte_carlo": monte_carlo.tables,
         "thermal": thermal.tables,
         "tool": tool.tables,
+        "hand_eye": hand_eye.tables,
         "hand_eye_camera": hand_eye_camera.tables,
+        "hand_eye_tracker": hand_eye_tracker.tables,
         "speed": speed.tables,
         "startup": start,
         "files": lambda: [files.file_times()],

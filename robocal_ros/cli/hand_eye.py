@@ -10,6 +10,7 @@ _actions = Actions(
         "sphere": "hand_eye_sphere",
         "step": "hand_eye_step",
         "line": "hand_eye_line",
+        "tracker": "hand_eye_tracker",
         "camera": "hand_eye_camera",
         "joint": "hand_eye_joint",
         "check-plan": "hand_eye_check_plan",

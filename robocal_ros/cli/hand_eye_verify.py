@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shots(parser)
     add_target(parser)
     add_feature(parser, "--line-kind")
-    add_limits(parser, "default 0.1 mm")
+    add_limits(parser, "default 0.05 mm, 0.003 deg")
 
 
 def run(args: argparse.Namespace) -> Outcome:

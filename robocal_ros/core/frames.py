@@ -110,7 +110,7 @@ def left_jacobian_inverse(rotvec: ArrayLike) -> Array:
 
 
 def nearest_rotation(matrix: ArrayLike) -> Array:
-    """Rotation (3, 3) nearest to a matrix in the Frobenius norm, with determinant +1."""
+    """Rotations (..., 3, 3) nearest to matrices in the Frobenius norm, with determinant +1."""
     U, _, Vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
-    U[:, -1] *= np.sign(np.linalg.det(U @ Vt))
+    U[..., -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     return np.asarray(U @ Vt)

@@ -56,14 +56,21 @@ def target_of(kind: str) -> Target:
 
 
 def write_part(
-    folder: Path, table: str, shots: Shots, rows: Sequence[int], T_base_flange: Array | None = None
+    folder: Path,
+    table: str,
+    shots: Shots,
+    rows: Sequence[int],
+    T_base_flange: Array | None = None,
+    **more: Any,
 ) -> Path:
-    """Write some shots as a table, with these poses in place of the reported ones."""
+    """Write some shots as a table, with these poses in place of the reported ones.
+
+    ``more`` as in `write_shots`.
+    """
     path = folder / f"{table}.csv"
     profiles = folder / "profiles"
     profiles.mkdir(parents=True, exist_ok=True)
     poses = shots.T_base_flange[list(rows)] if T_base_flange is None else T_base_flange
-    more: dict[str, Any] = {}
     if any(shots.marks):
         more["mark"] = [shots.marks[row] for row in rows]
     seen = {f"s{row + 1}": shots.profiles[row] for row in rows}

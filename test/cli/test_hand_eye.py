@@ -17,6 +17,7 @@ from hand_eye_tables import (
     RADIUS_M,
     ROBOT_M,
     SHOTS,
+    STAIRS,
     T_BASE_USER,
     TRUE,
     hand_eye_tables,
@@ -27,9 +28,16 @@ from scipy.stats import chi2
 
 from robocal_ros.cli.main import main
 from robocal_ros.core import frames
-from robocal_ros.sim.hand_eye_cell import Shots, View, view
+from robocal_ros.core.hand_eye.targets import LineTarget
+from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.hand_eye_cell import ArmRobot, Shots, View, view
 from robocal_ros.sim.hand_eye_sets import DOWN, sphere_shots
 from robocal_ros.sim.profile_targets import ball_on_table
+from robocal_ros.sim.ur10_station import Q_NEAR
+from robocal_ros.storage.hand_eye_files import read_flange_mount
+from robocal_ros.storage.hand_eye_tables import read_pose_table, write_pose_table
+from robocal_ros.storage.hand_eye_targets import write_target
+from robocal_ros.storage.robots import load_robot
 
 FOLDERS = ("sphere", "step", "line", "groove")
 LEFT_HANDED = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, -1.0], *np.ones((2, 4))])
@@ -143,6 +151,19 @@ class TestRecovered:
         found = robocal("joint", *both, "--line-kind", "groove")
         assert not found["target"]["line"]["known"]
         assert chi_square(found) < FAR_OFF
+
+    def test_joints_of_a_robot_instead_of_poses(self, tmp_path):
+        arm = load_robot("ur10")
+        rng = np.random.default_rng(0)
+        cell = replace(CELL, robot=ArmRobot(rigid_robot(arm, 0.0, rng), Q_NEAR))
+        some = sphere_shots(cell, CENTRE, RADIUS_M, 8, rng)
+        path = write_part(tmp_path, "poses", some, range(8), joints=(arm, some.q))
+        table = np.genfromtxt(path, delimiter=",", dtype=str)
+        path.write_text("\n".join(",".join(row) for row in table[:, :-7]) + "\n")
+        found = robocal("sphere", *shots(tmp_path), "--radius-mm", 20, "--robot", "ur10")
+        assert chi_square(found) < FAR_OFF
+        refused = robocal("sphere", *shots(tmp_path), "--radius-mm", 20, status=2)
+        assert "name the robot" in refused["error"]["message"]
 
     def test_people_read_the_verdict_first(self, made, capsys):
         words = ["sphere", *shots(made / "sphere"), "--radius-mm", 20]
@@ -325,6 +346,11 @@ class TestMistakes:
         self.refused("BAD_INPUT", "at least two", run=run)
 
 
+def step(T: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """A pose (4, 4) moved by (3,) along its own axes."""
+    return T @ frames.transform(np.eye(3), p)
+
+
 def same_place() -> Shots:
     """Shots with the sphere always at one place of the profile."""
     rng = np.random.default_rng(4)
@@ -389,6 +415,22 @@ class TestPlan:
         assert again["verdict"]["accept"], again["verdict"]
         assert again["working_error_mm"] == pytest.approx(found["proposed_error_mm"], rel=0.02)
 
+    def test_marks_of_proposed_poses(self, made, mount, tmp_path):
+        """The light of each lies on the mark that is told, by the place of the stairs."""
+        poses = tmp_path / "poses.csv"
+        rows = (made / "step" / "poses.csv").read_text().splitlines()
+        poses.write_text("\n".join(rows[:2]) + "\n")
+        more = tmp_path / "more.csv"
+        run = self.plan("step", poses, mount, *target(made / "step"), "--propose", more)
+        found = robocal(*run, "--limit-mm", 0.05)
+        written = read_pose_table(more, None, None)
+        assert list(written.mark) == found["proposed_marks"]
+        assert len(written) == len(found["proposed"]) > 1
+        for T_base_flange, mark in zip(written.T_base_flange, written.mark, strict=True):
+            T = frames.invert(T_base_flange @ read_flange_mount(mount))
+            lit = T[:3, :3] @ STAIRS.middle(mark) + T[:3, 3]
+            assert abs(lit[1]) < 1e-3
+
     def test_turns_about_one_axis_are_named(self, mount, tmp_path):
         cell = replace(CELL, tilt_rad=0.0)
         some = sphere_shots(cell, CENTRE, RADIUS_M, SHOTS, np.random.default_rng(0))
@@ -403,6 +445,25 @@ class TestPlan:
         found = robocal(*self.plan("sphere", poses, mount, *self.centre()))
         assert found["verdict"]["code"] in ("RANK_DEFICIENT", "POSES_NOT_INFORMATIVE")
         assert found["proposed"]
+
+    def test_light_square_to_a_line_shows_three_of_six(self, made, tmp_path):
+        """Shifts along the line and turns out of the plane stay open, in poses as they are drawn.
+
+        Rounding must not count as something seen.
+        """
+        mount = tmp_path / "mount.yaml"
+        mount.write_text("T_flange_sensor: {xyz_mm: [0, 0, 100], rpy_deg: [0, 0, 0]}\n")
+        T_base_user = frames.transform(np.diag([1.0, -1.0, -1.0]), [0.8, 0.0, 0.03])
+        known = tmp_path / "line.yaml"
+        write_target(known, LineTarget(T_base_user[:3, 3], T_base_user[:3, 1]))
+        at = np.random.default_rng(0).uniform([-0.01, -0.05, 0.29], [0.01, 0.05, 0.31], (10, 3))
+        poses = tmp_path / "plan.csv"
+        write_pose_table(poses, np.stack([step(T_base_user, -p) for p in at]))
+        found = robocal(*self.plan("line", poses, mount, "--target", known))
+        assert (found["rank"], found["unknowns"]) == (3, 6)
+        assert len(found["unobservable"]) == 3
+        assert found["verdict"]["code"] == "RANK_DEFICIENT"
+        assert (found["sigma"], found["working_error_mm"]) == (None, None)
 
     def test_poses_out_of_range_are_named(self, made, mount, tmp_path):
         some = shots_of("sphere")

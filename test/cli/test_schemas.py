@@ -13,9 +13,12 @@ from hand_eye_tables import TRUE, hand_eye_tables
 from recordings import plain_bag, recorded_bag, shift
 from tool_runs import run_tables
 from tool_tables import tool_tables
+from tracker_files import SCAN, tracker_files
 
 from robocal_ros.cli.main import COMMANDS
 from robocal_ros.core.documents import transform_document
+from robocal_ros.sim.tracker_cells import prp_cell
+from robocal_ros.storage.robots import load_description
 
 UR_NOMINAL = """[DH]
 a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]
@@ -46,6 +49,8 @@ STEP = ["--target", "step/target.yaml", "--poses", "step/poses.csv", "--profiles
 LINE = ["--poses", "line/poses.csv", "--profiles", "line/profiles"]
 PLANNED = ["hand-eye", "check-plan", "--target-kind", "sphere", "--radius-mm", "20"]
 CAMERA = ["hand-eye", "camera", "--measured", "board_poses.csv"]
+TRACKER = ["hand-eye", "tracker", "--robot", "p1r2p3", "--poses", "scan_poses.csv",
+           "--profiles", SCAN, "--points", "tracker.csv"]  # fmt: skip
 # Schema, arguments that succeed, arguments that fail, and the failure's exit status and code.
 CASES = {
     "fk": (
@@ -222,6 +227,12 @@ CASES = {
         [*CAMERA, "--poses", "few_camera_poses.csv"],
         (3, "TOO_FEW_SAMPLES"),
     ),
+    "hand-eye tracker": (
+        "hand-eye.tracker.json",
+        [*TRACKER, "--target", "tracker_target.yaml"],
+        [*TRACKER, "--radius-mm", "19.05"],
+        (3, "RANK_DEFICIENT"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
@@ -249,6 +260,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "sphere" / "few.csv").write_text("\n".join(shots[:4]) + "\n")
     (folder / "mount.yaml").write_text(json.dumps({"T_flange_sensor": transform_document(TRUE)}))
     camera_tables(folder)
+    tracker_files(folder, prp_cell(load_description("p1r2p3").arm))
     placing = ["--data", folder / "sensor.csv", "--output", folder / "s.yaml"]
     robocal_json("thermal.sensor.json", *PLACE, *placing)
     (folder / "n.conf").write_text(UR_NOMINAL)
@@ -264,8 +276,8 @@ def test_every_command_and_schema_has_a_case() -> None:
 
 def placed(folder: Path, arguments: list[str]) -> list[str]:
     """Names of files, and of folders after an option for one, become paths in the folder."""
-    files = (".csv", ".mcap", ".conf", ".yaml", "/profiles")
-    folders = ("--state", "--sphere", "--step", "--line")
+    files = (".csv", ".mcap", ".conf", ".yaml")
+    folders = ("--state", "--profiles", "--sphere", "--step", "--line")
     return [
         str(folder / word) if word.endswith(files) or before in folders else word
         for before, word in zip(["", *arguments], arguments, strict=False)

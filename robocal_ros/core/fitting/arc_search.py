@@ -96,16 +96,23 @@ def _through(triples: Array) -> Array:
 
 def _costs(circles: Array, points: Array, limit: float) -> Array:
     """Truncated squares (c,) of the points' distances from the near sides of circles (c, 3)."""
-    miss = _misses(circles, points)
-    square = np.minimum(miss * miss, limit**2)
+    square = _misses(circles, points)
+    np.square(square, out=square)
     square[points[:, 1] >= circles[:, 1:2]] = limit**2
-    return np.asarray(np.sum(square, axis=1))
+    return np.asarray(np.minimum(square, limit**2, out=square).sum(axis=1))
 
 
 def _misses(circles: Array, points: Array) -> Array:
-    """Distances (c, n) of points from circles (c, 3), exact near the circle."""
-    x0, z0, r = circles[:, :1], circles[:, 1:2], circles[:, 2:]
-    return np.asarray(((points[:, 0] - x0) ** 2 + (points[:, 1] - z0) ** 2 - r * r) / (2.0 * r))
+    """Distances (c, n) of points from circles (c, 3), exact near the circle.
+
+    ``((x - x0)^2 + (z - z0)^2 - r^2) / 2 r`` as one product of matrices.
+    """
+    away = points - points[0]  # so that squares of large numbers do not cancel
+    x0, z0 = (circles[:, :2] - points[0]).T
+    powers = np.stack([np.sum(away * away, axis=1), *away.T, np.ones(len(away))])
+    r = circles[:, 2]
+    shape = np.column_stack([np.ones(len(r)), -2.0 * x0, -2.0 * z0, x0**2 + z0**2 - r**2])
+    return np.asarray((shape / (2.0 * r)[:, None]) @ powers)
 
 
 def _improved(circle: Array, points: Array, limit: float) -> Array:

@@ -71,7 +71,7 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
     factor = chi2_quantile(1.0 - FALSE_REJECTION / count, 1.0) ** 0.5
     if start is None:
         direction, residual = _first_line(cloud)
-        scatter = np.full(count, MAD * float(np.median(np.abs(residual))) + SMALLEST_M)
+        scatter = np.full(count, MAD * _median(np.abs(residual)) + SMALLEST_M)
     else:
         direction = start.direction
         residual = (cloud - start.middle) @ start.normal
@@ -109,9 +109,15 @@ def _first_line(cloud: Array) -> tuple[Array, Array]:
     """Direction (2,) of points (n, 2) ascending in x, and their distances (n,) from the line."""
     half = len(cloud) // 2
     step = cloud[half:] - cloud[: len(cloud) - half]
-    angle = float(np.median(np.arctan2(step[:, 1], step[:, 0])))
+    angle = _median(np.arctan2(step[:, 1], step[:, 0]))
     residual = cloud @ np.array([-np.sin(angle), np.cos(angle)])
-    return np.array([np.cos(angle), np.sin(angle)]), residual - np.median(residual)
+    return np.array([np.cos(angle), np.sin(angle)]), residual - _median(residual)
+
+
+def _median(values: Array) -> float:
+    """The upper median of values (n,), in a fifth of NumPy's time for the few of a piece."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
 
 
 def _main_direction(away: Array, towards: Array) -> Array:

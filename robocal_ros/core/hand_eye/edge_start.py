@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 TURNS = 400  # rotations of the sensor that are tried
 DIRECTIONS = 60  # directions of an unknown line that are tried
 KEPT = 8
+PARTS = 50  # of the corners that are tried
 ALIKE_M = 1e-6  # small, so that the descent goes to the very minimum
 SEED = 5  # of the fixed set of trials
 NO_STRETCH = 2e-3  # of their length: corners that lie on one line but for so much
@@ -35,43 +36,52 @@ def linear_corners(value: Array, p_flange: Array) -> Array:
     """
     if len(value) < 3:
         raise TooFewSamplesError(f"{len(value)} corners fit the target, at least 3 are needed")
-    A = np.column_stack([value[:, 0], value[:, 1], np.ones(len(value))])
-    s = np.linalg.svd(A - A.mean(axis=0), compute_uv=False)
-    if s[1] < NO_STRETCH * s[0]:
+    X, seen = _linear(value, p_flange)
+    if not seen:
         words = "rotation about the line of the corners"
         raise RankDeficientError(
             f"not determined: {words}: all corners lie on one line of the laser plane; show the "
             "target from several poses, or a second line of corners",
             [words],
         )
-    r1, r3, t = np.linalg.lstsq(A, p_flange, rcond=None)[0]
-    return frames.transform(frames.nearest_rotation(np.column_stack([r1, np.cross(r3, r1), r3])), t)
+    return X
 
 
 def robust_corners(value: Array, p_flange: Array) -> Array:
-    """`linear_corners` of the half of corners that agree best, and then of those near them."""
+    """`linear_corners` of the part of corners that agrees best, and then of those near them."""
+    best = linear_corners(value, p_flange)
     rng = np.random.default_rng(SEED)
     m = len(value)
-    best, least = linear_corners(value, p_flange), np.inf
-    for _ in range(50):
-        rows = rng.permutation(m)[: max(4, m // 3)]
-        try:
-            X = linear_corners(value[rows], p_flange[rows])
-        except RankDeficientError:
-            continue
-        median = float(np.median(_miss(X, value, p_flange)))
-        if median < least:
-            best, least = X, median
-    near = _miss(best, value, p_flange) <= 3.0 * least
+    rows = np.array([rng.permutation(m)[: max(4, m // 3)] for _ in range(PARTS)])
+    X, seen = _linear(value[rows], p_flange[rows])
+    median = np.median(_miss(X, value, p_flange), axis=1)
+    median[~seen] = np.inf
+    first = int(np.argmin(median))
+    if seen[first]:
+        best = X[first]
+    near = _miss(best, value, p_flange) <= 3.0 * median[first]
     try:
         return linear_corners(value[near], p_flange[near])
-    except RankDeficientError:
+    except (RankDeficientError, TooFewSamplesError):
         return best
 
 
+def _linear(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Closed forms X (..., 4, 4) of corners (..., m, 3), and whether these show them at all."""
+    A = value.copy()
+    A[..., 2] = 1.0
+    s = np.linalg.svd(A - A.mean(axis=-2, keepdims=True), compute_uv=False)
+    columns = np.linalg.pinv(A) @ p_flange  # rows r1, r3, t
+    r1, r3, t = np.moveaxis(columns, -2, 0)
+    R = frames.nearest_rotation(np.stack([r1, np.cross(r3, r1), r3], axis=-1))
+    return frames.transform(R, t), np.asarray(s[..., 1] > NO_STRETCH * s[..., 0])
+
+
 def _miss(X: Array, value: Array, p_flange: Array) -> Array:
+    """Distances (..., m) of corners that poses (..., 4, 4) put into the flange frame."""
     own = np.column_stack([value[:, 0], np.zeros(len(value)), value[:, 1]])
-    return np.asarray(np.linalg.norm(own @ X[:3, :3].T + X[:3, 3] - p_flange, axis=1))
+    found = own @ np.swapaxes(X[..., :3, :3], -1, -2) + X[..., None, :3, 3]
+    return np.asarray(np.linalg.norm(found - p_flange, axis=-1))
 
 
 def line_starts(sightings: Sightings, line: Array | None) -> list[MountState]:
@@ -88,7 +98,9 @@ def line_starts(sightings: Sightings, line: Array | None) -> list[MountState]:
     else:
         sphere = rng.standard_normal((DIRECTIONS, 3))
         directions = sphere / np.linalg.norm(sphere, axis=1)[:, None]
-    found = [_held(sightings, turns, u, None if line is None else line[0]) for u in directions]
+    R = sightings.T_base_flange[:, :3, :3]
+    seen = _turned(sightings, turns)
+    found = [_held(R, seen, u, None if line is None else line[0]) for u in directions]
     costs = np.array([cost for cost, _, _ in found])  # (directions, turns)
     starts = []
     for flat in np.argsort(costs, axis=None)[:KEPT]:
@@ -106,24 +118,31 @@ def _random_rotations(count: int, rng: np.random.Generator) -> Array:
     return np.asarray(Rotation.from_quat(quat).as_matrix())
 
 
-def _held(
-    sightings: Sightings, turns: Array, direction: Array, point: Array | None
-) -> tuple[Array, Array, Array]:
-    """With rotations (p, 3, 3) and a direction held: costs (p,), t (p, 3), points (p, 3)."""
+def _turned(sightings: Sightings, turns: Array) -> Array:
+    """Features (p, m, 3) in base with rotations (p, 3, 3) of a sensor at the flange's origin."""
     R, place = sightings.T_base_flange[:, :3, :3], sightings.T_base_flange[:, :3, 3]
     own = np.column_stack([sightings.value[:, 0], np.zeros(len(place)), sightings.value[:, 1]])
+    flange = own @ np.swapaxes(turns, 1, 2)
+    return np.asarray((R @ flange[..., None])[..., 0] + place)
+
+
+def _held(
+    R: Array, seen: Array, direction: Array, point: Array | None
+) -> tuple[Array, Array, Array]:
+    """With rotations and a direction held: costs (p,), t (p, 3), points (p, 3) of the line.
+
+    ``R`` (m, 3, 3) of the flange; ``seen`` (p, m, 3) as `_turned` gives it.
+    """
     across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)
-    lhs = np.einsum("ai,mij->maj", across, R)
+    lhs = across @ R
     if point is None:
         lhs = np.concatenate([lhs, np.broadcast_to(-np.eye(2), (len(R), 2, 2))], axis=2)
     lhs = lhs.reshape(2 * len(R), -1)
     known = np.zeros(3) if point is None else point
-    rhs = np.einsum("ai,mij,pjk,mk->pma", across, R, turns, own)
-    rhs = rhs + np.einsum("ai,mi->ma", across, place - known)
-    rhs = rhs.reshape(len(turns), -1)
+    rhs = ((seen - known) @ across.T).reshape(len(seen), -1)
     solution = -(np.linalg.pinv(lhs, rcond=1e-9) @ rhs.T).T
     cost = np.sum((solution @ lhs.T + rhs) ** 2, axis=1)
-    points = np.broadcast_to(known, (len(turns), 3))
+    points = np.broadcast_to(known, (len(seen), 3))
     return cost, solution[:, :3], points if point is not None else solution[:, 3:] @ across
 
 

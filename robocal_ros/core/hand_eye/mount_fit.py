@@ -16,7 +16,11 @@ from robocal_ros.core.hand_eye.mount_problem import (
     pivot_of,
 )
 from robocal_ros.core.hand_eye.naming import describe_motion
-from robocal_ros.core.hand_eye.restricted_noise import FIRST_NOISE, restricted_noise
+from robocal_ros.core.hand_eye.restricted_noise import (
+    FIRST_NOISE,
+    averaged_covariance,
+    restricted_noise,
+)
 from robocal_ros.core.hand_eye.result import at_origin, increment, moved_origin
 from robocal_ros.core.observability import observability
 
@@ -95,10 +99,11 @@ def fit_mount(
         views = without(views, wrong, rejected)
     estimate, wrong, found = _settle(views, state, found, noise, together=True)
     views = without(views, wrong, rejected)
+    last = MountProblem(views, found, estimate.state)
     return MountFit(
         views,
         estimate.state,
-        estimate.covariance,
+        estimate.scale**2 * averaged_covariance(last, estimate.state, noise),
         estimate.scale,
         found,
         rejected,

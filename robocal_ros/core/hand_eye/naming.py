@@ -12,6 +12,7 @@ Array = NDArray[np.float64]
 AXES = ("the laser line (x)", "the laser plane's normal (y)", "the beam (z)")
 ALONG = 0.9  # cosine from which a direction is named after an axis
 SMALL_TURN_RAD = float(np.radians(1.0))  # turns below this show nothing
+FARTHEST_AXIS_M = 100.0  # a turn about an axis beyond it is a translation
 ENOUGH = "by 20 deg or more"
 
 
@@ -39,7 +40,7 @@ def describe_motion(direction: Array, T_base_flange: Array) -> str:
 
 def _words(direction: Array) -> str:
     v, w = direction[:3], direction[3:]
-    if np.linalg.norm(w) < 1e-6 * max(float(np.linalg.norm(v)), 1e-300):
+    if np.linalg.norm(w) * FARTHEST_AXIS_M < max(float(np.linalg.norm(v)), 1e-300):
         return f"translation along {_axis(v)}"
     turn = float(np.linalg.norm(w))
     centre = np.cross(w, v) / turn**2  # the point of the axis next to the origin

@@ -14,12 +14,10 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.mount_fit import open_directions
+from robocal_ros.core.hand_eye.mount_fit import OPEN_M, open_directions
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
-from robocal_ros.core.hand_eye.naming import describe_motion
 from robocal_ros.core.hand_eye.quality import expected_error_m
-from robocal_ros.core.hand_eye.result import at_origin, moved_origin
-from robocal_ros.core.observability import observability
+from robocal_ros.core.hand_eye.result import at_origin
 
 Array = NDArray[np.float64]
 
@@ -81,7 +79,9 @@ class PlanReport:
 
     Attributes
     ----------
-    rank, unknowns : of the problem; unobservable : open directions in words.
+    rank, unknowns : of the problem; a direction that stays open by 2 cm is not seen, even where
+        rounding or a faint effect would tell something. unobservable : those of the sensor, in
+        words.
     sigma : (6,) expected, sensor axes: m, rad; working_error_m: rms at the working distance.
     unseen : poses (by index) that do not see the target, with the reason.
     proposed : (n, 4, 4) flange poses to add, best first; proposed_error_m: with all of them.
@@ -160,18 +160,20 @@ def _shown(view: View, state: MountState, noise: PoseNoise, sensor: SensorRange)
     if not view.sightings.names:
         return _Shown(0, np.zeros((k, k)), None, ["no pose sees the target"])
     J = _samples(view, state, noise, sensor)[1].reshape(-1, k)
-    prior = _prior(view)
-    found = observability(np.vstack([J, np.sqrt(prior)]))
-    information = J.T @ J + prior
-    poses = view.sightings.T_base_flange
-    if found.rank < k:
-        open_ones = [moved_origin(d[:6], sensor.pivot) for d in found.null.T]
-        words = [describe_motion(d, poses) for d in open_ones if np.linalg.norm(d) > 1e-9]
-        return _Shown(found.rank, information, None, words)
-    covariance = np.asarray(np.linalg.inv(information))
+    information = J.T @ J + _prior(view)
+    covariance = np.asarray(np.linalg.inv(information + _vague(k)))
+    size = np.ones(k)
+    size[3:6] = sensor.middle_m
+    rank = int(np.sum(np.linalg.eigvalsh(covariance * np.outer(size, size)) < OPEN_M**2))
     at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
-    words = open_directions(at_sensor, sensor.middle_m, poses)
-    return _Shown(found.rank, information, covariance, words)
+    words = open_directions(at_sensor, sensor.middle_m, view.sightings.T_base_flange)
+    return _Shown(rank, information, None if words else covariance, words)
+
+
+def _vague(unknowns: int) -> Array:
+    """Information (k, k) of a guess, which makes of an open direction a large error."""
+    of_target = np.full(unknowns - 6, 1.0)
+    return np.diag(np.concatenate([np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0, of_target]))
 
 
 def _samples(
@@ -224,8 +226,7 @@ def _propose(
     gain = np.zeros((len(candidates), *information.shape))
     gain[poses] = np.swapaxes(J, 1, 2) @ J
     gain[list(target.unseen(view))] = 0.0
-    vague = np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0
-    total = information + np.diag(np.concatenate([vague, np.full(len(information) - 6, 1.0)]))
+    total = information + _vague(len(information))
     chosen: list[int] = []
     error = np.inf
     while len(chosen) < MOST_PROPOSED and (error > limit_m or seen + len(chosen) < target.fewest):

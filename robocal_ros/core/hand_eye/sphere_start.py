@@ -20,14 +20,15 @@ Array = NDArray[np.float64]
 FEWEST_PROFILES = 5
 SUBSET = 7  # profiles whose sides are tried in all patterns
 DRAWS = 12
+MIRROR = np.array([1.0, -1.0, 1.0])
 KEPT = 3  # starts of each draw, and in the end
 
 
-def linear_mounts(T_base_flange: Array, centres: Array) -> Array:
-    """Classic closed form for many patterns (p) of sides: X (p, 4, 4).
+def linear_mounts(T_base_flange: Array, centres: Array) -> tuple[Array, Array]:
+    """Classic closed form for many patterns (p) of sides: M (p, 3, 3), t (p, 3).
 
-    R_i (M s_i + t) + t_i = c is linear in M (3, 3) and t; differences from the mean leave out c.
-    M is projected to SO(3). ``centres`` (p, m, 3): the sphere in each sensor frame.
+    R_i (M s_i + t) + t_i = c is linear in M and t; differences from the mean leave out c. M is
+    near the rotation of the sensor. ``centres`` (p, m, 3): the sphere in each sensor frame.
     """
     R, place = T_base_flange[:, :3, :3], T_base_flange[:, :3, 3]
     p, m = centres.shape[:2]
@@ -36,9 +37,7 @@ def linear_mounts(T_base_flange: Array, centres: Array) -> Array:
     A = (A - A.mean(axis=1, keepdims=True)).reshape(p, 3 * m, 12)
     b = -(place - place.mean(axis=0)).reshape(-1)
     solution = np.linalg.pinv(A, rcond=1e-9) @ b
-    U, _, Vt = np.linalg.svd(solution[:, :9].reshape(p, 3, 3))
-    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
-    return frames.transform(U @ Vt, solution[:, 9:])
+    return solution[:, :9].reshape(p, 3, 3), solution[:, 9:]
 
 
 def _placed(T_base_flange: Array, turn: Array, centres: Array) -> tuple[Array, Array]:
@@ -72,7 +71,7 @@ def sphere_starts(sightings: Sightings, radius_m: float) -> list[MountState]:
     X, c = np.concatenate(X_all), np.concatenate(c_all)
     T = sightings.T_base_flange
     sides = _sides(T, X, c)
-    centres = np.stack([circle_centres(sightings.value, radius_m, side) for side in sides])
+    centres = _on_sides(sightings, radius_m, sides)
     score = np.median(_misses(T, X, c, centres), axis=1)
     best = np.argsort(score)[:KEPT]
     return [MountState(X[i], (c[i],)) for i in best]
@@ -88,13 +87,19 @@ def _by_patterns(sightings: Sightings, radius_m: float) -> tuple[Array, Array]:
     """The best poses from these profiles, over all patterns of sides."""
     m = len(sightings.names)
     patterns = np.array([(1.0, *rest) for rest in product((1.0, -1.0), repeat=m - 1)])
-    patterns = np.concatenate([patterns, -patterns])
-    centres = np.stack([circle_centres(sightings.value, radius_m, side) for side in patterns])
-    turn = linear_mounts(sightings.T_base_flange, centres)[:, :3, :3]
+    M, _ = linear_mounts(sightings.T_base_flange, _on_sides(sightings, radius_m, patterns))
+    turn = frames.nearest_rotation(np.concatenate([M, M * MIRROR]))  # of the opposite pattern too
+    centres = _on_sides(sightings, radius_m, np.concatenate([patterns, -patterns]))
     X, c = _placed(sightings.T_base_flange, turn, centres)
     miss = _misses(sightings.T_base_flange, X, c, centres)
     best = np.argsort(np.sum(miss**2, axis=1))[:KEPT]
     return X[best], c[best]
+
+
+def _on_sides(sightings: Sightings, radius_m: float, sides: Array) -> Array:
+    """Sphere centres (p, m, 3), sensor frame, for many patterns of sides (p, m)."""
+    value = np.broadcast_to(sightings.value, (*sides.shape, 3)).reshape(-1, 3)
+    return circle_centres(value, radius_m, sides.ravel()).reshape(*sides.shape, 3)
 
 
 def _sides(T_base_flange: Array, X: Array, place: Array) -> Array:
@@ -109,7 +114,8 @@ def classic_sphere(sightings: Sightings, radius_m: float, near: MountState) -> M
     X, place = near.T_flange_sensor[None], near.places[0][None]
     side = _sides(sightings.T_base_flange, X, place)[0]
     centres = circle_centres(sightings.value, radius_m, side)
-    found = linear_mounts(sightings.T_base_flange, centres[None])[0]
+    M, t = linear_mounts(sightings.T_base_flange, centres[None])
+    found = frames.transform(frames.nearest_rotation(M[0]), t[0])
     T = sightings.T_base_flange @ found
     own = np.einsum("mij,mj->mi", T[:, :3, :3], centres) + T[:, :3, 3]
     return MountState(found, (own.mean(axis=0),))

@@ -1,0 +1,136 @@
+"""What a line laser sees of a target, and the least error that any estimator can reach with it.
+
+A path of its own: planes, lines and circles are cut in base, and every derivative is a central
+difference of that, so that the bound is not the estimator's own opinion.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+STEP = 1e-6  # m, rad: of the differences
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One sigma: of a reported pose about each axis, and of light that is laid on a mark by eye."""
+
+    pose_m: float
+    pose_rad: float
+    aim_m: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What is seen of a target.
+
+    Attributes
+    ----------
+    see : from sensor poses (m, 4, 4) in base and the target's unknowns (k,) to features (m, c).
+    unknowns : k; ``components`` : c.
+    aim : (m, c, 2) change with the light's shift and turn on the marks; None where there are none.
+    """
+
+    see: Callable[[Array, Array], Array]
+    unknowns: int
+    components: int
+    aim: Array | None = None
+
+
+def circles(T_base_sensor: Array, centre: Array, radius_m: float) -> Array:
+    """(x0, z0, r) (m, 3) of the circles that laser planes (m, 4, 4) cut out of a sphere."""
+    eye, normal = T_base_sensor[:, :3, 3], T_base_sensor[:, :3, 1]
+    height = np.sum(normal * (centre - eye), axis=1)
+    foot = centre - height[:, None] * normal
+    return np.column_stack([*_along_axes(T_base_sensor, foot), np.sqrt(radius_m**2 - height**2)])
+
+
+def piercings(T_base_sensor: Array, point: Array, direction: Array) -> tuple[Array, Array]:
+    """(x, z) (m, 2) where lines pierce laser planes (m, 4, 4), and how far (m,) from the point.
+
+    ``point`` (3,) or (m, 3), ``direction`` (3,) in base.
+    """
+    eye, normal = T_base_sensor[:, :3, 3], T_base_sensor[:, :3, 1]
+    far = np.sum(normal * (eye - point), axis=1) / (normal @ direction)
+    hit = point + far[:, None] * direction
+    return np.column_stack(_along_axes(T_base_sensor, hit)), far * np.linalg.norm(direction)
+
+
+def _along_axes(T_base_sensor: Array, point: Array) -> tuple[Array, Array]:
+    away = point - T_base_sensor[:, :3, 3]
+    x, z = T_base_sensor[:, :3, 0], T_base_sensor[:, :3, 2]
+    return np.sum(away * x, axis=1), np.sum(away * z, axis=1)
+
+
+def circle_covariance(r: float, noise_m: float, pitch_m: float) -> Array:
+    """Covariance (3, 3) of (x0, z0, r) from an arc up to 60 deg, z with noise at every pitch."""
+    u = np.arange(-np.sin(np.pi / 3.0) * r, np.sin(np.pi / 3.0) * r, pitch_m)
+    h = np.sqrt(r**2 - u**2)
+    J = np.column_stack([-u / h, np.ones_like(u), -r / h])  # of z = z0 - h
+    return np.asarray(noise_m**2 * np.linalg.inv(J.T @ J))
+
+
+def corner_covariance(turn_rad: float, flank_m: float, noise_m: float, pitch_m: float) -> Array:
+    """Covariance (2, 2) of the corner of two flanks, 45 deg down on either side, then turned."""
+    slope = np.tan(np.array([0.25, -0.25]) * np.pi + turn_rad)
+    points = np.maximum(flank_m * np.cos(np.arctan(slope)) / pitch_m, 4.0)
+    variance = 4.0 * noise_m**2 / points  # of a straight line at the end of its points
+    J = np.array([[-1.0, 1.0], [-slope[1], slope[0]]]) / (slope[0] - slope[1])
+    return np.asarray((J * variance) @ J.T)
+
+
+def moved(T: Array, step: Array, pivot: Array) -> Array:
+    """Poses after (v, w) along their own axes: the pivot moves by v, turned by w."""
+    turn = frames.exp_rotation(step[3:])
+    return np.asarray(T @ frames.transform(turn, pivot + step[:3] - turn @ pivot))
+
+
+def least_covariance(
+    sight: Sight,
+    T_base_flange: Array,
+    pose: Index,
+    T_flange_sensor: Array,
+    pivot: Array,
+    place: Array,
+    covariance: Array,
+    noise: Noise,
+) -> Array:
+    """Cramer-Rao: least covariance (6, 6) of the increment (v, w) about the pivot.
+
+    Parameters
+    ----------
+    T_base_flange : (m, 4, 4) true pose of each sighting; ``pose`` (m,): which have it in common.
+    place : (k,) the target's unknowns; covariance : (m, c, c) of the features.
+    """
+
+    def seen(step: Array) -> Array:
+        sensor, target, robot = np.split(step, [6, 6 + sight.unknowns])
+        X = moved(T_flange_sensor, sensor, pivot)
+        return sight.see(moved(T_base_flange, robot, np.zeros(3)) @ X, place + target)
+
+    size = 6 + sight.unknowns
+    steps = STEP * np.eye(size + 6)
+    slopes = np.stack([(seen(h) - seen(-h)) / (2.0 * STEP) for h in steps], axis=2)
+    J, common = slopes[:, :, :size], slopes[:, :, size:]
+    spread = np.repeat([noise.pose_m, noise.pose_rad], 3)
+    if sight.aim is not None:
+        common = np.concatenate([common, sight.aim], axis=2)
+        spread = np.append(spread, [noise.aim_m, noise.aim_m])
+    information = np.zeros((size, size))
+    for one in np.unique(pose):
+        rows = np.flatnonzero(pose == one)
+        G = common[rows].reshape(-1, common.shape[2]) * spread
+        own = J[rows].reshape(-1, size)
+        total = G @ G.T
+        for k in range(len(rows)):
+            block = slice(k * sight.components, (k + 1) * sight.components)
+            total[block, block] += covariance[rows[k]]
+        information += own.T @ np.linalg.solve(total, own)
+    return np.asarray(np.linalg.inv(information)[:6, :6])

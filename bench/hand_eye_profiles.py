@@ -1,0 +1,275 @@
+"""Line laser on a flange, whole profiles: unseen poses, what is not modelled, time; simulated."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.hand_eye_shots import (
+    SETTINGS,
+    Calibration,
+    edge_set,
+    known_edge_set,
+    sphere_set,
+    step_set,
+)
+from bench.hand_eye_worlds import (
+    AIM_M,
+    CENTRE,
+    MACHINING_M,
+    X,
+    squared_error,
+)
+from bench.tables import Goal, Table
+from robocal_ros.core import frames
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.hand_eye.joint import solve_joint
+from robocal_ros.core.hand_eye.mount_problem import pivot_of
+from robocal_ros.core.hand_eye.quality import expected_error_m
+from robocal_ros.core.hand_eye.result import HandEyeResult, at_origin, increment
+from robocal_ros.core.hand_eye.solve import field_of
+from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
+from robocal_ros.sim.profile_sensor import ProfileSensor
+from robocal_ros.sim.ur10_station import Q_NEAR
+from robocal_ros.storage.robots import load_robot
+
+Array = NDArray[np.float64]
+
+RUNS = 12
+STEP_RUNS = 40
+JOINT_RUNS = 25
+UNSEEN = 20
+ROUGH = ProfileSensor(spikes=0.02, dropouts=0.05, gaps=3)
+DOWN = np.diag([1.0, -1.0, -1.0])
+COARSE = PoseRobot(1e-4 / float(np.sqrt(3.0)))  # 0.1 mm rms in space
+ECCENTRIC_RAD = 2e-5
+GEOMETRY_M = 5e-5  # of each length, and as much at 1 m of each angle
+
+
+def unseen_errors(T_flange_sensor: Array, rng: np.random.Generator) -> Array:
+    """Errors (20, 3), base, m, of one true point scanned from unseen poses that are truly known."""
+    errors = []
+    for _ in range(UNSEEN):
+        tilt, roll = np.radians(25.0), np.radians(60.0)
+        turns = rng.uniform(-1.0, 1.0, 3) * [tilt, tilt, roll]
+        p = np.array([rng.uniform(-0.015, 0.015), 0.0, rng.uniform(0.192, 0.208)])
+        T_base_flange = view(DOWN, turns, CENTRE, p) @ frames.invert(X)
+        found = T_base_flange @ T_flange_sensor @ np.append(p, 1.0)
+        errors.append(found[:3] - CENTRE)
+    return np.array(errors)
+
+
+def step_table() -> Table:
+    """The source's figures: points scanned from poses that were not used."""
+    table = Table(
+        "hand_eye_step",
+        "Stairs, 5 poses tilted up to 25 deg: one point scanned from 20 unseen poses, mm",
+        ("light on the marks", "method", "mean", "goal", "3 sigma", "goal", "runs within both, %",
+         "reported in the field"),
+        f"Simulated, whole profiles, {STEP_RUNS} runs; pose error 0.1 mm rms in space at the five "
+        "poses, true poses and a point without noise at the 20. Mean: of the point's distances; 3 "
+        "sigma: 3 times its standard deviation over the 20 poses along the worst of the base's "
+        "axes; both averaged over the runs. Goals: the published figures.",
+    )  # fmt: skip
+    cell = HandEyeCell(robot=COARSE)
+    for words, aim_m in (("exact", 0.0), ("to 0.2 mm by eye", AIM_M)):
+        found: dict[str, list[list[float]]] = {"best": [], "classic": []}
+        for seed in range(STEP_RUNS):
+            made = step_set(cell, np.random.default_rng([70, seed]), aim_m=aim_m)
+            fit, classic = made.both()
+            away = field_of(made.data) - pivot_of(fit.views)
+            told = expected_error_m(fit.covariance[:6, :6], away)
+            for rows, T in zip(found.values(), (fit.state.T_flange_sensor, classic), strict=True):
+                error = unseen_errors(T, np.random.default_rng([71, seed]))
+                mean, spread = np.mean(np.linalg.norm(error, axis=1)), error.std(axis=0, ddof=1)
+                rows.append([1e3 * float(mean), 3e3 * float(spread.max()), 1e3 * told])
+        for method, rows in found.items():
+            each = np.array(rows)
+            mean, spread, told = each.mean(axis=0).tolist()
+            both = 100.0 * float(np.mean(np.all(each[:, :2] <= 0.15, axis=1)))
+            best = method == "best"
+            table.add(
+                words, method, mean, Goal(mean, 0.15) if best else None, spread,
+                Goal(spread, 0.15) if best else None, both, told if best else None,
+            )  # fmt: skip
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """What is simulated."""
+
+    words: str
+    sensor: ProfileSensor = field(default_factory=ProfileSensor)
+    robot: Callable[[np.random.Generator], Robot] = lambda rng: PoseRobot(5e-5, 5e-5)
+    machining_m: float = 0.0
+
+
+def arm(rng: np.random.Generator, eccentric_rad: float = 0.0) -> Robot:
+    """A UR10 with errors of its geometry, which hang together from pose to pose."""
+    true = rigid_robot(load_robot("ur10"), GEOMETRY_M, rng)
+    true.static_error[-1] = 0.0  # nobody can tell it from a shift of the sensor
+    n = true.nominal.n
+    effects = replace(true.effects, noise=True, eccentricity=True)
+    true = replace(
+        true, repeatability=1e-5, effects=effects, eccentricity=np.full(n, eccentric_rad),
+        phase=rng.uniform(-np.pi, np.pi, n),
+    )  # fmt: skip
+    return ArmRobot(true, Q_NEAR)
+
+
+EFFECTS = (
+    Effect("as modelled"),
+    Effect(
+        "spikes 2 %, lost points 5 %, 3 gaps", ProfileSensor(spikes=0.02, dropouts=0.05, gaps=3)
+    ),
+    Effect("mirrored light, 2 % of columns", ProfileSensor(ghosts=0.02)),
+    Effect("UR10, geometry off by 0.05 mm and 0.05 mrad", robot=arm),
+    Effect("the same, encoders eccentric by 20 urad", robot=lambda rng: arm(rng, ECCENTRIC_RAD)),
+    Effect("stairs machined to 0.033 mm", machining_m=MACHINING_M),
+)
+
+
+def effects_table() -> Table:
+    """What each effect does."""
+    table = Table(
+        "hand_eye_effects",
+        "Effects that the estimator does not model: rms error of the mount in the field, mm",
+        ("what", "target", "best", "expected", "best over expected", "mean of d2 / 6", "classic",
+         "not used, %", "refused"),
+        f"Simulated, whole profiles, {RUNS} runs each. Expected: from the reported covariance. "
+        "Joints of the UR10 scatter by 10 urad. Where best is well over expected, the covariance "
+        "does not hold the effect: errors that hang together from pose to pose do not average "
+        "out. Not used: shots without a feature, or recognised as wrong.",
+    )  # fmt: skip
+    for effect in EFFECTS:
+        sets: dict[str, Callable[[HandEyeCell, np.random.Generator], Calibration]] = {
+            "stairs": lambda cell, rng, effect=effect: step_set(  # type: ignore[misc]
+                cell, rng, machining_m=effect.machining_m
+            )
+        }
+        if not effect.machining_m:
+            sets |= {"sphere": sphere_set, "unknown edge": edge_set}
+        for target, make in sets.items():
+            table.add(effect.words, target, *_effect(effect, make))
+    return table
+
+
+def _effect(
+    effect: Effect, make: Callable[[HandEyeCell, np.random.Generator], Calibration]
+) -> tuple[float | int | None, ...]:
+    best, expected, squared, classic = [], [], [], []
+    lost, shown, refused = 0, 0, 0
+    for seed in range(RUNS):
+        rng = np.random.default_rng([80, seed])
+        made = make(HandEyeCell(sensor=effect.sensor, robot=effect.robot(rng)), rng)
+        try:
+            fit, old = made.both()
+        except RobocalError:
+            refused += 1
+            continue
+        pivot = pivot_of(fit.views)
+        best.append(np.sum(increment(fit.state.T_flange_sensor, X, pivot)[:3] ** 2))
+        expected.append(np.trace(fit.covariance[:3, :3]))
+        squared.append(squared_error(fit) / 6.0)
+        classic.append(np.sum(increment(old, X, pivot)[:3] ** 2))
+        shots = len(made.data.names)
+        lost += shots - len(np.unique(np.concatenate([v.sightings.pose for v in fit.views])))
+        shown += shots
+    rms = [1e3 * float(np.sqrt(np.mean(each))) for each in (best, expected, classic)]
+    share = 100.0 * lost / shown
+    return rms[0], rms[1], rms[0] / rms[1], float(np.mean(squared)), rms[2], share, refused
+
+
+def joint_table() -> Table:
+    """A sphere and an edge together."""
+    table = Table(
+        "hand_eye_joint",
+        "A sphere and an unknown edge, 8 poses each, alone and together: rms error of the mount",
+        ("shown", "middle of the field, mm", "expected, mm", "goal", "turn, deg", "expected, deg",
+         "refused"),
+        f"Simulated, whole profiles, {JOINT_RUNS} runs; poses off by 0.05 mm and 0.05 mrad about "
+        "each axis. Goal: together no worse than the better one alone.",
+    )  # fmt: skip
+    solved: dict[str, list[HandEyeResult]] = {"sphere": [], "unknown edge": [], "together": []}
+    for seed in range(JOINT_RUNS):
+        rng = np.random.default_rng([90, seed])
+        cell = HandEyeCell(robot=PoseRobot(5e-5, 5e-5))
+        parts = sphere_set(cell, rng, 8), edge_set(cell, rng, 8)
+        calls: dict[str, Callable[[], HandEyeResult]] = {
+            "sphere": parts[0].solve,
+            "unknown edge": parts[1].solve,
+            "together": lambda parts=parts: solve_joint(  # type: ignore[misc]
+                [(part.task, part.data) for part in parts], SETTINGS
+            ),
+        }
+        for name, call in calls.items():
+            try:
+                solved[name].append(call())
+            except RobocalError:
+                continue
+    alone = np.inf
+    for name, results in solved.items():
+        shift, told, turn, told_turn = _joint_errors(results)
+        goal = Goal(shift, alone) if name == "together" else None
+        alone = min(alone, shift)
+        table.add(name, shift, told, goal, turn, told_turn, JOINT_RUNS - len(results))
+    return table
+
+
+def _joint_errors(results: Sequence[HandEyeResult]) -> list[float]:
+    """Rms shift, mm, at the middle of the field, what was expected; turn, deg, the same."""
+    pivot = np.array([0.0, 0.0, 0.2])
+    steps = np.array([increment(r.T_flange_sensor, X, pivot) for r in results])
+    move = [_about(r, pivot) for r in results]
+    figures = []
+    for rows, unit in ((slice(3), 1e3), (slice(3, 6), float(np.degrees(1.0)))):
+        figures.append(unit * float(np.sqrt(np.mean(np.sum(steps[:, rows] ** 2, axis=1)))))
+        figures.append(unit * float(np.sqrt(np.mean([np.trace(c[rows, rows]) for c in move]))))
+    return figures
+
+
+def _about(result: HandEyeResult, pivot: Array) -> Array:
+    """The reported covariance (6, 6) about another pivot."""
+    if result.covariance is None:
+        raise ValueError("the best method tells a covariance")
+    return at_origin(result.covariance, result.pivot - pivot)
+
+
+def speed_table(runs: int = 15) -> Table:
+    """From profiles to the result."""
+    table = Table(
+        "hand_eye_speed",
+        "Mount of a line laser: from profiles of 1280 points to the judged result, s, one thread",
+        ("what", "median", "longest", "processor's median", "goal", "published"),
+        f"{runs} runs; finding the features, all starts, outliers, noise, leaving out each pose. "
+        "Goal: of the processor's own time, which other work on the machine does not change.",
+    )
+    cell = HandEyeCell()
+    made = {
+        "sphere, 15 poses": (sphere_set, 0.3, "2.5 s"),
+        "stairs, 5 poses": (step_set, 0.1, "0.474 s"),
+        "known edge, 15 poses": (known_edge_set, 0.3, None),
+        "unknown edge, 15 poses": (edge_set, 0.5, None),
+    }
+    for name, (make, limit, published) in made.items():
+        took = []
+        for seed in range(runs + 1):
+            one = make(cell, np.random.default_rng([95, seed]))
+            start, used = time.perf_counter(), time.process_time()
+            one.solve()
+            took.append((time.perf_counter() - start, time.process_time() - used))
+        wall, own = np.array(took[1:]).T  # the first one loads what is imported late
+        busy = float(np.median(own))
+        table.add(
+            name, float(np.median(wall)), float(wall.max()), busy, Goal(busy, limit), published
+        )
+    return table
+
+
+def tables() -> Sequence[Table]:
+    """All of them."""
+    return [step_table(), effects_table(), joint_table(), speed_table()]

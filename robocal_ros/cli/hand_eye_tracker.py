@@ -1,0 +1,154 @@
+"""``robocal hand-eye tracker``: a profile sensor on a robot, placed by a laser tracker."""
+
+import argparse
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
+from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.core.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from robocal_ros.core.hand_eye.tracker_data import TrackerData
+    from robocal_ros.core.kinematics import SerialArm
+
+NAME = "tracker"
+HELP = "place a profile sensor by a laser tracker that sees the flange, and a cube with a sphere"
+
+METHODS = ("best", "classic")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--robot", required=True, metavar="NAME", help=ROBOT_HELP)
+    parser.add_argument(
+        "--poses",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="the scan: joints q1_deg …, and profile, the file of each",
+    )
+    parser.add_argument(
+        "--profiles", required=True, type=Path, metavar="DIR", help="folder of the profiles"
+    )
+    parser.add_argument(
+        "--points",
+        required=True,
+        type=Path,
+        metavar="CSV",
+        help="of the tracker: role (arc_a, arc_b, sphere, face_1, face_2), x_mm, y_mm, z_mm, and "
+        "on the arcs the joints",
+    )
+    target = parser.add_mutually_exclusive_group(required=True)
+    target.add_argument("--target", type=Path, metavar="YAML", help="radii and reflector's height")
+    target.add_argument(
+        "--radius-mm",
+        type=positive,
+        metavar="R",
+        help="instead of a target file: of the sphere and of the reflector alike",
+    )
+    parser.add_argument("--method", choices=METHODS, default=METHODS[0])
+    _add_limits(parser)
+
+
+def _add_limits(parser: argparse.ArgumentParser) -> None:
+    noise = parser.add_argument_group("noise, one sigma")
+    noise.add_argument(
+        "--tracker-sigma-mm", type=positive, default=0.015, metavar="S", help="default 0.015"
+    )
+    noise.add_argument(
+        "--joint-sigma-deg", type=positive, default=0.003, metavar="S", help="default 0.003"
+    )
+    noise.add_argument(
+        "--joint-sigma-mm", type=positive, default=0.02, metavar="S", help="default 0.02"
+    )
+    parser.add_argument(
+        "--limit-mm",
+        type=positive,
+        default=0.5,
+        metavar="L",
+        help="largest error to expect at the working distance that is accepted; default 0.5",
+    )
+
+
+def run(args: argparse.Namespace) -> Outcome:
+    """Do it. Raises `RobocalError` for what a user can mend."""
+    from math import radians
+
+    from robocal_ros.core.hand_eye.result import hand_eye_document
+    from robocal_ros.core.hand_eye.tracker import solve_tracker
+    from robocal_ros.core.hand_eye.tracker_data import TrackerNoise, TrackerTarget
+    from robocal_ros.storage.tracker_tables import read_tracker_target
+
+    warnings: list[str] = []
+    arm = describe_robot(args.robot, warnings).arm
+    if args.target is None:
+        target = TrackerTarget(args.radius_mm * 1e-3, args.radius_mm * 1e-3)
+    else:
+        target = read_tracker_target(args.target)
+    data, rejected = _read(args, arm)
+    noise = TrackerNoise(
+        args.tracker_sigma_mm * 1e-3, radians(args.joint_sigma_deg), args.joint_sigma_mm * 1e-3
+    )
+    result = solve_tracker(data, target, noise, args.method, args.limit_mm * 1e-3)
+    warn(warnings)
+    result = replace(result, rejected={**rejected, **result.rejected})
+    document = hand_eye_document(result)
+    return Outcome(document, partial(_show, document=document))
+
+
+def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", dict[str, str]]:
+    """All measurements, and the profiles that show next to nothing, with why."""
+    from robocal_ros.core.errors import TooFewSamplesError
+    from robocal_ros.core.hand_eye.profile import Profile
+    from robocal_ros.core.hand_eye.tracker_data import TrackerData
+    from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
+    from robocal_ros.storage.tracker_tables import read_tracker_points
+
+    points = read_tracker_points(args.points, arm)
+    table = read_pose_table(args.poses, arm)
+    if table.q is None:
+        raise InputError(
+            "the joints are missing: the arcs and the scan are tied by the robot's joints; add "
+            "q1_deg …",
+            file=str(args.poses),
+            row=1,
+        )
+    shots = read_profiles(args.profiles, table)
+    rejected = {
+        name: str(shot)
+        for name, shot in zip(table.names, shots, strict=True)
+        if isinstance(shot, TooFewSamplesError)
+    }
+    seen = [index for index, name in enumerate(table.names) if name not in rejected]
+    profiles = [shot for shot in shots if isinstance(shot, Profile)]
+    data = TrackerData(arm, points.arcs, points.sphere, points.faces, table.q[seen], profiles)
+    return data, rejected
+
+
+def _show(console: "Console", document: Document) -> None:
+    from rich.text import Text
+
+    verdict, pose = document["verdict"], document["T_flange_sensor"]
+    style = "bold green" if verdict["accept"] else "bold red"
+    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
+    xyz = ", ".join(f"{value:.3f}" for value in pose["xyz_mm"])
+    console.print(f"Sensor in the flange frame, mm: {xyz}")
+    console.print(
+        "Orientation, quaternion x y z w: " + " ".join(f"{v:.6f}" for v in pose["quat_xyzw"])
+    )
+    sigma = document["sigma"]
+    if sigma is not None:
+        xyz = ", ".join(f"{value:.3f}" for value in sigma["xyz_mm"])
+        turns = ", ".join(f"{value:.4f}" for value in sigma["rot_deg"])
+        console.print(f"Standard deviations: {xyz} mm; {turns} deg")
+    residual = document["residual_mm"]
+    console.print(
+        f"Profiles from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
+    )
+    for name, why in document["rejected_because"].items():
+        console.print(f"Not used: {name}: {why}", soft_wrap=True)

@@ -1,0 +1,27 @@
+"""Files of a simulated calibration by laser tracker, in the folder `SCAN` and beside it."""
+
+from pathlib import Path
+
+import numpy as np
+
+from robocal_ros.core.hand_eye.tracker_data import TrackerData
+from robocal_ros.sim.laser_tracker import TrackerCell
+from robocal_ros.storage.hand_eye_tables import write_pose_table, write_profile
+from robocal_ros.storage.tracker_tables import write_tracker_points, write_tracker_target
+
+SCAN = "scan"
+
+
+def tracker_files(folder: Path, cell: TrackerCell) -> TrackerData:
+    """Write poses.csv, tracker.csv, target.yaml and the profiles; what was measured."""
+    data = cell.measure(np.random.default_rng(4))
+    (folder / SCAN).mkdir()
+    files = [f"{profile.name}.csv" for profile in data.profiles]
+    for file, profile in zip(files, data.profiles, strict=True):
+        write_profile(folder / SCAN / file, profile.points)
+    write_pose_table(
+        folder / "scan_poses.csv", data.arm.fk(data.q), files, joints=(data.arm, data.q)
+    )
+    write_tracker_points(folder / "tracker.csv", data)
+    write_tracker_target(folder / "tracker_target.yaml", cell.sizes.target)
+    return data

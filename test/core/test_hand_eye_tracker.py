@@ -1,0 +1,377 @@
+"""A profile sensor placed by a laser tracker: exact, as good as the bound, refusals in words."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import (
+    InputError,
+    RankDeficientError,
+    ResidualError,
+    TooFewSamplesError,
+)
+from robocal_ros.core.hand_eye.profile import Profile
+from robocal_ros.core.hand_eye.tracker import solve_best, solve_tracker, spread
+from robocal_ros.core.hand_eye.tracker_classic import solve_classic
+from robocal_ros.core.hand_eye.tracker_data import Arc, TrackerData
+from robocal_ros.core.hand_eye.tracker_features import fit_caps
+from robocal_ros.core.hand_eye.tracker_scan import Scan
+from robocal_ros.core.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
+from robocal_ros.sim.laser_tracker import TrackerCell
+from robocal_ros.sim.profile_targets import Prism, Stem
+from robocal_ros.sim.tracker_cells import prp_cell, six_axis_cell
+from robocal_ros.sim.ur10_station import Q_NEAR
+from robocal_ros.storage.robots import load_robot
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
+RUNS = 40
+
+
+@cache
+def cell(kind: str) -> TrackerCell:
+    if kind == "prp":
+        return prp_cell(load_robot("p1r2p3"))
+    return six_axis_cell(load_robot("ur10"), Q_NEAR)
+
+
+def error(made: TrackerCell, T: np.ndarray) -> np.ndarray:
+    """Of T_flange_sensor, (6,) in the sensor frame."""
+    D = frames.invert(made.T_flange_sensor) @ T
+    return np.concatenate([D[:3, 3], frames.log_rotation(D[:3, :3])])
+
+
+def solve(data: TrackerData, method="best", made: TrackerCell | None = None, **target):
+    made = made or cell("prp")
+    told = replace(made.sizes.target, **target)
+    return solve_tracker(data, told, made.sizes.noise, method)
+
+
+@cache
+def noisy() -> TrackerData:
+    return cell("prp").measure(np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("kind", ["prp", "ur10"])
+def test_measurements_without_noise_give_the_truth(kind):
+    """To rounding; the closed form to where its iteration stops."""
+    made = cell(kind)
+    best = solve(made.exact, "best", made)
+    assert np.abs(error(made, best.T_flange_sensor)).max() < 1e-9
+    assert best.verdict.accept
+    assert best.residual_m.max() < 1e-9
+    classic = solve(made.exact, "classic", made)
+    away = error(made, classic.T_flange_sensor)
+    assert np.abs(away).max() < 1e-6  # the iteration stops at 1e-6
+    assert classic.covariance is None
+
+
+@cache
+def repeated(kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Errors (n, 6) of best and classic, covariances (n, 6, 6)."""
+    made = cell(kind)
+    best, classic, covariance = [], [], []
+    for seed in range(RUNS):
+        rng = np.random.default_rng([5, seed])
+        data, target = made.measure(rng), made.told(rng)
+        first = solve_classic(data, target, made.sizes.noise)
+        _, estimate = solve_best(data, target, made.sizes.noise, first)
+        best.append(error(made, estimate.state.T_flange_sensor))
+        classic.append(error(made, first.T_flange_sensor))
+        covariance.append(estimate.covariance[SENSOR, SENSOR])
+    return np.array(best), np.array(classic), np.array(covariance)
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    """Chi-square of 6 n degrees of freedom, within 4 sigma either way."""
+    best, _, covariance = repeated("prp")
+    chi2 = np.einsum("ni,nij,nj->", best, np.linalg.inv(covariance), best)
+    assert abs(chi2 / best.size - 1.0) < 4.0 * np.sqrt(2.0 / best.size)
+
+
+def test_no_component_is_biased():
+    best, _, covariance = repeated("prp")
+    bound = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0))
+    assert np.all(np.abs(best.mean(axis=0)) < 4.0 * bound / np.sqrt(RUNS))
+
+
+def test_the_best_method_beats_the_sources():
+    best, classic, _ = repeated("prp")
+    square = [np.mean(rows**2, axis=0) for rows in (best, classic)]
+    assert square[0][:3].sum() < 0.5 * square[1][:3].sum()
+    assert square[0][3:].sum() < 0.5 * square[1][3:].sum()
+
+
+def test_the_jacobian_is_the_derivative():
+    made = cell("ur10")
+    rng = np.random.default_rng(1)
+    data = made.measure(rng)
+    told = replace(made.sizes.target, height_m=0.04)
+    first = solve_classic(data, told, made.sizes.noise)
+    problem, estimate = solve_best(data, told, made.sizes.noise, first)
+    state = estimate.state.moved(1e-4 * rng.standard_normal(UNKNOWNS))
+    residual, jacobian = problem.linearise(state)
+    assert len(problem.rows) == len(residual)
+    step = 1e-6
+    for k in range(UNKNOWNS):
+        move = step * np.eye(UNKNOWNS)[k]
+        ahead, back = (problem.linearise(state.moved(sign * move))[0] for sign in (1.0, -1.0))
+        slope = (ahead - back) / (2.0 * step)
+        scale = np.abs(jacobian[..., k]).max()
+        assert np.abs(slope - jacobian[..., k]).max() < 1e-5 * scale
+
+
+def test_noise_of_the_points_leaves_a_balls_place_unbiased():
+    """The same profile of a ball 2000 times: the mean pull on its centre, chi-square."""
+    m, radius, noise = 2000, 0.01905, 3.7e-5
+    centre = np.array([0.0, 0.008, 0.21])
+    x = np.linspace(-0.015, 0.011, 260)
+    z = centre[2] - np.sqrt(radius**2 - centre[1] ** 2 - (x - centre[0]) ** 2)
+    rng = np.random.default_rng(8)
+    points = np.column_stack([np.tile(x, m), np.tile(z, m) + noise * rng.standard_normal(260 * m)])
+    scan = Scan(points, np.repeat(np.arange(m), 260), np.broadcast_to(np.eye(4), (m, 4, 4)))
+    caps = fit_caps(scan, np.tile(centre, (m, 1)), radius, noise)
+    pull = np.einsum("mij,mi->mj", caps.root, caps.offset).mean(axis=0)
+    information = np.einsum("mij,mik->jk", caps.root, caps.root) / m
+    chi2 = m * pull @ np.linalg.solve(information, pull)
+    assert chi2 < 25.0  # of 3 degrees of freedom: chance 2e-5
+
+
+def test_the_adjoint_carries_twists_across_a_transform():
+    rng = np.random.default_rng(2)
+    T = frames.transform(frames.exp_rotation(rng.standard_normal(3)), rng.standard_normal(3))
+    x = 1e-7 * rng.standard_normal(6)
+    y = adjoint(T) @ x
+    right = T @ frames.transform(frames.exp_rotation(x[3:]), x[:3])
+    left = frames.transform(frames.exp_rotation(y[3:]), y[:3]) @ T
+    assert np.allclose(left, right, atol=1e-13)
+
+
+@pytest.mark.parametrize("method", ["best", "classic"])
+def test_where_the_tracker_stands_does_not_matter(method):
+    data = noisy()
+    T = frames.transform(frames.exp_rotation([0.4, -1.1, 0.7]), [-2.0, 1.0, 0.5])
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return points @ T[:3, :3].T + T[:3, 3]
+
+    first, second = (replace(arc, points=seen(arc.points)) for arc in data.arcs)
+    faces = (seen(data.faces[0]), seen(data.faces[1]))
+    moved = replace(data, arcs=(first, second), sphere=seen(data.sphere), faces=faces)
+    away = frames.invert(solve(data, method).T_flange_sensor) @ solve(moved, method).T_flange_sensor
+    assert np.abs(away - np.eye(4)).max() < 2e-6  # closed form and descent stop at 1e-6
+
+
+def test_names_of_faces_and_arcs_do_not_matter():
+    data = noisy()
+    swapped = replace(data, faces=(data.faces[1], data.faces[0]), arcs=(data.arcs[1], data.arcs[0]))
+    away = frames.invert(solve(data).T_flange_sensor) @ solve(swapped).T_flange_sensor
+    assert np.abs(away - np.eye(4)).max() < 2e-6
+
+
+def test_a_sensor_that_looks_the_other_way_along_the_slide():
+    """The scan then runs along its -y."""
+    made = cell("prp")
+    turned = replace(
+        made,
+        T_flange_sensor=made.T_flange_sensor
+        @ frames.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)),
+    )
+    found = solve(turned.exact, "best", turned)
+    assert np.abs(error(turned, found.T_flange_sensor)).max() < 1e-9
+
+
+def test_a_sensor_tilted_against_the_slide():
+    made = cell("prp")
+    tilted = replace(
+        made,
+        T_flange_sensor=made.T_flange_sensor
+        @ frames.transform(frames.exp_rotation([0.12, 0.05, 0.1]), np.zeros(3)),
+    )
+    found = solve(tilted.exact, "best", tilted)
+    assert np.abs(error(tilted, found.T_flange_sensor)).max() < 1e-9
+
+
+def test_a_wild_tracker_point_is_named_and_left_out():
+    data = noisy()
+    arc = data.arcs[0]
+    points = arc.points.copy()
+    points[7] += [0.0, 2e-4, 1e-4]
+    found = solve(replace(data, arcs=(replace(arc, points=points), data.arcs[1])))
+    assert "arc_a 8" in found.rejected
+    clean = solve(data)
+    away = frames.invert(clean.T_flange_sensor) @ found.T_flange_sensor
+    sigma = np.sqrt(np.diag(clean.covariance))
+    assert np.all(np.abs(away[:3, 3]) < sigma[:3])
+
+
+@pytest.mark.parametrize("off_deg", [0.1, -0.05])
+def test_axes_that_are_not_quite_square(off_deg):
+    """Named, not rejected; the flange is midway between what either axis says."""
+    nominal = load_robot("p1r2p3")
+    mdh = np.array(nominal.mdh)
+    mdh[1, 3] += np.radians(off_deg)
+    made = prp_cell(nominal.with_mdh(mdh))
+    found = solve(replace(made.measure(np.random.default_rng(7)), arm=nominal), "best", made)
+    assert found.verdict.accept
+    assert not found.rejected
+    assert found.more["residual_over_noise"] < 1.2
+    # the line's direction is known to 0.015 mm / (75 mm sqrt(16)) = 0.003 deg
+    assert abs(found.more["axes_off_nominal"]["angle_deg"] - off_deg) < 4.0 * 0.003
+    half = frames.exp_rotation([-0.5 * np.radians(off_deg), 0.0, 0.0])
+    T = frames.transform(half, np.zeros(3)) @ found.T_flange_sensor
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(made, T)) < 4.0 * sigma)
+
+
+def test_spikes_in_the_profiles_do_no_harm():
+    made = cell("prp")
+    rng = np.random.default_rng(3)
+    profiles = []
+    for profile in noisy().profiles:
+        points = profile.points.copy()
+        wild = rng.random(len(points)) < 0.05
+        points[wild, 1] += rng.uniform(-2e-3, 2e-3, wild.sum())
+        profiles.append(Profile(points, profile.name))
+    found = solve(replace(noisy(), profiles=profiles))
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(made, found.T_flange_sensor)) < 4.0 * sigma)
+
+
+def with_arc(which: int, arc: Arc) -> TrackerData:
+    arcs = list(noisy().arcs)
+    arcs[which] = arc
+    return replace(noisy(), arcs=(arcs[0], arcs[1]))
+
+
+def test_a_table_and_a_stem_in_the_field_do_no_harm():
+    """With all the sensor's depth, dropouts, and light that is mirrored to another place."""
+    made = cell("prp")
+    view = made.T_base_view
+    top = view @ frames.transform(np.diag([1.0, -1.0, -1.0]), [-0.5, 0.0, 0.29])
+    square = np.array([[-0.5, -0.05], [0.5, -0.05], [0.5, 0.0], [-0.5, 0.0]])
+    stem = Stem(made.centre, view[:3, 2], 0.25 * made.sizes.target.sphere_radius_m, 0.08)
+    seen = replace(made.sensor, far_m=0.4, dropouts=0.02, ghosts=0.05)
+    busy = replace(made, around=(Prism(top, square, 1.0), stem), sensor=seen)
+    found = solve(busy.measure(np.random.default_rng(6)), "best", busy)
+    assert found.verdict.accept
+    sigma = np.sqrt(np.diag(found.covariance))
+    assert np.all(np.abs(error(busy, found.T_flange_sensor)) < 4.0 * sigma)
+    assert found.residual_m.max() < 3.0 * busy.sensor.noise_m
+
+
+def part(arc: Arc, rows: slice) -> Arc:
+    return Arc(arc.name, arc.q[rows], arc.points[rows])
+
+
+def test_a_slide_needs_the_reflectors_height():
+    with pytest.raises(RankDeficientError, match="height of the reflector") as caught:
+        solve(noisy(), height_m=None)
+    assert caught.value.directions == ("position along the axis of joint 2",)
+
+
+def test_arcs_that_are_too_few_too_short_or_of_several_joints():
+    arc = noisy().arcs[0]
+    with pytest.raises(TooFewSamplesError, match="arc_a has 4 points"):
+        solve(with_arc(0, part(arc, slice(4))))
+    dense = replace(arc, q=arc.q * [1.0, 0.1, 1.0])
+    with pytest.raises(TooFewSamplesError, match="turns over 12 deg"):
+        solve(with_arc(0, dense))
+    moved = replace(arc, q=arc.q + np.linspace(0.0, 0.1, len(arc.q))[:, None] * [0.0, 0.0, 1.0])
+    with pytest.raises(InputError, match="joint2, joint3 moved"):
+        solve(with_arc(0, moved))
+    with pytest.raises(RankDeficientError, match="both of joint 2"):
+        solve(with_arc(1, replace(arc, name="arc_b")))
+
+
+def test_axes_that_contradict_the_robot_file():
+    arm = noisy().arm
+    mdh = np.array(arm.mdh)
+    mdh[1, 3] = np.radians(80.0)
+    with pytest.raises(ResidualError, match=r"90\.0. deg in the tracker and at 80\.00 deg"):
+        solve(replace(noisy(), arm=arm.with_mdh(mdh)))
+
+
+def test_a_wrong_sphere_is_named():
+    with pytest.raises(ResidualError, match=r"radius of 19\.\d+ mm, the sphere's is 19\.550 mm"):
+        solve(noisy(), sphere_radius_m=0.01955)
+    with pytest.raises(ResidualError, match=r"the sphere's is 25\.000 mm"):
+        solve(noisy(), sphere_radius_m=0.025)
+
+
+def test_a_scan_built_backwards_is_named():
+    data = noisy()
+    with pytest.raises(ResidualError, match="left-handed"):
+        solve(replace(data, q=2.0 * data.q[0] - data.q))
+
+
+def test_profiles_with_x_reversed_are_of_a_sensor_that_is_turned_about_its_beam():
+    data = noisy()
+    profiles = [Profile(p.points * [-1.0, 1.0], p.name) for p in data.profiles]
+    found, other = solve(data), solve(replace(data, profiles=profiles))
+    turned = found.T_flange_sensor @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    away = frames.invert(turned) @ other.T_flange_sensor
+    assert np.all(np.abs(away[:3, 3]) < np.sqrt(np.diag(found.covariance))[:3])
+
+
+def test_another_face_of_the_cube_is_no_match():
+    """The tracker's face_2 is one that the scan does not show."""
+    made = cell("prp")
+    R, t = made.T_base_cube[:3, :3], made.T_base_cube[:3, 3]
+    grid = np.array([[a, b] for a in (0.02, 0.06) for b in (0.02, 0.06)])
+    end = np.column_stack(
+        [np.full(4, -made.sizes.target.reflector_radius_m), grid[:, 0], -grid[:, 1]]
+    )
+    T = made.T_tracker_base
+    points = (end @ R.T + t) @ T[:3, :3].T + T[:3, 3]
+    with pytest.raises(ResidualError, match="were other faces touched"):
+        solve(replace(noisy(), faces=(noisy().faces[0], points)))
+
+
+def test_an_edge_square_to_the_slide_leaves_two_answers():
+    made = replace(cell("prp"), edge_rad=np.radians(90.0), lean_rad=0.0)
+    with pytest.raises(RankDeficientError, match="two mountings") as caught:
+        solve(made.exact, "best", made)
+    assert caught.value.directions
+
+
+def test_faces_and_scans_that_tell_too_little():
+    data = noisy()
+    line = replace(data, faces=(data.faces[0][:3].repeat(2, axis=0), data.faces[1]))
+    with pytest.raises(RankDeficientError, match="face_1 lie nearly on a line"):
+        solve(line)
+    with pytest.raises(TooFewSamplesError, match="face_2 has 3 tracker points"):
+        solve(replace(data, faces=(data.faces[0], data.faces[1][:3])))
+    with pytest.raises(TooFewSamplesError, match="scan has 5 profiles"):
+        solve(replace(data, q=data.q[:5], profiles=data.profiles[:5]))
+    with pytest.raises(ResidualError, match="slide over at least 20 mm"):
+        solve(replace(data, q=np.tile(data.q[0], (len(data.q), 1))))
+    with pytest.raises(ResidualError, match=r"centres of the sphere differ by (0\.9|1\.0)"):
+        solve(replace(data, sphere=data.sphere + 1e-3 * np.eye(3)[0] * np.eye(3)[:, :1]))
+
+
+def test_noise_far_above_what_was_told_is_refused():
+    made = cell("prp")
+    told = replace(made.sizes.noise, joint_m=2e-7, joint_rad=5e-7, tracker_m=5e-6)
+    found = solve_tracker(noisy(), made.sizes.target, told)
+    assert found.verdict.code.name == "RESIDUAL_TOO_LARGE"
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1.5, np.pi - 1e-4, np.pi])
+def test_the_spread_of_runs_at_any_angle(angle):
+    """Turns of +-1e-5 rad about the axis itself, and 0.1 mm along it."""
+    axis = np.array([0.6, 0.0, 0.8])
+    poses = np.array(
+        [
+            frames.transform(frames.exp_rotation((angle + s * 1e-5) * axis), [s * 1e-4, 0.0, 0.0])
+            for s in (-1.0, 0.0, 1.0)
+        ]
+    )
+    found = spread(poses)
+    assert np.allclose(found.turn_rad, [1e-5, 0.0, 1e-5], atol=1e-12)
+    assert np.allclose(found.translation_m, [1e-4, 0.0, 1e-4], atol=1e-12)
+    if angle > 1.0:
+        assert np.allclose(found.angle_rad, [1e-5, 0.0, 1e-5], atol=1e-8)
+        assert np.allclose(found.axis, 0.0, atol=1e-7)
