@@ -48,7 +48,7 @@ class Standstills:
     def __init__(self, joint_names: tuple[str, ...], rule: StandstillRule) -> None:
         self._stream, self._rule = JointStream(joint_names), rule
         self._waiting: deque[tuple[str, Shot]] = deque()
-        self._count = 0
+        self._count, self._frame = 0, ""
         self.found: list[StandingShot] = []
         self.rejected: dict[str, str] = {}
         self.ignored = Ignored()
@@ -76,9 +76,16 @@ class Standstills:
         self._count += 1
         name = f"shot_{self._count:02d}"
         try:
-            self._waiting.append((name, profile_shot(message)))
+            shot = profile_shot(message)
         except RobocalError as error:
             self.rejected[name] = str(error)
+            return
+        self._frame = self._frame or shot.frame
+        if shot.frame == self._frame:
+            self._waiting.append((name, shot))
+        else:
+            told = f"in frame '{shot.frame}', those before it in '{self._frame}'"
+            self.rejected[name] = f"of another sensor: {told}"
 
     def _settled(self, name: str, shot: Shot) -> bool:
         try:
