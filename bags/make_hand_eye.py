@@ -4,8 +4,11 @@ Simulated: a UR10 whose lengths err by 0.05 mm shows a line laser a sphere,
 stairs and the edge of a block, each in a bag of its own with a target file (``.yaml``) beside it:
 
 - ``joint_states``: before, during and after each standstill;
-- ``profile``: one shot at each, 1280 columns, not-a-number where nothing returned; the frame is
-  ``laser``, at the stairs ``laser/near`` or ``laser/far`` after the mark that the light lies on;
+- ``profile``: one shot at each, 1280 columns, not-a-number where nothing returned;
+- ``/hand_eye_node/session_events``: what a hand-eye session made of it, for ``robocal replay``. A
+  capture is asked for before the robot stands, another one meets a profile in which nothing
+  returned; both fail and are asked for again. One sample is removed. The rest is calibrated and
+  accepted;
 - ``/truth/hand_eye``: for judging only: where the sensor and the target truly are.
 
 ``--csv DIR`` writes the same shots as tables for ``robocal hand-eye``, into a folder for each
@@ -14,20 +17,39 @@ target: ``poses.csv``, ``profiles/``, ``target.yaml``; and ``check.csv`` with fu
 
 import argparse
 import json
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hand_eye_program import (
+    BLIND,
+    BLIND_S,
+    EARLY,
+    EARLY_S,
+    REST_S,
+    SHOTS,
+    TIMEOUT_S,
+    arrivals,
+    asked,
+    shot_times,
+    waits,
+    way,
+)
+from hand_eye_recorder import record_session
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sim.cell import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
 from robocal_ros.sim.hand_eye_sets import (
     TrueStairs,
+    edge_block,
     edge_shots,
     sphere_shots,
     step_shots,
@@ -36,12 +58,14 @@ from robocal_ros.sim.hand_eye_sets import (
 from robocal_ros.sim.motion import Path as JointPath
 from robocal_ros.sim.motion import readings
 from robocal_ros.sim.profile_sensor import ProfileSensor
+from robocal_ros.sim.profile_targets import Scene, ball_on_table
+from robocal_ros.sim.robot import TrueRobot
 from robocal_ros.sim.thermal import Warmth
 from robocal_ros.sim.ur10_station import Q_NEAR
 from robocal_ros.storage.bag_writer import ros_time
 from robocal_ros.storage.bags import BagWriter
 from robocal_ros.storage.hand_eye_tables import write_shots
-from robocal_ros.storage.hand_eye_targets import Target, write_target
+from robocal_ros.storage.hand_eye_targets import Target, read_target, write_target
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -51,7 +75,7 @@ FOLDER = Path(__file__).parent
 SEEDS = {"sphere": 21, "step": 22, "line": 23}
 JITTER_SEED = 31  # of the readings of resting joints
 START_NS = 1_790_000_000_000_000_000
-SHOTS, CHECKS = 15, 5
+CHECKS = 5
 SENSOR = ProfileSensor(spikes=0.003, dropouts=0.01, gaps=1)
 GEOMETRY_M, REPEATABILITY_RAD = 5e-5, 1e-5
 RADIUS_M = 0.02
@@ -59,10 +83,11 @@ CENTRE = np.array([0.837, -0.059, 0.045])
 T_BASE_USER = frames.transform(frames.exp_rotation([0.01, -0.02, -2.1]), [0.84, -0.02, 0.03])
 TAUGHT_M, TAUGHT_RAD = 5e-5, 5e-4  # one sigma, of a frame that is touched with the robot's tip
 RATE_HZ = 125.0
-MOVE_S, REST_S, SHOT_S = 1.5, 1.0, 0.6  # a shot is taken so long after the arrival
-SHOWN_S = 0.3  # of each motion is recorded, before the standstill and after it
+SHOWN_S = 0.5  # of each motion is recorded, before the standstill and after it
 DELAY_S = 0.04  # of a profile's message behind its stamp
 MICROMETRE = 1e-6
+TRUTH, FRAME = "/truth/hand_eye", "laser"
+CONFIG = HandEyeConfig(sensor_frame=FRAME, capture_timeout_s=TIMEOUT_S)
 CLOUD_FIELDS = [
     {"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate("xyz")
 ]
@@ -73,6 +98,8 @@ class Recording:
     """Shots of a target, what the operator knows of it, and what is true."""
 
     cell: HandEyeCell
+    scene: Scene
+    robot: TrueRobot
     shots: Shots
     target: Target
     truth: dict[str, Any]
@@ -92,7 +119,13 @@ def build(kind: str) -> Recording:
     T_known_true = arm.fk(Q_NEAR) @ frames.invert(there)
     shots, target, truth = _shown(kind, cell, T_known_true, rng)
     told = {"simulated": True, "T_flange_sensor": cell.T_flange_sensor.tolist(), **truth}
-    return Recording(cell, shots, target, told)
+    return Recording(cell, _scene(kind), true, shots, target, told)
+
+
+def _scene(kind: str) -> Scene:
+    if kind == "sphere":
+        return ball_on_table(CENTRE, RADIUS_M)
+    return Scene((TrueStairs(T_BASE_USER).body if kind == "step" else edge_block(T_BASE_USER),))
 
 
 def _shown(
@@ -120,64 +153,73 @@ def _shown(
     return shots, target, truth
 
 
-def arrivals() -> Array:
-    """When (m,) the robot arrives at each standstill, s."""
-    return np.asarray(MOVE_S + (MOVE_S + REST_S) * np.arange(SHOTS))
-
-
-def joints(recording: Recording) -> Array:
-    """Joint readings (SHOTS, n) at the standstills."""
+def _way(recording: Recording) -> JointPath:
     q = recording.shots.q
     if q is None:
         raise ValueError("a robot without joints")
-    return q[:SHOTS]
+    return way(Q_NEAR, q[:SHOTS])
 
 
 def joint_records(recording: Recording, rng: np.random.Generator) -> Iterator[Record]:
     """Readings around the standstills."""
-    q = joints(recording)
-    rests = np.concatenate([[0.0], arrivals()])
-    path = JointPath(rests, np.append(0.0, arrivals() + REST_S), np.vstack([Q_NEAR, q]))
-    steps = np.arange(round((REST_S + 2.0 * SHOWN_S) * RATE_HZ)) / RATE_HZ
-    times = (arrivals()[:, None] - SHOWN_S + steps).ravel()
+    spans = zip(arrivals() - SHOWN_S, REST_S + waits() + 2.0 * SHOWN_S, strict=True)
+    times = np.concatenate(
+        [start + np.arange(round(span * RATE_HZ)) / RATE_HZ for start, span in spans]
+    )
     names = list(load_robot("ur10").joint_names)
-    for time_s, row in zip(times.tolist(), readings(path, times, rng), strict=True):
+    q = readings(_way(recording), times, rng)
+    for time_s, row in zip(times.tolist(), q, strict=True):
         message = {"header": _header(time_s), "name": names, "position": row}
         yield time_s, "/joint_states", "sensor_msgs/msg/JointState", message
 
 
-def profile_records(recording: Recording) -> Iterator[Record]:
-    """One shot at each standstill, to a micrometre."""
-    shots = recording.shots
-    for arrival, points, mark in zip(
-        arrivals().tolist(), shots.profiles, shots.marks, strict=False
-    ):
-        xyz = np.insert(points, 1, 0.0, axis=1)
-        data = np.round(xyz / MICROMETRE) * MICROMETRE
-        message = {
-            "header": _header(arrival + SHOT_S, f"laser/{mark}" if mark else "laser"),
-            "height": 1,
-            "width": len(xyz),
-            "fields": CLOUD_FIELDS,
-            "is_bigendian": False,
-            "point_step": 12,
-            "row_step": 12 * len(xyz),
-            "data": np.frombuffer(data.astype("<f4").tobytes(), dtype=np.uint8),
-            "is_dense": False,
-        }
-        yield arrival + SHOT_S + DELAY_S, "/profile", "sensor_msgs/msg/PointCloud2", message
+def profile_records(recording: Recording, rng: np.random.Generator) -> Iterator[Record]:
+    """One shot at each standstill, and those in vain."""
+    profiles = recording.shots.profiles
+    for time_s, points in zip(shot_times().tolist(), profiles, strict=False):
+        yield _cloud(time_s, points)
+    early_s, blind_s = arrivals()[[EARLY, BLIND]] + [EARLY_S, BLIND_S]
+    q = _way(recording).at(np.array([early_s]))[0]
+    T_base_flange = recording.robot.flange(q, Warmth.cold(len(q)))[0]
+    T_base_sensor = T_base_flange @ recording.cell.T_flange_sensor
+    yield _cloud(early_s, SENSOR.shoot(T_base_sensor, recording.scene, rng))
+    yield _cloud(blind_s, np.full_like(profiles[0], np.nan))
 
 
-def write_bag(recording: Recording, path: Path) -> None:
-    """Write the bag in order of time, and the target file beside it."""
+def _cloud(time_s: float, points: Array) -> Record:
+    """A profile (n, 2), to a micrometre."""
+    xyz = np.insert(points, 1, 0.0, axis=1)
+    data = np.round(xyz / MICROMETRE) * MICROMETRE
+    message = {
+        "header": _header(time_s, FRAME),
+        "height": 1,
+        "width": len(xyz),
+        "fields": CLOUD_FIELDS,
+        "is_bigendian": False,
+        "point_step": 12,
+        "row_step": 12 * len(xyz),
+        "data": np.frombuffer(data.astype("<f4").tobytes(), dtype=np.uint8),
+        "is_dense": False,
+    }
+    return time_s + DELAY_S, "/profile", "sensor_msgs/msg/PointCloud2", message
+
+
+def write_bag(recording: Recording, path: Path) -> Outcome:
+    """Write the bag in order of time, and the target file beside it; what was calibrated."""
+    file = path.with_suffix(".yaml")
+    write_target(file, recording.target)
     rng = np.random.default_rng(JITTER_SEED)
     told = {"data": json.dumps(recording.truth)}
-    records = [(0.0, "/truth/hand_eye", "std_msgs/msg/String", told)]
-    records += [*joint_records(recording, rng), *profile_records(recording)]
-    with BagWriter(path, latched=["/truth/hand_eye"]) as bag:
-        for time_s, topic, kind, message in sorted(records, key=lambda record: record[0]):
-            bag.write(topic, kind, message, _stamp(time_s))
-    write_target(path.with_suffix(".yaml"), recording.target)
+    records = [(0.0, TRUTH, "std_msgs/msg/String", told)]
+    records += [*joint_records(recording, rng), *profile_records(recording, rng)]
+    with tempfile.TemporaryDirectory() as folder:
+        inputs = Path(folder) / "inputs.mcap"
+        with BagWriter(inputs) as bag:
+            for time_s, topic, kind, message in sorted(records, key=lambda record: record[0]):
+                bag.write(topic, kind, message, _stamp(time_s))
+        program = asked(recording.shots.marks, read_target(file))
+        commands = [(_stamp(time_s), command) for time_s, command in program]
+        return record_session(inputs, path, CONFIG, commands, TRUTH)
 
 
 def write_csv(recording: Recording, folder: Path) -> None:
@@ -219,8 +261,8 @@ def main() -> None:
             write_csv(recording, folder / kind)
             continue
         path = FOLDER / f"hand_eye_{kind}.mcap"
-        write_bag(recording, path)
-        print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB, simulated")
+        found = write_bag(recording, path)
+        print(f"{path.name}: {path.stat().st_size / 1e6:.2f} MB, simulated; {found.message}")
 
 
 if __name__ == "__main__":

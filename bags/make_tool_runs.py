@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from session_events import EventLog
 
 from robocal_ros import __version__
 from robocal_ros.core.samples import JointSample
@@ -27,7 +28,6 @@ from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.sessions import events
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.records import arguments_text, outcome_text
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sessions.tool_recorded import configuration
@@ -75,7 +75,8 @@ class Recorder:
         healthy = RoundTool.cylinder(TAUGHT, RADIUS_M)
         rng = np.random.default_rng(SEED)
         self.program = RobotProgram(cell, healthy, rng, START_NS, STATION)
-        self._bag, self._sequence, self._now_ns = bag, 0, START_NS
+        self._bag, self._now_ns = bag, START_NS
+        self._events = EventLog(bag, EVENTS)
         self._shown: tuple[int, int] | None = None
         self._show_in_force()
 
@@ -114,7 +115,7 @@ class Recorder:
     def _carry_out(self, command: Command) -> Outcome:
         self.session.submit(command)
         (outcome,) = self.session.step(wall_ns=self._now_ns)
-        self._event(outcome.command, outcome)
+        self._events.write(outcome.command, outcome, self._now_ns)
         self._show_in_force()
         return outcome
 
@@ -124,18 +125,7 @@ class Recorder:
         if shown != self._shown:
             self._shown = shown
             topics = {JOINTS: f"/{JOINTS}", EDGES: f"/{EDGES}"}
-            self._event(configuration(self.session, topics), None)
-
-    def _event(self, command: Command, outcome: Outcome | None) -> None:
-        self._sequence += 1
-        message = {
-            "stamp": _time(command.stamp_ns or 0),
-            "sequence": self._sequence,
-            "command": command.name,
-            "arguments": arguments_text(command),
-            "outcome": "{}" if outcome is None else outcome_text(outcome),
-        }
-        self._write(EVENTS, "robocal_msgs/msg/SessionEvent", message)
+            self._events.write(configuration(self.session, topics), None, self._now_ns)
 
     def _write_sample(self, sample: Sample) -> None:
         header = {"stamp": _time(sample.stamp_ns), "frame_id": ""}

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
 from robocal_ros.core.point_clouds import cloud_points
@@ -16,6 +17,7 @@ from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
 from robocal_ros.storage.hand_eye_targets import read_target
 from robocal_ros.storage.robots import load_robot
 
+EVENTS = "/hand_eye_node/session_events"
 BAGS = Path(__file__).parent.parent / "bags"
 KINDS = ("sphere", "step", "line")
 UR10 = load_robot("ur10")
@@ -30,7 +32,8 @@ def script():
         import make_hand_eye
 
         yield make_hand_eye
-        sys.modules.pop("make_hand_eye", None)
+        for name in ("make_hand_eye", "hand_eye_program", "hand_eye_recorder", "session_events"):
+            sys.modules.pop(name, None)
 
 
 @pytest.fixture(scope="module")
@@ -55,17 +58,62 @@ def bag(kind: str) -> Path:
     return BAGS / f"hand_eye_{kind}.mcap"
 
 
+def commands(path: Path) -> list[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Name, arguments and outcome of each event."""
+    found = [m.message for m in messages(path, EVENTS)]
+    return [(e.command, json.loads(e.arguments)["arguments"], json.loads(e.outcome)) for e in found]
+
+
+def sampled(kind: str) -> list[tuple[Any, str]]:
+    """The profiles that became samples, each with the mark that its capture names."""
+    marks = {a["handle"]: a["mark"] for name, a, _ in commands(bag(kind)) if name == "capture"}
+    taken = {
+        a["shot_ns"]: marks[a["handle"]] for name, a, _ in commands(bag(kind)) if name == "sample"
+    }
+    shots = [m.message for m in messages(bag(kind), "/profile")]
+    stamps = [s.header.stamp.sec * 10**9 + s.header.stamp.nanosec for s in shots]
+    return [(s, taken[at]) for s, at in zip(shots, stamps, strict=True) if at in taken]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_is_small_and_says_what_it_is(kind):
     info = bag_info(bag(kind))
     assert bag(kind).stat().st_size < 1_500_000
     assert not info.notes
-    assert set(info.topics) == {"/joint_states", "/profile", "/truth/hand_eye"}
-    assert info.topics["/profile"].messages == 15
+    assert set(info.topics) == {"/joint_states", "/profile", "/truth/hand_eye", EVENTS}
+    assert info.topics["/profile"].messages == 17
     assert truth_of(bag(kind))["simulated"] is True
     frames_seen = [m.message.header.frame_id for m in messages(bag(kind), "/profile")]
-    marked = {"laser/near", "laser/far"} if kind == "step" else {"laser"}
-    assert set(frames_seen) == marked
+    assert set(frames_seen) == {"laser"}
+    assert {mark for _, mark in sampled(kind)} == ({"near", "far"} if kind == "step" else {""})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_its_session_meets_what_a_cell_meets(kind):
+    """One capture fails in motion, one for a blind sensor, one sample is removed; the rest is
+    accepted, with the sensor in force beside what was there before."""
+    told = commands(bag(kind))
+    codes = [end["status"] for name, _, end in told if name == "break_off"]
+    assert codes == [Code.BAD_INPUT, Code.TOO_FEW_SAMPLES]
+    moved, empty = [end["message"] for name, _, end in told if name == "break_off"]
+    assert "moved by" in moved
+    assert "has 0 points" in empty
+    assert [name for name, *_ in told].count("sample") == 15
+    assert [name for name, *_ in told].count("remove") == 1
+    assert [name for name, *_ in told[-3:]] == ["calibrate", "accept", "configure"]
+    assert [end["status"] for *_, end in told[-3:-1]] == [Code.ACCEPT, Code.ACCEPT]
+    assert told[-3][2]["samples"] == 14
+    assert told[0][1]["sensor"] is None
+    assert told[-1][1]["sensor"]["child"] == "laser"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_session_finds_the_sensor(kind):
+    """As far as the robot knows where its flange is."""
+    model = commands(bag(kind))[-1][1]["sensor"]
+    found, true = np.array(model["T_parent_sensor"]), truth_of(bag(kind))["T_flange_sensor"]
+    there = np.array([0.0, 0.0, 0.2, 1.0])
+    assert np.linalg.norm((found - true) @ there) < FLANGE_M
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -78,8 +126,9 @@ def test_its_script_makes_it_again(script, recordings, tmp_path, kind):
     for one, two in zip(kept, made, strict=True):
         if one.topic == "/profile":
             apart = cloud_points(one.message) - cloud_points(two.message)
-            assert np.nanmax(np.abs(apart)) <= 1.1e-6
-            assert np.isnan(apart).mean() < 1.0
+            seen = np.abs(apart[np.isfinite(apart)])
+            assert np.max(seen, initial=0.0) <= 1.1e-6
+            assert np.isnan(apart).all() == np.isnan(cloud_points(one.message)).all()
         elif one.topic == "/joint_states":
             assert np.abs(one.message.position - two.message.position).max() <= 1.1e-6
 
@@ -89,14 +138,17 @@ def test_the_robot_stands_still_at_each_shot(kind):
     joints = messages(bag(kind), "/joint_states")
     at = np.array([stamp_s(m.message) for m in joints])
     q = np.array([m.message.position for m in joints])
-    shots = [stamp_s(m.message) for m in messages(bag(kind), "/profile")]
+    shots = [stamp_s(shot) for shot, _ in sampled(kind)]
+    assert len(shots) == 15
     assert joints[0].message.name == list(UR10.joint_names)
+    arrived = 0
     for shot in shots:
         rest = (at > shot - 0.5) & (at < shot + 0.3)
         assert rest.sum() == pytest.approx(0.8 * 125, abs=2)
         assert np.ptp(q[rest], axis=0).max() < 2e-5  # servo hum of 1e-6 rad
         before = (at > shot - 0.9) & (at < shot - 0.62)
-        assert np.ptp(q[before], axis=0).max() > 1e-4  # it has just arrived
+        arrived += np.ptp(q[before], axis=0).max() > 1e-4
+    assert arrived == 13  # all but those that a failed capture went before
 
 
 def base_points(kind: str) -> list[np.ndarray]:
@@ -105,9 +157,9 @@ def base_points(kind: str) -> list[np.ndarray]:
     at = np.array([stamp_s(m.message) for m in joints])
     X = np.array(truth_of(bag(kind))["T_flange_sensor"])
     found = []
-    for shot in messages(bag(kind), "/profile"):
-        q = joints[int(np.argmin(np.abs(at - stamp_s(shot.message))))].message.position
-        p = cloud_points(shot.message)
+    for shot, _ in sampled(kind):
+        q = joints[int(np.argmin(np.abs(at - stamp_s(shot))))].message.position
+        p = cloud_points(shot)
         assert np.all(p[:, 1] == 0.0)
         p = p[np.isfinite(p).all(axis=1)]
         found.append((UR10.fk(q) @ X @ np.insert(p, 3, 1.0, axis=1).T)[:3].T)
@@ -128,10 +180,9 @@ def in_user(kind: str, points: np.ndarray) -> np.ndarray:
 
 def test_the_profiles_show_the_stairs():
     """Near a tread or a riser, near the mark."""
-    frame_ids = [m.message.header.frame_id for m in messages(bag("step"), "/profile")]
-    for points, frame_id in zip(base_points("step"), frame_ids, strict=True):
+    for points, (_, mark) in zip(base_points("step"), sampled("step"), strict=True):
         x, y, z = in_user("step", points).T
-        assert np.median(x) == pytest.approx(0.03 if frame_id == "laser/near" else 0.06, abs=5e-3)
+        assert np.median(x) == pytest.approx(0.03 if mark == "near" else 0.06, abs=5e-3)
         step = np.clip(np.floor(y / 0.01), 0, 4)
         to_tread = np.abs(z - 0.01 * (step + 1))
         to_riser = np.abs(y - 0.01 * np.round(y / 0.01))
@@ -152,15 +203,14 @@ def test_the_tables_hold_the_same_shots(script, recordings, tmp_path, kind):
     table = read_pose_table(tmp_path / "poses.csv", UR10)
     # joints are written to 12 digits, 5e-10 degrees at most; six of them turn the flange
     assert table.T_base_flange == pytest.approx(UR10.fk(table.q), abs=1e-10)
-    marks = [m.message.header.frame_id for m in messages(bag(kind), "/profile")]
     if kind == "step":
-        assert [f"laser/{mark}" for mark in table.mark] == marks
+        assert list(table.mark) == [mark for _, mark in sampled(kind)]
     else:
         assert table.mark is None
     profiles = read_profiles(tmp_path / "profiles", table)
-    for profile, shot in zip(profiles, messages(bag(kind), "/profile"), strict=True):
+    for profile, (shot, _) in zip(profiles, sampled(kind), strict=True):
         assert isinstance(profile, Profile)
-        seen = cloud_points(shot.message)
+        seen = cloud_points(shot)
         seen = seen[np.isfinite(seen).all(axis=1)][:, ::2]
         assert profile.points == pytest.approx(seen, abs=1e-6)
     check = read_pose_table(tmp_path / "check.csv")

@@ -110,6 +110,14 @@ def text(value: str) -> str:
     return value
 
 
+def input_topic(value: str) -> tuple[str, str]:
+    """Read an input and its topic, INPUT:=TOPIC."""
+    name, sign, topic = value.partition(":=")
+    if not (name and sign and topic):
+        raise argparse.ArgumentTypeError(f"'{value}' is not of the form INPUT:=TOPIC")
+    return name, topic
+
+
 def add_sigma(parser: "argparse._ActionsContainer", more: str = "") -> None:
     """Offer ``--sigma-mm``, the noise of a visit; ``more`` says what else about it."""
     parser.add_argument(

@@ -1,11 +1,12 @@
 """Options and files of a line laser that the actions of ``robocal hand-eye`` share."""
 
 import argparse
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.arguments import ROBOT_HELP, positive
+from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, positive
 from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,27 +22,41 @@ LIMIT_MM = 1.0
 
 
 def add_shots(parser: argparse.ArgumentParser) -> None:
-    """Offer the tables of a calibration."""
+    """Offer the tables of a calibration, or a bag."""
     parser.add_argument(
         "--poses",
-        required=True,
         type=Path,
         metavar="CSV",
         help="flange poses in base, or joints with --robot; column profile names each shot's file",
     )
     parser.add_argument(
         "--profiles",
-        required=True,
         type=Path,
         metavar="DIR",
         help="folder of the profiles, tables of x_mm and z_mm",
+    )
+    parser.add_argument(
+        "--bag",
+        type=Path,
+        help="instead of the tables: a recording of joint_states and profile, or a data file of "
+        "hand_eye_node; with --robot",
+    )
+    parser.add_argument(
+        "--topic",
+        type=input_topic,
+        action="append",
+        default=[],
+        metavar="INPUT:=TOPIC",
+        help="topic of an input in the bag: joint_states, profile, session_events",
     )
     add_robot(parser)
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
     """Offer the robot."""
-    parser.add_argument("--robot", metavar="NAME", help=f"{ROBOT_HELP}; for tables of joints")
+    parser.add_argument(
+        "--robot", metavar="NAME", help=f"{ROBOT_HELP}; for bags and tables of joints"
+    )
 
 
 def add_target(parser: argparse.ArgumentParser) -> None:
@@ -121,10 +136,35 @@ def arm_of(args: argparse.Namespace) -> "SerialArm | None":
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """A table of shots and what they show."""
+    """Shots, the table that holds them (None: a bag), and its profiles that are none, with why."""
 
-    table: "PoseTable"
     data: "HandEyeData"
+    table: "PoseTable | None" = None
+    rejected: Mapping[str, str] = field(default_factory=dict)
+
+
+def given_shots(
+    args: argparse.Namespace, arm: "SerialArm | None", judges: Path | None = None
+) -> Shots:
+    """Read the shots that are given, or those like them in the file of ``judges``.
+
+    Raises
+    ------
+    RobocalError
+        When too little or too much is given; further as `read_shots` and `read_bag_shots`.
+    """
+    if args.bag is None:
+        if args.poses is None or args.profiles is None:
+            raise InputError("give the shots: --poses with --profiles, or --bag")
+        return read_shots(judges or args.poses, args.profiles, arm)
+    from robocal_ros.cli.hand_eye_bag import read_bag_shots
+
+    if args.poses is not None or args.profiles is not None:
+        raise InputError("the shots are given twice: --bag, and --poses or --profiles; keep one")
+    if arm is None:
+        raise InputError("a bag holds joints, not poses: name its robot with --robot")
+    data, rejected = read_bag_shots(judges or args.bag, arm, dict(args.topic))
+    return Shots(data, None, rejected)
 
 
 def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
@@ -134,7 +174,7 @@ def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
 
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table)
-    return Shots(table, HandEyeData(table.names, table.T_base_flange, seen, table.mark))
+    return Shots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
 
 
 def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Target | None":

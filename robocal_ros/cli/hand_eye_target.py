@@ -7,23 +7,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.hand_eye_shots import (
+    Shots,
     add_limits,
     add_shots,
     arm_of,
+    given_shots,
     given_target,
-    read_shots,
     settings_of,
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_mount
 from robocal_ros.cli.output import Document, Outcome
+from robocal_ros.core.errors import InputError
 from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from robocal_ros.core.hand_eye.quality import HandEyeSettings
     from robocal_ros.core.hand_eye.result import HandEyeResult
-    from robocal_ros.core.hand_eye.tasks import HandEyeData, Task
-    from robocal_ros.storage.hand_eye_tables import PoseTable
+    from robocal_ros.core.hand_eye.tasks import Task
 
 METHODS = ("best", "classic")
 
@@ -36,9 +37,9 @@ def add_target_action(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--check",
         type=Path,
-        metavar="CSV",
-        help="shots of the same target, as --poses, that judge the result and are not used to find "
-        "it",
+        metavar="FILE",
+        help="shots of the same target, as --poses or --bag, that judge the result and are not "
+        "used to find it",
     )
 
 
@@ -50,26 +51,31 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
     arm, settings = arm_of(args), settings_of(args)
     target = given_target(kind, args.target, radius_mm)
     task = task_of(target, getattr(args, "feature", None), args.method == "classic")
-    shots = read_shots(args.poses, args.profiles, arm)
-    judges = None if args.check is None else read_shots(args.check, args.profiles, arm)
+    shots = given_shots(args, arm)
+    judges = None if args.check is None else given_shots(args, arm, args.check)
     if judges is not None:
-        _require_unused(judges.table, shots.table)
+        _require_unused(args, judges, shots)
     result = solve_task(task, shots.data, args.method, settings)
+    result = replace(result, rejected={**shots.rejected, **result.rejected})
     held_out: Document | None = None
     if judges is not None:
-        result, held_out = _judged(result, task, judges.data, settings)
+        result, held_out = _judged(result, task, judges, settings)
     document = hand_eye_document(result) | {"held_out": held_out}
     return Outcome(document, partial(show_mount, document=document))
 
 
-def _require_unused(judges: "PoseTable", used: "PoseTable") -> None:
-    for index, file in enumerate(judges.files):
-        if file in used.files:
-            judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
+def _require_unused(args: argparse.Namespace, judges: Shots, used: Shots) -> None:
+    if judges.table is None or used.table is None:
+        if args.check.resolve() == args.bag.resolve():
+            raise InputError("--check is --bag: other shots must judge", file=str(args.check))
+        return
+    for index, file in enumerate(judges.table.files):
+        if file in used.table.files:
+            judges.table.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
 
 
 def _judged(
-    result: "HandEyeResult", task: "Task", judges: "HandEyeData", settings: "HandEyeSettings"
+    result: "HandEyeResult", task: "Task", judges: Shots, settings: "HandEyeSettings"
 ) -> "tuple[HandEyeResult, Document]":
     """Distances of other shots from the target that was found; they may refuse the result."""
     from robocal_ros.core.assessment import Verdict, summarise
@@ -79,10 +85,12 @@ def _judged(
 
     if result.place is None:
         raise ValueError("a result of one target has its place")
-    seen = held_out(task, judges, result.T_flange_sensor, result.place)
+    seen = held_out(task, judges.data, result.T_flange_sensor, result.place)
     document: Document = errors_document(summarise(seen.distance_m))
-    document |= {"rejected": list(seen.rejected), "rejected_because": dict(seen.rejected)}
-    refused = judge_residuals(seen.distance_m, len(judges.names), len(seen.rejected), settings)
+    rejected = {**judges.rejected, **seen.rejected}
+    document |= {"rejected": list(rejected), "rejected_because": rejected}
+    count = len(judges.data.names)
+    refused = judge_residuals(seen.distance_m, count, len(seen.rejected), settings)
     if refused is not None and result.verdict.accept:
         words = f"shots that were not used to solve: {refused.reason}"
         result = replace(result, verdict=Verdict(refused.code, words))

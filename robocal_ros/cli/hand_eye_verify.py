@@ -12,8 +12,8 @@ from robocal_ros.cli.hand_eye_shots import (
     add_shots,
     add_target,
     arm_of,
+    given_shots,
     given_target,
-    read_shots,
     settings_of,
     task_of,
 )
@@ -57,15 +57,15 @@ def run(args: argparse.Namespace) -> Outcome:
     settings = settings_of(args)
     T_flange_sensor = read_flange_mount(args.result)
     task = task_of(given_target(args.kind, args.target, args.radius_mm), args.feature)
-    shots = read_shots(args.poses, args.profiles, arm_of(args))
+    shots = given_shots(args, arm_of(args))
     found = verify(task, shots.data, T_flange_sensor, settings)
     errors = errors_document(summarise(found.distance_m))
+    rejected = {**shots.rejected, **found.rejected}
     document: Document = {
         "kind": args.kind,
         "T_flange_sensor": transform_document(T_flange_sensor),
         "target": found.target,
-        "held_out": errors
-        | {"rejected": list(found.rejected), "rejected_because": dict(found.rejected)},
+        "held_out": errors | {"rejected": list(rejected), "rejected_because": rejected},
         "per_sample_mm": dict(zip(found.samples, (found.distance_m * 1e3).tolist(), strict=True)),
         "verdict": verdict_document(found.verdict),
     }

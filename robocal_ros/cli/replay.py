@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
+from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, input_topic, warn
 from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, Outcome, progress_console, tell
 from robocal_ros.cli.replay_view import show_replay
 from robocal_ros.core.codes import Code
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--topic",
-        type=_topic,
+        type=input_topic,
         action="append",
         default=[],
         metavar="INPUT:=TOPIC",
@@ -150,10 +150,3 @@ def _window(value: str) -> tuple[float, float]:
             f"'{value}' is no window T0:T1 in seconds, with 0 <= T0 < T1"
         )
     return start, end
-
-
-def _topic(value: str) -> tuple[str, str]:
-    name, sign, topic = value.partition(":=")
-    if not (name and sign and topic):
-        raise argparse.ArgumentTypeError(f"'{value}' is not of the form INPUT:=TOPIC")
-    return name, topic

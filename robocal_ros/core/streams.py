@@ -177,3 +177,11 @@ class JointStream:
         share = 0.0 if after == before else (stamp_ns - before) / (after - before)
         q = (1.0 - share) * self._q[at - 1] + share * self._q[min(at, high)]
         return Reading(q, int(stamps[high]))
+
+    def resting(self, stamp_ns: int, rule: StandstillRule) -> Array | None:
+        """Mean joints (n,) of the standstill about an instant. Else as `standstill`."""
+        reading = self.standstill(stamp_ns, rule)
+        if reading is None:
+            return None
+        _, q = self.window(stamp_ns - int(rule.before_s * 1e9), reading.ready_ns)
+        return np.asarray(q.mean(axis=0))

@@ -180,12 +180,10 @@ class HandEyeSession(Commanded):
     def _sample(self, command: Command, wall_ns: int) -> Outcome:
         data, at_ns = self._require_set(), int(command.arguments["shot_ns"])
         capture = self._require_waiting(data, command)
-        shot, rule = self._shots.at(data.topic, at_ns), self.config.standstill
-        reading = self.stream.standstill(at_ns, rule)
-        if reading is None:
+        shot = self._shots.at(data.topic, at_ns)
+        mean = self.stream.resting(at_ns, self.config.standstill)
+        if mean is None:
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
-        _, q = self.stream.window(at_ns - int(rule.before_s * 1e9), reading.ready_ns)
-        mean = q.mean(axis=0)
         T_base_flange = self.current.arm.fk(mean)
         handle, mark = capture.handle, capture.mark
         words = data.put(HandEyeSample(handle, mark, at_ns, mean, T_base_flange, shot.values))

@@ -119,11 +119,16 @@ def step_shots(
     return cell.shoot(Scene((target.body,)), wanted(), count, rng)
 
 
+def edge_block(T_base_user: Array) -> Prism:
+    """A block whose upper edge is x of the frame."""
+    return block(T_base_user, BLOCK_M, 0.1, 0.1)
+
+
 def edge_shots(
     cell: HandEyeCell, T_base_user: Array, count: int, rng: np.random.Generator
 ) -> Shots:
     """Shots across the upper edge of a block; the edge is x of the frame."""
-    body = block(T_base_user, BLOCK_M, 0.1, 0.1)
+    body = edge_block(T_base_user)
     return _line_shots(cell, body, _look(T_base_user, 1.0, 1.0), 0.5, count, rng)
 
 

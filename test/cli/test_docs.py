@@ -38,11 +38,12 @@ def test_the_thermal_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_the_hand_eye_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("bags").symlink_to(ROOT / "bags")
     make = [sys.executable, ROOT / "bags/make_hand_eye.py", "--csv", "out/hand_eye"]
     subprocess.run(make, check=True, env=environment())
     page = (ROOT / "docs/hand_eye.md").read_text()
     typed = re.findall(rf"^{re.escape(PREFIX)}(.*)$", page, re.MULTILINE)
-    assert len(typed) == 8
+    assert len(typed) == 9
     printed = []
     for line in typed:
         words, _, file = line.partition(" > ")

@@ -2,15 +2,13 @@
 
 import json
 import shutil
-from contextlib import redirect_stdout
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command import conforms
+from hand_eye_command import chi_square, pose_of, robocal, shots, target
 from hand_eye_tables import (
     CELL,
     CENTRE,
@@ -52,45 +50,14 @@ def made(tmp_path_factory) -> Path:
     return root
 
 
-def robocal(action: str, *words: object, status: int = 0) -> Any:
-    """Run a command in this process: its document follows the schema."""
-    with redirect_stdout(StringIO()) as printed:
-        found = main(["hand-eye", action, *map(str, words), "--json"])
-    document = json.loads(printed.getvalue())
-    assert found == status, document
-    conforms(document, f"hand-eye.{action}.json")
-    return document
-
-
 @pytest.fixture(scope="module")
 def sphere(made) -> Any:
     """The document of the sphere."""
     return robocal("sphere", *shots(made / "sphere"), "--radius-mm", 20)
 
 
-def shots(folder: Path, table: str = "poses") -> list[object]:
-    return ["--poses", folder / f"{table}.csv", "--profiles", folder / "profiles"]
-
-
-def target(folder: Path) -> list[object]:
-    return ["--target", folder / "target.yaml"]
-
-
 def line_of(kind: str) -> tuple[str, list[str]]:
     return ("line", ["--kind", "groove"]) if kind == "groove" else (kind, [])
-
-
-def pose_of(document: Any, key: str = "T_flange_sensor") -> np.ndarray:
-    pose = document[key]
-    return frames.transform_from_quat(1e-3 * np.array(pose["xyz_mm"]), np.array(pose["quat_xyzw"]))
-
-
-def chi_square(document: Any) -> float:
-    """Distance from the truth in units of the covariance that the document tells."""
-    T = pose_of(document)
-    turn = frames.log_rotation(TRUE[:3, :3] @ T[:3, :3].T)
-    error = np.concatenate([TRUE[:3, 3] - T[:3, 3], turn])
-    return float(error @ np.linalg.solve(np.array(document["covariance"]), error))
 
 
 class TestRecovered:

@@ -1,5 +1,6 @@
 """``robocal replay`` of a hand-eye session's bag."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,10 @@ import pytest
 from command import robocal, robocal_json
 from hand_eye_bag import hand_eye_bag
 from hand_eye_driver import FRAME, sphere_set
+
+from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
+from robocal_ros.storage.bags import BagReader
 
 SCHEMA = "replay.hand_eye.json"
 
@@ -62,3 +67,20 @@ def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
     unknown = robocal("history", "rollback", "--kind", "hand_eye/", "--state", tmp_path)
     assert unknown.returncode == 2
     assert "none of thermal, reference" in unknown.stderr
+
+
+@pytest.mark.parametrize("kind", ["sphere", "step", "line"])
+def test_the_golden_bags_give_what_they_recorded(kind):
+    """On another machine not to the last bit, but to a hundredth of a millimetre."""
+    file = Path(__file__).parents[2] / "bags" / f"hand_eye_{kind}.mcap"
+    with BagReader(file) as reader:
+        events = [m.message for m in reader.messages(["/hand_eye_node/session_events"])]
+    recorded = [json.loads(e.outcome).get("status") for e in events if e.command != "configure"]
+    in_force = json.loads(events[-1].arguments)["arguments"]["sensor"]
+    document = robocal_json(SCHEMA, "replay", file)
+    assert [Code[c["code"]] for c in document["commands"]] == recorded
+    final = document["final_sensor"]
+    T = np.array(in_force["T_parent_sensor"])
+    assert (final["parent"], final["child"]) == (in_force["parent"], in_force["child"])
+    found = frames.transform_from_quat(1e-3 * np.array(final["xyz_mm"]), final["quat_xyzw"])
+    assert np.linalg.norm((found - T) @ [0.0, 0.0, 0.2, 1.0]) < 1e-5

@@ -1,0 +1,110 @@
+"""The golden hand-eye bags: replayed, and played through the live node, with the same results."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command import robocal_json
+from hand_eye_live import STREAM, TYPES
+from rclpy.serialization import deserialize_message
+from robocal_msgs.msg import SessionEvent
+
+from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.sessions.events import (
+    ACCEPT,
+    BREAK_OFF,
+    CALIBRATE,
+    CAPTURE,
+    REMOVE,
+    SAMPLE,
+    START,
+    Command,
+)
+from robocal_ros.sessions.hand_eye_shots import PROFILE
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.storage.bags import BagReader, BagWriter
+
+BAGS = Path(__file__).parents[2] / "bags"
+EVENT_TOPIC = "/hand_eye_node/session_events"
+INPUTS = {f"/{kind}": kind for kind in (JOINTS, PROFILE)}
+CALLED = (START, CAPTURE, REMOVE, CALIBRATE, ACCEPT)
+SETTINGS = {"sensor_frame": "laser", "capture_timeout_s": 1.0}
+
+
+@pytest.fixture(scope="module", params=["sphere", "step", "line"])
+def bag(request: Any, tmp_path_factory: Any) -> Path:
+    """The bag made anew: only on the machine that made it are results equal to the last bit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BAGS))
+        from make_hand_eye import build, write_bag
+
+        path = tmp_path_factory.mktemp("bag") / f"{request.param}.mcap"
+        write_bag(build(request.param), path)
+        for name in ("make_hand_eye", "hand_eye_program", "hand_eye_recorder", "session_events"):
+            sys.modules.pop(name, None)
+    return path
+
+
+def test_it_replays_bit_for_bit(bag: Path) -> None:
+    document = robocal_json("replay.hand_eye.json", "replay", bag)
+    assert document["differs"] == []
+    assert document["warnings"] == []
+    (found,) = document["calibrations"]
+    assert document["final_sensor"]["xyz_mm"] == found["T_flange_sensor"]["xyz_mm"]
+
+
+def test_live_equals_replay_bit_for_bit(graph: Any, bag: Path, tmp_path: Path) -> None:
+    """Every message over DDS; the calls where they were made; every outcome as it was recorded."""
+    live = graph.collect(SessionEvent, EVENT_TOPIC, EVENTS)
+    target = {"target": bag.stem, "target_file": str(bag.with_suffix(".yaml"))}
+    node = graph.add(HandEyeNode, SETTINGS | target)
+    publishers = {t: graph.publisher(TYPES[kind], t, STREAM) for t, kind in INPUTS.items()}
+    wanted, sent = [], 0
+    with BagReader(bag) as reader:
+        for m in reader.messages([*INPUTS, EVENT_TOPIC], raw=True):
+            if m.topic != EVENT_TOPIC:
+                publishers[m.topic].publish(deserialize_message(m.message, TYPES[INPUTS[m.topic]]))
+                sent += 1
+                _wait(graph, node, sent)
+                continue
+            event = deserialize_message(m.message, SessionEvent)
+            wanted.append(_told(event))
+            if event.command in CALLED:
+                arguments = json.loads(event.arguments)["arguments"]
+                node._desk.ask(Command(event.command, arguments))
+    graph.spin_until(lambda: len(live) >= len(wanted), "all events")
+    assert [_told(e) for e in live] == wanted
+    assert {SAMPLE, BREAK_OFF, *CALLED} <= {e.command for e in live}
+    again = tmp_path / "live.mcap"
+    _write(bag, live, again)
+    document = robocal_json("replay.hand_eye.json", "replay", again)
+    assert document["differs"] == []
+    made = robocal_json("replay.hand_eye.json", "replay", bag)
+    assert document["calibrations"] == made["calibrations"]
+
+
+def _told(event: SessionEvent) -> Any:
+    """A command, its samples, and what came of it; revisions and ids too, of an empty history."""
+    outcome = json.loads(event.outcome)
+    stamp = event.stamp.sec, event.stamp.nanosec
+    return event.sequence, event.command, stamp, json.loads(event.arguments), outcome
+
+
+def _wait(graph: Any, node: HandEyeNode, sent: int) -> None:
+    """One message at a time, so that the topics stay in order."""
+    inputs = node.inputs
+    graph.spin_until(lambda: sum(i.received for i in inputs.values()) >= sent, "the message")
+
+
+def _write(bag: Path, events: list[SessionEvent], path: Path) -> None:
+    """The inputs, with what the live node recorded of its session."""
+    with BagReader(bag) as reader, BagWriter(path, latched=[EVENT_TOPIC]) as writer:
+        for m in reader.messages(INPUTS):
+            kind = reader.info.topics[m.topic].msgtype
+            writer.write(m.topic, kind, m.message, m.log_time_ns)
+            last_ns = m.log_time_ns
+        for event in events:
+            writer.write(EVENT_TOPIC, "robocal_msgs/msg/SessionEvent", event, last_ns)
