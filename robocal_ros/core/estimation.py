@@ -96,18 +96,16 @@ def solve(
         When the residuals at the start are not finite.
     """
     residual, jacobian = problem.linearise(start)
-    m, c, k = jacobian.shape
-    if sizes is None:
-        sizes = np.full(m, c, dtype=np.int64)
     if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
         raise ValueError("the residuals at the start are not finite")
+    m, c, k = jacobian.shape
+    counts = np.full(m, c, dtype=np.int64) if sizes is None else sizes
     flat = prior_information is None
     if flat:
-        _require_enough(jacobian, int(np.sum(sizes)), problem.names)
+        _require_enough(jacobian, int(np.sum(counts)), problem.names)
     prior = np.zeros((k, k)) if prior_information is None else prior_information
-    descent = Descent(
-        problem, prior, 0 if noise_known else problem.scale_components, sizes, freedom
-    )
+    unscaled = 0 if noise_known else problem.scale_components
+    descent = Descent(problem, prior, unscaled, counts, freedom)
     run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
     information = information_of(run.jacobian, keep)
     seen = observability(rows_of(run.jacobian, keep), information)

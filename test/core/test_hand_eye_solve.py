@@ -288,3 +288,69 @@ class TestVerify:
         )
         seen = verify(SphereTask(SPHERE), sphere_data(7, 10), knocked, SETTINGS)
         assert seen.verdict.code is Code.RESIDUAL_TOO_LARGE
+
+
+class TestStepMistakes:
+    """Which corner is which depends on the poses: mistakes in them are found all the same."""
+
+    @pytest.fixture
+    def shots(self):
+        return data_of(step_shots(CELL, STAIRS, 8, np.random.default_rng(11)))
+
+    @pytest.mark.parametrize(
+        ("words", "undo"),
+        [
+            ("shifted by one", lambda T: np.roll(T, 1, axis=0)),
+            ("inverted", frames.invert),
+            ("y of their positions negated", lambda T: _negated(T, 1)),
+            ("read as w, x, y, z", lambda T: _read_as_xyzw(T)),
+        ],
+    )
+    def test_poses(self, shots, words, undo):
+        wrong = replace(shots, T_base_flange=undo(shots.T_base_flange))
+        with pytest.raises(ResidualError, match=words):
+            solve_step(wrong, stairs_target(), "best", SETTINGS)
+
+    def test_marks_exchanged(self, shots):
+        other = tuple({"near": "far", "far": "near"}[mark] for mark in shots.marks)
+        with pytest.raises(ResidualError, match="near and far exchanged"):
+            solve_step(replace(shots, marks=other), stairs_target(), "best", SETTINGS)
+
+    def test_two_shots_swapped(self, shots):
+        T = shots.T_base_flange.copy()
+        T[[1, 3]] = T[[3, 1]]  # of one mark
+        found = solve_step(replace(shots, T_base_flange=T), stairs_target(), "best", SETTINGS)
+        assert {name.partition("/")[0] for name in found.rejected} == {"p2", "p4"}
+        assert all("swapped" in words for words in found.rejected.values())
+
+
+def _negated(T, axis):
+    wrong = T.copy()
+    wrong[:, axis, 3] *= -1.0
+    return wrong
+
+
+def _read_as_xyzw(T):
+    """Poses whose quaternions were written w, x, y, z and read x, y, z, w."""
+    return frames.transform_from_quat(T[:, :3, 3], np.roll(frames.quat_xyzw(T), 1, axis=1))
+
+
+def test_a_sphere_that_was_knocked_is_not_the_poses_fault():
+    rng = np.random.default_rng(12)
+    before = sphere_shots(CELL, CENTRE, RADIUS_M, 8, rng)
+    after = sphere_shots(CELL, CENTRE + np.array([5e-3, 0.0, 0.0]), RADIUS_M, 7, rng)
+    first, second = data_of(before), data_of(after)
+    both = HandEyeData(
+        tuple(f"p{i}" for i in range(15)),
+        np.concatenate([first.T_base_flange, second.T_base_flange]),
+        [*first.profiles, *second.profiles],
+    )
+    with pytest.raises(ResidualError, match="has the target moved"):
+        solve(both)
+
+
+def test_two_poses_cannot_tell_the_robots_noise():
+    shots = data_of(step_shots(CELL, STAIRS, 2, np.random.default_rng(13), level=True))
+    found = solve_step(shots, stairs_target(), "best", SETTINGS)
+    assert found.verdict.code is Code.TOO_FEW_SAMPLES
+    assert "robot's noise" in found.verdict.reason

@@ -22,10 +22,11 @@ SEED = 5  # of the fixed set of trials
 NO_STRETCH = 2e-3  # of their length: corners that lie on one line but for so much
 
 
-def linear_corners(value: Array, p_flange: Array) -> Array:
+def closed_corners(value: Array, p_flange: Array) -> Array:
     """Classic closed form: X (4, 4) from corners (m, 3) = (x, z, .) at flange points (m, 3).
 
-    p = x r1 + z r3 + t is linear in nine unknowns; r2 = r3 x r1, then the nearest rotation.
+    The nine unknowns of p = x r1 + z r3 + t, projected to a rotation and refined on it, are the
+    rotation of the corners' cross-covariance (Kabsch 1976): the least squares of their distances.
 
     Raises
     ------
@@ -36,7 +37,7 @@ def linear_corners(value: Array, p_flange: Array) -> Array:
     """
     if len(value) < 3:
         raise TooFewSamplesError(f"{len(value)} corners fit the target, at least 3 are needed")
-    X, seen = _linear(value, p_flange)
+    X, seen = _closed(value, p_flange)
     if not seen:
         words = "rotation about the line of the corners"
         raise RankDeficientError(
@@ -48,12 +49,12 @@ def linear_corners(value: Array, p_flange: Array) -> Array:
 
 
 def robust_corners(value: Array, p_flange: Array) -> Array:
-    """`linear_corners` of the part of corners that agrees best, and then of those near them."""
-    best = linear_corners(value, p_flange)
+    """`closed_corners` of the part of corners that agrees best, and then of those near them."""
+    best = closed_corners(value, p_flange)
     rng = np.random.default_rng(SEED)
     m = len(value)
     rows = np.array([rng.permutation(m)[: max(4, m // 3)] for _ in range(PARTS)])
-    X, seen = _linear(value[rows], p_flange[rows])
+    X, seen = _closed(value[rows], p_flange[rows])
     median = np.median(_miss(X, value, p_flange), axis=1)
     median[~seen] = np.inf
     first = int(np.argmin(median))
@@ -61,19 +62,18 @@ def robust_corners(value: Array, p_flange: Array) -> Array:
         best = X[first]
     near = _miss(best, value, p_flange) <= 3.0 * median[first]
     try:
-        return linear_corners(value[near], p_flange[near])
+        return closed_corners(value[near], p_flange[near])
     except (RankDeficientError, TooFewSamplesError):
         return best
 
 
-def _linear(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _closed(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Closed forms X (..., 4, 4) of corners (..., m, 3), and whether these show them at all."""
-    A = value.copy()
-    A[..., 2] = 1.0
-    s = np.linalg.svd(A - A.mean(axis=-2, keepdims=True), compute_uv=False)
-    columns = np.linalg.pinv(A) @ p_flange  # rows r1, r3, t
-    r1, r3, t = np.moveaxis(columns, -2, 0)
-    R = frames.nearest_rotation(np.stack([r1, np.cross(r3, r1), r3], axis=-1))
+    own = np.stack([value[..., 0], np.zeros(value.shape[:-1]), value[..., 1]], axis=-1)
+    middle, there = own.mean(axis=-2, keepdims=True), p_flange.mean(axis=-2, keepdims=True)
+    s = np.linalg.svd(own - middle, compute_uv=False)
+    R = frames.nearest_rotation(np.swapaxes(p_flange - there, -1, -2) @ (own - middle))
+    t = (there - middle @ np.swapaxes(R, -1, -2))[..., 0, :]
     return frames.transform(R, t), np.asarray(s[..., 1] > NO_STRETCH * s[..., 0])
 
 

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.hand_eye.diagnosis import look
 from robocal_ros.core.hand_eye.mount_fit import fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.result import HandEyeResult
-from robocal_ros.core.hand_eye.solve import look, result_of
+from robocal_ros.core.hand_eye.solve import result_of
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task
 
 Part = tuple[Task, HandEyeData]

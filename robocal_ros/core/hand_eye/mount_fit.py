@@ -13,7 +13,6 @@ from robocal_ros.core.hand_eye.mount_problem import (
     MountState,
     PoseNoise,
     View,
-    pivot_of,
 )
 from robocal_ros.core.hand_eye.naming import describe_motion
 from robocal_ros.core.hand_eye.restricted_noise import (
@@ -29,6 +28,8 @@ Array = NDArray[np.float64]
 LOOKS = 3
 ROUNDS = 8
 POSE_NUMBERS = 6
+CALM_M = 1e-4  # and rad at 1 m: the noise of a good robot, to tell poses from noise
+LEAST_AIM = 1  # so that four poses suffice to tell how well the eye aims
 SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 
@@ -136,7 +137,9 @@ def _settle(
     """Solve, take weights and noise anew, until both stay: which sightings (m,) are wrong, too."""
     for _ in range(ROUNDS):
         problem = MountProblem(views, noise, state, together)
-        estimate = _solved(problem, state, _freedom(problem) if given is None else np.inf)
+        estimate = _solved(
+            problem, state, max(noise_numbers(problem), 1) if given is None else np.inf
+        )
         away = _away(problem.pivot, state, estimate)
         state, before = estimate.state, noise
         noise = restricted_noise(problem, state, ~estimate.rejected, given)
@@ -152,11 +155,16 @@ def _away(pivot: Array, before: MountState, estimate: Estimate[MountState]) -> f
     return float(np.sqrt(step @ np.linalg.solve(estimate.covariance[:6, :6], step)))
 
 
-def _freedom(problem: MountProblem) -> float:
-    """How many numbers tell the noise of poses: at most six of a pose, less the unknowns."""
-    poses = np.unique(np.concatenate([view.sightings.pose for view in problem.views]))
-    told = min(POSE_NUMBERS * len(poses), int(problem.sizes.sum()))
-    return float(max(told - len(problem.names), 1))
+def noise_numbers(problem: MountProblem) -> int:
+    """How many numbers tell the noise: at most six of a pose, less the unknowns.
+
+    Where light is laid by eye, two of a pose tell how well; three unknowns look the same.
+    """
+    poses = len(np.unique(np.concatenate([view.sightings.pose for view in problem.views])))
+    told = min(POSE_NUMBERS * poses, int(problem.sizes.sum())) - len(problem.names)
+    if problem.aimed:
+        return min(told, 2 * poses - 3 + LEAST_AIM)
+    return told
 
 
 def _solved(
@@ -171,7 +179,7 @@ def _solved(
             freedom=freedom,
         )
     except RankDeficientError as error:
-        raise _in_words(problem, state) or error from error
+        raise _in_words(problem, state) or _few_agree(error) from error
     return estimate
 
 
@@ -188,13 +196,21 @@ def _in_words(problem: MountProblem, state: MountState) -> RankDeficientError | 
     return refuse_open(words) if words else None
 
 
+def _few_agree(error: RankDeficientError) -> RankDeficientError:
+    """The refusal where all samples would do, but not those of them that fit together."""
+    words = "those samples that fit together do not determine the sensor: measure again, more often"
+    return RankDeficientError(words, error.directions)
+
+
 def refuse_open(words: list[str]) -> RankDeficientError:
     """The refusal for directions that are not seen, in words."""
-    return RankDeficientError(f"not determined: {'; '.join(words)}", words)
+    what, remedies = zip(*(each.split(": ", 1) for each in words), strict=True)
+    told = f"{'; '.join(what)}: {'; '.join(dict.fromkeys(remedies))}"
+    return RankDeficientError(f"not determined: {told}", words)
 
 
 def require_seen(fit: MountFit, reach_m: float) -> None:
-    """Refuse a direction of the sensor that is known no better than `OPEN_M`.
+    """Refuse a direction that the poses, even of a good robot, show no better than `OPEN_M`.
 
     ``reach_m``: distance at which turns count.
 
@@ -204,8 +220,13 @@ def require_seen(fit: MountFit, reach_m: float) -> None:
         Naming it, with the missing motion.
     """
     T = np.concatenate([view.sightings.T_base_flange for view in fit.views])
-    covariance = at_origin(fit.covariance[:6, :6], pivot_of(fit.views))
-    words = open_directions(covariance, reach_m, T)
+    calm = replace(fit.noise, sigma_m=min(fit.noise.sigma_m, CALM_M))
+    calm = replace(calm, sigma_rad=min(calm.sigma_rad, CALM_M))
+    problem = MountProblem(fit.views, calm, fit.state)
+    J = problem.linearise(fit.state)[1].reshape(-1, len(problem.names))
+    prior = problem.prior()
+    covariance = np.asarray(np.linalg.pinv(J.T @ J + (0.0 if prior is None else prior)))
+    words = open_directions(at_origin(covariance[:6, :6], problem.pivot), reach_m, T)
     if words:
         raise refuse_open(words)
 

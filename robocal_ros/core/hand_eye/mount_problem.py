@@ -112,6 +112,7 @@ class MountProblem:
         sizes = np.concatenate([np.full(len(v.sightings.names), v.model.components) for v in views])
         self.sizes = np.bincount(self.sample, weights=sizes).astype(np.int64)
         _, _, common, covariance = self.grouped(self.linear(near))
+        self.aimed = bool(np.any(common[..., 6:]))  # whether light is laid by eye
         spread = covariance + common @ noise.covariance() @ np.swapaxes(common, 1, 2)
         self._whitening = np.linalg.inv(np.linalg.cholesky(spread))
 

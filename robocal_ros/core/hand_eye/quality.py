@@ -9,14 +9,19 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.mount_fit import MountFit
+from robocal_ros.core.hand_eye.mount_fit import MountFit, noise_numbers
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, PoseNoise
 
 Array = NDArray[np.float64]
 
 MOST_REJECTED = 1.0 / 3.0
+FEWEST_TOLD = 6  # numbers that tell the noise of poses, where it is found from the data
+LARGEST_POSE_M = 2e-3  # error of a pose in space that a robot may have
+CONTRADICTED = 2.0  # times the given noise
+ARM_M = 1.0
 STRIDE = 8  # of the points that tell the field of view
 OUTSIDE = 0.02  # share of points beyond it on each side: spikes
+MOST_MISFITS = 0.2  # of those that show the target
 FEWEST_SPARE = 3  # measured numbers beyond the unknowns, without which nothing is judged
 
 
@@ -26,8 +31,9 @@ class HandEyeSettings:
 
     Attributes
     ----------
-    robot_sigma_m, robot_sigma_rad : standard deviation of a reported pose about each axis; None
-        to estimate both from the profiles.
+    robot_sigma_m, robot_sigma_rad : standard deviation of a reported pose along and about each
+        axis; None to estimate both from the profiles. Where the first is given alone, the second
+        is that shift at an arm's length of 1 m.
     limit_m : largest expected error (rms) of a point in the field that the profiles cover.
     residual_m : largest distance (rms) of samples from the target.
     """
@@ -41,7 +47,8 @@ class HandEyeSettings:
         """Of reported poses; None where it is to be estimated."""
         if self.robot_sigma_m is None:
             return None
-        return PoseNoise(self.robot_sigma_m, self.robot_sigma_rad or 0.0)
+        turn = self.robot_sigma_m / ARM_M if self.robot_sigma_rad is None else self.robot_sigma_rad
+        return PoseNoise(self.robot_sigma_m, turn)
 
 
 def field_points(profiles: Sequence[Array]) -> Array:
@@ -94,11 +101,11 @@ def judge(
     fit: MountFit, shots: int, lost: int, error_m: float, settings: HandEyeSettings
 ) -> Verdict:
     """The verdict on a mount; ``lost`` of ``shots`` gave nothing or did not fit."""
-    spare = int(MountProblem(fit.views, fit.noise, fit.state).sizes.sum()) - len(fit.covariance)
-    if spare < FEWEST_SPARE:
-        words = f"only {spare} measured numbers beyond the unknowns: show the target more often"
-        return Verdict(Code.TOO_FEW_SAMPLES, words)
-    refused = judge_residuals(fit.distances(), shots, lost, settings)
+    refused = (
+        _too_few(fit, settings)
+        or judge_residuals(fit.distances(), shots, lost, settings)
+        or _inconsistent(fit)
+    )
     if refused is not None:
         return refused
     if fit.creeping:
@@ -111,4 +118,38 @@ def judge(
         words += "target at more distances, or measure more often; check-plan proposes poses"
         return Verdict(Code.POSES_NOT_INFORMATIVE, words)
     rms = float(np.sqrt(np.mean(fit.distances() ** 2)))
-    return Verdict(Code.ACCEPT, f"{figures}; samples are off by {rms * 1e3:.3f} mm rms")
+    words = f"{figures}; samples are off by {rms * 1e3:.3f} mm rms"
+    if fit.scale > CONTRADICTED:
+        words += f", {fit.scale:.1f} times what the given noise explains"
+    return Verdict(Code.ACCEPT, words)
+
+
+def _too_few(fit: MountFit, settings: HandEyeSettings) -> Verdict | None:
+    """Refuse data that leave too little to judge by; None where they do not."""
+    problem = MountProblem(fit.views, fit.noise, fit.state)
+    spare = int(problem.sizes.sum()) - len(fit.covariance)
+    if spare < FEWEST_SPARE:
+        words = f"only {spare} measured numbers beyond the unknowns: show the target more often"
+        return Verdict(Code.TOO_FEW_SAMPLES, words)
+    if settings.noise() is None and (told := noise_numbers(problem)) < FEWEST_TOLD:
+        words = f"{len(problem.poses)} poses leave {max(told, 0)} numbers to tell the robot's noise"
+        words += f" (at least {FEWEST_TOLD}): show the target more often, or give the robot's noise"
+        return Verdict(Code.TOO_FEW_SAMPLES, words)
+    return None
+
+
+def _inconsistent(fit: MountFit) -> Verdict | None:
+    """Refuse poses that contradict each other by more than a robot; None where they do not."""
+    off_m = float(np.sqrt(3.0)) * fit.noise.sigma_m * fit.scale
+    if off_m > LARGEST_POSE_M:
+        words = (
+            f"from pose to pose robot and target are off by {off_m * 1e3:.2f} mm: has the target"
+        )
+        words += " moved, does the robot repeat, are the poses those of the profiles?"
+        return Verdict(Code.RESIDUAL_TOO_LARGE, words)
+    misfits = {name.partition("/")[0] for name in fit.rejected}
+    wrong = len(fit.rejected)
+    if wrong > MOST_MISFITS * (wrong + len(fit.names)) and len(misfits) > 1:
+        words = f"{wrong} of {wrong + len(fit.names)} features do not fit the others: see the "
+        return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}rejected ones")
+    return None

@@ -104,7 +104,9 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     """The document of ``robocal hand-eye`` and of the history, in the units people read.
 
     ``covariance`` (6, 6), SI, and ``sigma``: of the sensor's origin, and of its turn about that
-    origin, both along the axes of the parent frame.
+    origin, both along the axes of the parent frame, to first order: where turns are uncertain the
+    origin moves on an arc. ``covariance_at_pivot``, sensor axes, holds there too: of the
+    `increment` about ``pivot_mm``, a point of the sensor frame.
     """
     covariance = parent_covariance(result)
     return {
@@ -113,6 +115,8 @@ def hand_eye_document(result: HandEyeResult) -> Document:
         f"T_{result.parent}_sensor": transform_document(result.T_flange_sensor),
         "sigma": _sigma_document(covariance),
         "covariance": None if covariance is None else covariance.tolist(),
+        "pivot_mm": (result.pivot * 1e3).tolist(),
+        "covariance_at_pivot": None if result.covariance is None else result.covariance.tolist(),
         "target": result.target,
         "residual_mm": _residual_document(result.samples, result.residual_m * 1e3),
         "residual_deg": None

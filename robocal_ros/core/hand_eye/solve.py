@@ -2,25 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.mistakes import explain, swapped, undone
+from robocal_ros.core.hand_eye.diagnosis import read_and_look
+from robocal_ros.core.hand_eye.mistakes import swapped
 from robocal_ros.core.hand_eye.mount_fit import (
     MountFit,
     distances,
-    first_look,
     fit_mount,
     leave_one_out,
     require_seen,
     solved_again,
 )
-from robocal_ros.core.hand_eye.mount_problem import MountState, View, pivot_of
+from robocal_ros.core.hand_eye.mount_problem import View, pivot_of
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.quality import (
     HandEyeSettings,
@@ -38,8 +35,6 @@ from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarg
 from robocal_ros.core.hand_eye.tasks import HandEyeData, LineTask, Read, SphereTask, Task
 
 Array = NDArray[np.float64]
-
-DOUBTFUL_M = 2e-4  # median distance from which a mistake in the data is looked for
 
 
 def solve_sphere(
@@ -84,9 +79,7 @@ def solve_task(
     InputError
         A mark that the target does not have.
     """
-    read = task.read(data)
-    near = look(task, read.view)
-    _require_no_mistake(task, data, read.view, near)
+    read, near = read_and_look(task, data)
     fit = fit_mount((read.view,), near, settings.noise())
     require_radius(fit)
     require_seen(fit, float(np.abs(read.view.sightings.value[:, 1]).mean()))
@@ -95,62 +88,9 @@ def solve_task(
     return result_of([task], fit, [read], data, settings)
 
 
-def look(task: Task, view: View) -> MountState:
-    """The state nearest to the sightings to which a start leads, before the noise is known.
-
-    Raises
-    ------
-    TooFewSamplesError, RankDeficientError
-        When none leads anywhere.
-    """
-    states: list[MountState] = []
-    failure: RobocalError | None = None
-    for start in task.starts(view):
-        try:
-            states.append(first_look((view,), start))
-        except RobocalError as error:
-            failure = failure or error
-            if isinstance(error, RankDeficientError):
-                break  # it lies in the poses, not in the start
-    if not states:
-        raise failure or RobocalError("no start was found")
-    return min(states, key=lambda state: misfit(view, state))
-
-
-def misfit(view: View, state: MountState) -> float:
-    """Median distance of sightings from their target, m."""
-    return float(np.median(distances((view,), state)))
-
-
-def _require_no_mistake(task: Task, data: HandEyeData, view: View, near: MountState) -> None:
-    as_given = misfit(view, near)
-    if as_given < DOUBTFUL_M:
-        return
-
-    def followed(task: Task, view: View) -> float:
-        first = task.starts(view)[0]
-        if (off := misfit(view, first)) > as_given:  # not worth following
-            return off
-        return misfit(view, first_look((view,), first))
-
-    def with_poses(T_base_flange: Array) -> float:
-        return followed(task, task.posed(view, replace(data, T_base_flange=T_base_flange)))
-
-    def as_told(other: Task) -> float:
-        return followed(other, other.read(data).view)
-
-    told = ((words, partial(as_told, other)) for words, other in task.suspects())
-    words = explain(chain(undone(with_poses, data.T_base_flange), told), as_given)
-    if words is not None:
-        raise ResidualError(f"samples are off by {as_given * 1e3:.3g} mm: {words}")
-
-
-def _swapped(view: View, fit: MountFit, place: Array) -> dict[str, str]:
+def _swapped(view: View, fit: MountFit, place: Array, shots: Sequence[str]) -> dict[str, str]:
     names = np.array([name in fit.rejected for name in view.sightings.names])
-    if np.sum(names) < 2:
-        return {}
-    state = MountState(fit.state.T_flange_sensor, (place,))
-    return swapped(fit, replace(fit, views=(view.take(names),), state=state))
+    return swapped(fit, view.take(names), place, shots) if np.sum(names) > 1 else {}
 
 
 def result_of(
@@ -165,9 +105,9 @@ def result_of(
     error_m = expected_error_m(fit.covariance[:6, :6], field - pivot)
     shots = len(data.names)
     rejected = {name: why for read in reads for name, why in read.rejected.items()}
-    swaps = [
-        _swapped(read.view, fit, place) for read, place in zip(reads, fit.state.places, strict=True)
-    ]
+    rejected |= dict(fit.rejected)
+    for read, place in zip(reads, fit.state.places, strict=True):
+        rejected |= _swapped(read.view, fit, place, data.names)
     found = [task.found(place) for task, place in zip(tasks, fit.state.places, strict=True)]
     more = {
         "robot_sigma_mm": fit.noise.sigma_m * 1e3,
@@ -186,7 +126,7 @@ def result_of(
         samples=fit.names,
         residual_m=fit.distances(),
         leave_one_out_m=leave_one_out(fit.views, solved_again(fit)),
-        rejected=rejected | dict(fit.rejected) | {k: v for swap in swaps for k, v in swap.items()},
+        rejected=rejected,
         target=found[0] if alone else {t.kind: f for t, f in zip(tasks, found, strict=True)},
         working_error_m=error_m,
         pivot=pivot,

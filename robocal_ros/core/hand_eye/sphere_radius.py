@@ -7,6 +7,7 @@ from robocal_ros.core.hand_eye.mount_fit import MountFit
 from robocal_ros.core.hand_eye.mount_problem import MountProblem
 from robocal_ros.core.hand_eye.target_models import SphereModel
 
+CONDITION = 1e5
 SURE = 5.0  # standard deviations
 TOLERANCE_M = 5e-5  # of a sphere that is sold as a reference
 
@@ -34,6 +35,9 @@ def require_radius(fit: MountFit) -> None:
     column = np.zeros_like(linear.jacobian[:, :, :1])
     column[:, 2, 0] = radius  # dr / dR at a given height of the laser plane
     residual, jacobian = problem.whitened(linear, column)
+    unit = np.linalg.norm(jacobian, axis=0)
+    if np.any(unit == 0.0) or np.linalg.cond(jacobian / unit) > CONDITION:
+        return  # the radius looks like another unknown
     normal = jacobian.T @ jacobian
     change = np.linalg.solve(normal, -jacobian.T @ residual)[-1]
     sigma = fit.scale * float(np.sqrt(np.linalg.inv(normal)[-1, -1]))

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
@@ -12,9 +13,10 @@ from robocal_ros.core.documents import transform_document
 from robocal_ros.core.errors import InputError, ResidualError, RobocalError
 from robocal_ros.core.fitting.polyline import CornerFit, CornerRule, fit_corners
 from robocal_ros.core.hand_eye.corner_matching import Match, along, nearest
-from robocal_ros.core.hand_eye.edge_start import linear_corners, robust_corners
+from robocal_ros.core.hand_eye.edge_start import closed_corners, robust_corners
 from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
+from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.sightings import Sightings
 from robocal_ros.core.hand_eye.target_models import CornerModel
 from robocal_ros.core.hand_eye.targets import StepTarget
@@ -24,6 +26,7 @@ Array = NDArray[np.float64]
 Document = dict[str, Any]
 
 TURNED_M, TURNED = 5e-4, 0.3  # the order of the target file is kept unless it misses by so much
+PROFILES = 256  # whose corners are remembered
 SMALLEST_SIGMA = 1e-7  # m, rad: of a teaching error that is not zero in the other
 
 
@@ -35,6 +38,7 @@ class StepTask:
     rule: CornerRule = field(default_factory=CornerRule)
     kind: Literal["step"] = field(default="step", init=False)
     fewest: int = field(default=1, init=False)
+    read_by_poses: bool = field(default=True, init=False)
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Corners, each with its mark."""
@@ -71,7 +75,7 @@ class StepTask:
 
     def classic(self, view: View, near: MountState) -> MountState:
         """The closed form of all corners."""
-        X = linear_corners(view.sightings.value, _in_flange(view))
+        X = closed_corners(view.sightings.value, _in_flange(view))
         return MountState(X, (self.target.T_base_user,))
 
     def placed(self, view: View, T_flange_sensor: Array) -> Array:
@@ -87,11 +91,17 @@ class StepTask:
         return {"aim_sigma_mm": fit.noise.aim_m * 1e3}
 
     def suspects(self) -> Iterable[tuple[str, Task]]:
-        """The corners in a left-handed frame."""
+        """The corners in a left-handed frame; the marks exchanged."""
+        marks = self.target.corners
         mirror = np.array([-1.0, 1.0, 1.0])
-        other = {mark: mirror * corners for mark, corners in self.target.corners.items()}
         words = "the corners fit when their x is negated: the target file is left-handed"
-        return ((words, replace(self, target=replace(self.target, corners=other))),)
+        yield words, self._with({mark: mirror * places for mark, places in marks.items()})
+        if len(marks) == 2:
+            words = f"they fit with the marks {' and '.join(marks)} exchanged"
+            yield words, self._with(dict(zip(marks, list(marks.values())[::-1], strict=True)))
+
+    def _with(self, corners: Mapping[str, Array]) -> Task:
+        return replace(self, target=replace(self.target, corners=corners))
 
     def model(self, corner_user: Array) -> CornerModel:
         """Corners (m, 3), user frame, with what is known of that frame."""
@@ -101,6 +111,12 @@ class StepTask:
         if np.any(sigma):
             information = np.diag(np.maximum(sigma, SMALLEST_SIGMA) ** -2.0)
         return CornerModel(corner_user, target.edge_user, target.T_base_user, information)
+
+
+@lru_cache(maxsize=PROFILES)
+def _corners(profile: Profile | RobocalError, rule: CornerRule) -> CornerFit:
+    """Corners of a profile: they do not depend on poses, which may be tried in many ways."""
+    return fit_corners(seen(profile), rule)
 
 
 class _Reader:
@@ -116,7 +132,7 @@ class _Reader:
         self._fits: dict[str, CornerFit] = {}
         for name, profile in zip(data.names, data.profiles, strict=True):
             try:
-                self._fits[name] = fit_corners(seen(profile), task.rule)
+                self._fits[name] = _corners(profile, task.rule)
             except RobocalError as error:
                 self.rejected[name] = str(error)
         usable(self._fits, self.rejected, task.fewest, "corners")

@@ -25,8 +25,7 @@ Document = dict[str, Any]
 
 RADII = (
     0.8,
-    0.85,
-    0.9,
+    0.87,
     0.93,
     0.96,
     0.98,
@@ -35,7 +34,6 @@ RADII = (
     1.02,
     1.04,
     1.07,
-    1.1,
     1.15,
     1.25,
 )  # shares of the radius as told
@@ -83,6 +81,10 @@ class Task(Protocol):
     @property
     def fewest(self) -> int:
         """Profiles without which nothing is solved."""
+
+    @property
+    def read_by_poses(self) -> bool:
+        """Whether poses tell which feature of a profile is which."""
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Features of profiles. Raises `RobocalError` when fewer give any than solving needs.
@@ -137,6 +139,7 @@ class SphereTask:
     target: SphereTarget
     kind: Literal["sphere"] = field(default="sphere", init=False)
     fewest: int = field(default=5, init=False)
+    read_by_poses: bool = field(default=False, init=False)
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:
         """Circles."""
@@ -180,7 +183,7 @@ class SphereTask:
         """Other radii, the likeliest first."""
         for share in sorted(RADII, key=lambda share: abs(share - 1.0)):
             radius_m = share * self.target.radius_m
-            words = f"the profiles fit a sphere of radius {radius_m * 1e3:.1f} mm better"
+            words = f"the profiles fit a sphere of a radius of about {radius_m * 1e3:.3g} mm"
             yield f"{words}: check which sphere is mounted", SphereTask(SphereTarget(radius_m))
 
     def more(self, fit: MountFit, read: Read) -> Document:
@@ -202,6 +205,7 @@ class LineTask:
     target: LineTarget | None
     rule: EdgeRule
     kind: Literal["line"] = field(default="line", init=False)
+    read_by_poses: bool = field(default=False, init=False)
 
     @property
     def fewest(self) -> int:
