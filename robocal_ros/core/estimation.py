@@ -95,9 +95,7 @@ def solve(
     ValueError
         When the residuals at the start are not finite.
     """
-    residual, jacobian = problem.linearise(start)
-    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
-        raise ValueError("the residuals at the start are not finite")
+    residual, jacobian = _linearised(problem, start)
     m, c, k = jacobian.shape
     counts = np.full(m, c, dtype=np.int64) if sizes is None else sizes
     flat = prior_information is None
@@ -126,6 +124,13 @@ def solve(
         iterations=run.iterations,
         converged=run.converged,
     )
+
+
+def _linearised(problem: Problem[S], start: S) -> tuple[Array, Array]:
+    residual, jacobian = problem.linearise(start)
+    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
+        raise ValueError("the residuals at the start are not finite")
+    return residual, jacobian
 
 
 def _settle(

@@ -24,7 +24,9 @@ from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.result import at_origin
 from robocal_ros.core.hand_eye.solve import solve_sphere
 from robocal_ros.core.hand_eye.targets import SphereTarget
+from robocal_ros.sim.hand_eye_cell import Shots
 from robocal_ros.sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
+from robocal_ros.sim.profile_targets import ball_on_table
 
 SENSOR = SensorRange(width_m=0.09)
 NOISE = PoseNoise(POSE_M, 1e-6, 1e-4)
@@ -112,3 +114,26 @@ def test_a_moved_base_gives_the_same_judgement():
     moved = PlannedSphere(RADIUS_M, SENSOR, tuple((T @ np.append(CENTRE, 1.0))[:3]))
     here, there = judged(BALL, poses), judged(moved, T @ poses)
     assert here.working_error_m == pytest.approx(there.working_error_m, rel=1e-6)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_proposed_poses_do_what_they_promise(turned):
+    """Shots from the mended plan, through the sensor and the solver: by another code path."""
+    still = replace(CELL, tilt_rad=0.0, roll_rad=np.radians(60.0) * turned)
+    poor = sphere_poses(6, still)
+    plan = judged(BALL, poor)
+    every = np.concatenate([poor, plan.proposed])
+    rng = np.random.default_rng(8)
+    scene = ball_on_table(CENTRE, RADIUS_M)
+    profiles = [CELL.sensor.shoot(T @ CELL.T_flange_sensor, scene, rng) for T in every]
+    stands = [CELL.robot.stand(T, rng) for T in every]
+    reported = np.array([stand.T_base_flange for stand in stands])
+    shots = Shots(every, reported, profiles, [""] * len(every), None)
+    result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", HandEyeSettings())
+    assert result.verdict.accept
+    assert len(result.rejected) <= 1  # nothing that is proposed is out of view
+    field = SENSOR.field_points
+    away = field @ (result.T_flange_sensor - CELL.T_flange_sensor)[:3, :3].T
+    away += (result.T_flange_sensor - CELL.T_flange_sensor)[:3, 3]
+    achieved = np.sqrt(np.mean(np.sum(away**2, axis=1)))
+    assert achieved < 3.0 * plan.proposed_error_m

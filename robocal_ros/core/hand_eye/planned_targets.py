@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
 STEEPEST_RAD = float(np.radians(60.0))  # slope of a surface that still returns light
+NEEDED = 0.3  # of a circle's radius: how deep an arc must be seen to know its centre
 EDGE_POINTS = 10.0  # on each side of an edge, by which its place is known
 TILTS_RAD = np.radians([-25.0, 0.0, 25.0])
 ROLLS_RAD = np.radians([-60.0, 0.0, 60.0])
@@ -38,9 +39,12 @@ def _looking(turns: Array, at: Array, target: Array) -> Array:
     return frames.transform(turns, target - np.einsum("nij,nj->ni", turns, at))
 
 
-def _places(sensor: SensorRange, heights: tuple[float, ...]) -> Array:
-    """Where a target may be seen (k, 3), sensor frame, m."""
-    far = np.linspace(sensor.near_m, sensor.far_m, 5)[[1, 3]]
+def _places(sensor: SensorRange, heights: tuple[float, ...], behind_m: float = 0.0) -> Array:
+    """Where a target may be seen (k, 3), sensor frame, m.
+
+    ``behind_m``: how far the point that is placed lies behind the surface that is seen.
+    """
+    far = np.linspace(sensor.near_m, sensor.far_m, 5)[[1, 3]] + behind_m
     aside = np.array(ASIDE) * sensor.width_m
     return np.array(list(product(aside, heights, far)))
 
@@ -52,10 +56,10 @@ def _expected(model: TargetModel, seen: Seen, T_base_flange: Array, covariance: 
     return View(model, Sightings(names, np.arange(m), T_base_flange, seen.value, covariance))
 
 
-def _out_of_range(x: Array, z: Array, reach: float, sensor: SensorRange) -> dict[int, str]:
-    """Poses whose sighting (x, z), with ``reach`` on each side, lies out of the field of view."""
+def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict[int, str]:
+    """Poses whose sighting (x, z to z + depth), m, lies out of the field of view."""
     found = {}
-    for i in np.flatnonzero((z < sensor.near_m - reach) | (z > sensor.far_m + reach)):
+    for i in np.flatnonzero((z < sensor.near_m) | (z + depth > sensor.far_m)):
         found[int(i)] = f"the target is at {z[i] * 1e3:.0f} mm, the sensor sees "
         found[int(i)] += f"{sensor.near_m * 1e3:.0f} to {sensor.far_m * 1e3:.0f} mm"
     for i in np.flatnonzero(np.abs(x) > 0.5 * sensor.width_m):
@@ -96,7 +100,7 @@ class PlannedSphere:
     def unseen(self, view: View) -> dict[int, str]:
         """Out of the field of view, or beside the sphere."""
         x, z, r = view.sightings.value.T
-        found = _out_of_range(x, z, self.radius_m, self.sensor)
+        found = _out_of_range(x, z - r, NEEDED * r, self.sensor)
         for i in np.flatnonzero(r < 0.2 * self.radius_m):
             found.setdefault(int(i), "the laser plane passes beside the sphere")
         return found
@@ -104,7 +108,8 @@ class PlannedSphere:
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
         """On both sides of the laser plane."""
         high = OFF_EQUATOR * self.radius_m
-        at = _places(self.sensor, (-high, high))
+        cut = np.sqrt(self.radius_m**2 - high**2)  # the arc lies before the circle's centre
+        at = _places(self.sensor, (-high, high), (1.0 - 0.5 * NEEDED) * cut)
         pairs = list(product(_tilted(T_base_sensor), at))
         return _looking(np.array([R for R, _ in pairs]), np.array([s for _, s in pairs]), place)
 
@@ -118,8 +123,8 @@ class PlannedLine:
 
     @property
     def fewest(self) -> int:
-        """Two equations each."""
-        return 5 if self.line is None else 3
+        """Two equations each, and enough over to tell the noise."""
+        return 8 if self.line is None else 6
 
     def place(self, T_base_sensor: Array) -> Array:
         """A point and the direction."""
@@ -139,9 +144,8 @@ class PlannedLine:
 
     def unseen(self, view: View) -> dict[int, str]:
         """Out of the field of view."""
-        return _out_of_range(
-            view.sightings.value[:, 0], view.sightings.value[:, 1], 0.0, self.sensor
-        )
+        x, z, nothing = view.sightings.value.T
+        return _out_of_range(x, z, nothing, self.sensor)
 
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
         """At several places along the edge."""
@@ -164,7 +168,7 @@ class PlannedStep:
     target: StepTarget
     sensor: SensorRange
     marks: Sequence[str] | None = None
-    fewest: int = field(default=1, init=False)
+    fewest: int = field(default=4, init=False)
 
     def __post_init__(self) -> None:
         require_marks(self.target, self.marks or ())
@@ -208,7 +212,7 @@ class PlannedStep:
         """Poses that see less than two corners."""
         x, z, _ = view.sightings.value.T
         found: dict[int, str] = {}
-        out = _out_of_range(x, z, 0.0, self.sensor)
+        out = _out_of_range(x, z, np.zeros_like(z), self.sensor)
         for pose in np.unique(view.sightings.pose):
             rows = np.flatnonzero(view.sightings.pose == pose)
             if sum(int(row) not in out for row in rows) < 2:

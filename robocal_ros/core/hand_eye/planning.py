@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 VAGUE_M, VAGUE_RAD = 1.0, 1.0  # what is known of a mount without any measurement
 MOST_PROPOSED = 12
+SPARE_POSES = 2  # beyond the fewest, so that one may be lost
 
 
 @dataclass(frozen=True)
@@ -229,12 +230,14 @@ def _propose(
     total = information + _vague(len(information))
     chosen: list[int] = []
     error = np.inf
-    while len(chosen) < MOST_PROPOSED and (error > limit_m or seen + len(chosen) < target.fewest):
+    wanted = target.fewest + SPARE_POSES - seen
+    while len(chosen) < MOST_PROPOSED and (error > limit_m or len(chosen) < wanted):
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
         errors = _errors(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
         error = float(errors[best])
         total = total + gain[best]
+        gain[best] = 0.0  # once: the same pose again shows the same error again
         chosen.append(best)
     return candidates[chosen] @ frames.invert(X), error
 
