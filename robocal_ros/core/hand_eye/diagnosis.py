@@ -109,11 +109,14 @@ def _name_mistake(
         )
 
     def as_told(other: Task) -> float:
-        return followed(other, other.read(data).view)
+        known = None if read is None or task.read_by_poses else read.view
+        return followed(other, other.read(data).view if known is None else other.posed(known, data))
 
     def suspects() -> Iterator[tuple[str, Callable[[], float]]]:
         for words, poses in undone(data.T_base_flange):
             yield words, partial(with_poses, poses)
+        if read is not None and error is not None:
+            return  # open directions lie in the poses, whatever is told of the target
         for words, other in task.suspects():
             yield words, partial(as_told, other)
 

@@ -14,7 +14,7 @@ from robocal_ros.core.hand_eye.mount_problem import (
     PoseNoise,
     View,
 )
-from robocal_ros.core.hand_eye.naming import describe_motion
+from robocal_ros.core.hand_eye.naming import describe_motion, joined
 from robocal_ros.core.hand_eye.restricted_noise import (
     FIRST_NOISE,
     averaged_covariance,
@@ -204,9 +204,7 @@ def _few_agree(error: RankDeficientError) -> RankDeficientError:
 
 def refuse_open(words: list[str]) -> RankDeficientError:
     """The refusal for directions that are not seen, in words."""
-    what, remedies = zip(*(each.split(": ", 1) for each in words), strict=True)
-    told = f"{'; '.join(what)}: {'; '.join(dict.fromkeys(remedies))}"
-    return RankDeficientError(f"not determined: {told}", words)
+    return RankDeficientError(f"not determined: {joined(words)}", words)
 
 
 def require_seen(fit: MountFit, reach_m: float) -> None:

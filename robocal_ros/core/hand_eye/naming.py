@@ -1,5 +1,6 @@
 """Directions that poses leave open, in words, with the motion that would show them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +37,14 @@ def turns_of(T_base_flange: Array) -> Turns:
 def describe_motion(direction: Array, T_base_flange: Array) -> str:
     """Words for an open direction (v, w) (6,) of the sensor, sensor axes, and what to do."""
     return f"{_words(direction)}: {_remedy(turns_of(T_base_flange))}"
+
+
+def joined(words: Sequence[str]) -> str:
+    """Several `describe_motion` in one sentence, a remedy that they share said once."""
+    parts = [each.partition(": ") for each in words]
+    what = "; ".join(first for first, _, _ in parts)
+    remedies = dict.fromkeys(remedy for _, _, remedy in parts if remedy)
+    return ": ".join(filter(None, (what, "; ".join(remedies))))
 
 
 def _words(direction: Array) -> str:

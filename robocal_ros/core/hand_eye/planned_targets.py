@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
 STEEPEST_RAD = float(np.radians(60.0))  # slope of a surface that still returns light
 NEEDED = 0.3  # of a circle's radius: how deep an arc must be seen to know its centre
+CUT = 0.3  # of that depth: what may be cut off at the near end
 EDGE_POINTS = 10.0  # on each side of an edge, by which its place is known
 TILTS_RAD = np.radians([-25.0, 0.0, 25.0])
 ROLLS_RAD = np.radians([-60.0, 0.0, 60.0])
@@ -59,7 +60,7 @@ def _expected(model: TargetModel, seen: Seen, T_base_flange: Array, covariance: 
 def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict[int, str]:
     """Poses whose sighting (x, z to z + depth), m, lies out of the field of view."""
     found = {}
-    for i in np.flatnonzero((z < sensor.near_m) | (z + depth > sensor.far_m)):
+    for i in np.flatnonzero((z < sensor.near_m - CUT * depth) | (z + depth > sensor.far_m)):
         found[int(i)] = f"the target is at {z[i] * 1e3:.0f} mm, the sensor sees "
         found[int(i)] += f"{sensor.near_m * 1e3:.0f} to {sensor.far_m * 1e3:.0f} mm"
     for i in np.flatnonzero(np.abs(x) > 0.5 * sensor.width_m):

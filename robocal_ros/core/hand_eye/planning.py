@@ -16,6 +16,7 @@ from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import OPEN_M, open_directions
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.naming import joined
 from robocal_ros.core.hand_eye.quality import expected_error_m
 from robocal_ros.core.hand_eye.result import at_origin
 
@@ -196,12 +197,12 @@ def _prior(view: View) -> Array:
 def _verdict(
     seen: int, fewest: int, words: Sequence[str], error: float | None, limit_m: float
 ) -> Verdict:
+    open_ones = f"not determined: {joined(words)}" if words else ""
     if seen < fewest:
-        return Verdict(
-            Code.TOO_FEW_SAMPLES, f"{seen} poses see the target, at least {fewest} are needed"
-        )
+        few = f"{seen} poses see the target, at least {fewest} are needed"
+        return Verdict(Code.TOO_FEW_SAMPLES, "; ".join(filter(None, (few, open_ones))))
     if words or error is None:
-        return Verdict(Code.RANK_DEFICIENT, f"not determined: {'; '.join(words)}")
+        return Verdict(Code.RANK_DEFICIENT, open_ones)
     figures = f"a point in the field of view is to be expected off by {error * 1e3:.3f} mm rms"
     if error > limit_m:
         return Verdict(

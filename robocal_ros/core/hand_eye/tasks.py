@@ -15,7 +15,7 @@ from robocal_ros.core.hand_eye.mount_fit import MountFit
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.result import TargetKind
-from robocal_ros.core.hand_eye.sightings import Sightings
+from robocal_ros.core.hand_eye.sightings import Sightings, TargetModel
 from robocal_ros.core.hand_eye.sphere_start import agreed_centre, classic_sphere, sphere_starts
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
@@ -23,20 +23,7 @@ from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
-RADII = (
-    0.8,
-    0.87,
-    0.93,
-    0.96,
-    0.98,
-    0.99,
-    1.01,
-    1.02,
-    1.04,
-    1.07,
-    1.15,
-    1.25,
-)  # shares of the radius as told
+RADII = (0.8, 0.83, 0.86, 0.89, *np.arange(0.91, 1.1, 0.01), 1.12, 1.15, 1.2, 1.25)  # as told: 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,8 +147,8 @@ class SphereTask:
         return Read(view, rejected, points)
 
     def posed(self, view: View, data: HandEyeData) -> View:
-        """Features do not depend on poses."""
-        return with_poses(view, data.T_base_flange)
+        """Circles depend neither on poses nor on the radius."""
+        return with_poses(view, SphereModel(self.target.radius_m), data.T_base_flange)
 
     def starts(self, view: View) -> list[MountState]:
         """All sides of the laser plane are tried."""
@@ -180,10 +167,10 @@ class SphereTask:
         return {"center_mm": (place * 1e3).tolist(), "radius_mm": self.target.radius_m * 1e3}
 
     def suspects(self) -> Iterable[tuple[str, Task]]:
-        """Other radii, the likeliest first."""
-        for share in sorted(RADII, key=lambda share: abs(share - 1.0)):
+        """Other radii."""
+        for share in RADII:
             radius_m = share * self.target.radius_m
-            words = f"the profiles fit a sphere of a radius of about {radius_m * 1e3:.3g} mm"
+            words = f"the profiles fit a sphere of radius {radius_m * 1e3:.3g} mm or so"
             yield f"{words}: check which sphere is mounted", SphereTask(SphereTarget(radius_m))
 
     def more(self, fit: MountFit, read: Read) -> Document:
@@ -230,8 +217,8 @@ class LineTask:
         return Read(View(LineModel(self.target is not None), _gathered(data, found)), rejected)
 
     def posed(self, view: View, data: HandEyeData) -> View:
-        """Features do not depend on poses."""
-        return with_poses(view, data.T_base_flange)
+        """Points do not depend on poses."""
+        return with_poses(view, view.model, data.T_base_flange)
 
     def starts(self, view: View) -> list[MountState]:
         """Rotations, and directions of an unknown line, are tried."""
@@ -282,10 +269,10 @@ def seen(profile: Profile | RobocalError) -> Array:
     return profile.points
 
 
-def with_poses(view: View, T_base_flange: Array) -> View:
-    """A view from other poses (m, 4, 4)."""
+def with_poses(view: View, model: TargetModel, T_base_flange: Array) -> View:
+    """A view of a target from other poses (m, 4, 4)."""
     s = view.sightings
-    return View(view.model, replace(s, T_base_flange=T_base_flange[s.pose]))
+    return View(model, replace(s, T_base_flange=T_base_flange[s.pose]))
 
 
 def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:
