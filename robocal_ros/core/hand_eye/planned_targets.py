@@ -81,7 +81,7 @@ class PlannedSphere:
         blind = [
             len(self.unseen(self.view(T_base_sensor, np.eye(4), centre))) for centre in centres
         ]
-        return np.asarray(centres[np.lexsort((misfit, blind))[0]])
+        return np.asarray(centres[min(range(len(blind)), key=lambda i: (blind[i], misfit[i]))])
 
     def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
         """Circles, with the covariance that their arcs will have."""
