@@ -97,7 +97,7 @@ def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):
 
     assert unseen(CENTRE) == 0
     assert unseen(None) == 0
-    assert unseen(CENTRE + [0.0, 0.0, 0.2]) == len(poses)
+    assert unseen(CENTRE + np.array([0.0, 0.0, 0.2])) == len(poses)
     assert driver.ask(events.START, target={"kind": "line"}, method="best", mount="in-hand",
                       feature="edge").done  # fmt: skip
     with pytest.raises(InputError, match="center is a sphere's"):
@@ -106,13 +106,13 @@ def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):
 
 def test_other_units_are_named():
     q = np.array([-30.0, -100.0, -110.0, -60.0, 90.0, 20.0])
-    with pytest.raises(InputError, match="planned pose 2: joint .* is at -110 rad: degrees"):
+    with pytest.raises(InputError, match=r"planned pose 2: joint .* is at -110 rad: degrees"):
         poses_of_joints(ARM, [JointSample(0, ARM.joint_names, x) for x in (np.radians(q), q)])
-    with pytest.raises(InputError, match="flange pose 1 is 943.* m away: .*thousand.*mm where m"):
+    with pytest.raises(InputError, match=r"flange pose 1 is 943.* m away: .*thousand.*mm where m"):
         poses_of_flange(np.array([[800.0, 0.0, 500.0]]), QUAT)
-    with pytest.raises(InputError, match="planned pose 1: .*a thousand times too near"):
+    with pytest.raises(InputError, match=r"planned pose 1: .*a thousand times too near"):
         poses_of_flange(np.array([[8e-4, 0.0, 5e-4]]), QUAT)
-    with pytest.raises(InputError, match="sensor is 90 m away: .*mm where m are expected"):
+    with pytest.raises(InputError, match=r"sensor is 90 m away: .*mm where m are expected"):
         pose_of([0.0, 0.0, 90.0], QUAT[0], "sensor")
 
 
