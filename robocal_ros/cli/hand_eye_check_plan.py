@@ -65,8 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--center-mm",
         type=three_numbers,
         metavar="X,Y,Z",
-        help="of a sphere, roughly, in base; default: where the poses look, each past it at the "
-        "side of y > 0",
+        help="of a sphere, roughly, in base; default: where most of the poses see it",
     )
     add_robot(parser)
     sensor = parser.add_argument_group("the sensor")

@@ -41,7 +41,7 @@ class Recording:
         """What is wrong with the bag, as far as it was read, and what it lacks."""
         info = self.reader.info
         lacking = not set(MEASURED) & set(self.inputs.values())
-        words = f"{info.path} has no measured_point or measured_pose; {_has(info.topics)}"
+        words = f"{info.path} has none of {', '.join(MEASURED)}; {_has(info.topics)}"
         return [*info.notes, words] if lacking else list(info.notes)
 
     @property

@@ -58,7 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="INPUT:=TOPIC",
-        help="topic of an input: joint_states, measured_point, measured_pose, session_events",
+        help="topic of an input: joint_states, measured_point, measured_pose, beam_events, "
+        "profile, target_pose, session_events",
     )
     parser.add_argument(
         "--state",

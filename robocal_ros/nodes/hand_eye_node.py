@@ -4,15 +4,17 @@ docs/hand_eye_node.md.
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.proposals import hand_eye_kind
+from robocal_ros.core.proposals import Head, hand_eye_kind
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
@@ -85,9 +87,10 @@ class HandEyeNode(HouseNode):
             raise ValueError("activated before it was configured")
         self._session = HandEyeSession(self._nominal, self._history, self._config, __version__)
         self._desk.session = self._session
-        self._frames = FrameWatch(self, self._config.sensor_frame)
+        self._frames = FrameWatch(self, self._config.sensor_frame, self._outputs.transforms)
         self._last: Outcome | None = None
         self._shown: tuple[int, int] | None = None
+        self._on_tf: int | None = None  # the revision
         self._silence, self._newest_ns = Silence(), 0
         self._show_in_force()
         self._outputs.status(self._session, None)
@@ -139,8 +142,8 @@ class HandEyeNode(HouseNode):
             return ""
         pending = [entry.id for entry in history.pending(self._kind)]
         chosen = [int(command.arguments["id"])] if "id" in command.arguments else pending[:1]
-        parents = [history.model(one).get("parent") for one in chosen]
-        return "".join(self._frames.conflict(parent) for parent in parents if parent)
+        models = [history.model(one) for one in chosen]
+        return "".join(self._conflict(model) for model in models if "parent" in model)
 
     def _watch(self) -> None:
         """A capture ends too when the joint states do."""
@@ -190,24 +193,29 @@ class HandEyeNode(HouseNode):
 
     def _show_in_force(self) -> None:
         """Put the sensor in force onto tf and record the new state, when either changed."""
-        session, history = self._session, self._history
-        if session is None or history is None:
+        session = self._session
+        if session is None:
             return
-        head = session.in_force
-        shown = head.revision, session.current.thermal.revision
-        if self._shown == shown or self._conflict():
+        shown = session.in_force.revision, session.current.thermal.revision
+        if self._shown != shown:
+            self._shown = shown
+            self._outputs.event(configuration(session, self._topics), None)
+            self._outputs.status(session, self._last)
+        self._show_transform(session.in_force)
+
+    def _show_transform(self, head: Head) -> None:
+        """Put what is in force onto tf, once it is known that nobody else puts the frame there."""
+        history, model = self._history, head.model
+        if history is None or self._on_tf == head.revision or not self._frames.settled:
+            return
+        if model is not None and self._conflict(model):
             return
         stamp_ns = 0 if head.calibration_id is None else history.get(head.calibration_id).stamp_ns
         self._outputs.transform(head, stamp_ns)
-        if head.model is not None:
-            self._frames.own.add(head.model["parent"])
-        self._shown = shown
-        self._outputs.event(configuration(session, self._topics), None)
-        self._outputs.status(session, self._last)
+        self._on_tf = head.revision
 
-    def _conflict(self) -> str:
-        model = None if self._session is None else self._session.in_force.model
-        return "" if model is None else self._frames.conflict(model["parent"])
+    def _conflict(self, model: Mapping[str, Any]) -> str:
+        return self._frames.conflict(model["parent"], np.array(model["T_parent_sensor"]))
 
     def health(self) -> Health:
         """Tell what is in force, what is captured, what was lost or ignored, what is wrong."""
@@ -225,7 +233,9 @@ class HandEyeNode(HouseNode):
             for reason, count in reasons.items():
                 last = session.ignored.last(topic, reason)
                 values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
-        for fault in (self._guard.fault, session.current.fault, self._conflict()):
+        model = session.in_force.model
+        taken = "" if model is None else self._conflict(model)
+        for fault in (self._guard.fault, session.current.fault, taken):
             if fault:
                 health.worsen(ERROR, fault)
         if self._outputs.missing:

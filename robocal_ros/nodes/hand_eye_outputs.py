@@ -39,6 +39,7 @@ class HandEyeOutputs:
 
     Attributes
     ----------
+    transforms : all that were put onto tf.
     missing : what cannot be published on this machine; empty when everything can.
     """
 
@@ -48,6 +49,7 @@ class HandEyeOutputs:
         self._status = add(HandEyeStatus, "~/status", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
         self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self.transforms: list[TransformStamped] = []
         self._tf: Any = None
         self.missing = ""
         try:
@@ -67,6 +69,7 @@ class HandEyeOutputs:
         if self._tf is None:
             return
         transforms = [] if head.model is None else [transform_message(head.model, stamp_ns)]
+        self.transforms += transforms
         self._tf.publish(self._tf_message(transforms=transforms))
 
     def quality(self, outcome: Outcome, frame: str, entry: Entry | None) -> None:

@@ -29,7 +29,7 @@ class HandEyeConfig:
     capture_timeout_s: float = 10.0
     robot_sigma_m: float | None = None
     robot_sigma_rad: float | None = None
-    limit_m: float = 5e-4
+    limit_m: float = 1e-3
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, TooFewSamplesError
+from robocal_ros.core.flange_units import flange_unit_fault
 from robocal_ros.core.hand_eye.profile import Profile, profile_of
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.storage.cells import Cells, read_cells, texts, write_cells
@@ -35,8 +36,6 @@ from robocal_ros.storage.tables import (
 
 Array = NDArray[np.float64]
 
-FARTHEST_M = 20.0  # no arm's flange is farther from its base
-NEAREST_M = 0.01  # nor do all poses of one lie so near to it
 PROFILE = ("x_mm", "z_mm")
 FILE_COLUMNS = ("profile", "image")
 
@@ -168,26 +167,10 @@ def _poses(table: Cells, layout: Layout, arm: SerialArm | None, q: Array | None)
 
 
 def _check_unit(table: Cells, columns: Sequence[str], position: Array) -> None:
-    distance = np.linalg.norm(position, axis=1)
-    index = int(np.argmax(distance))
-    unit, other = ("mm", "m") if columns == POSITION["mm"] else ("m", "mm")
-    axis = columns[int(np.argmax(np.abs(position[index])))]
-    if distance[index] > FARTHEST_M:
-        why = f": {other} where {unit} are expected?" if unit == "m" else "?"
-        table.fail(
-            f"the flange is {distance[index]:.4g} m from the base: is it a thousand times too "
-            f"far{why}",
-            index,
-            axis,
-        )
-    if distance[index] < NEAREST_M:
-        why = f", {other} where {unit} are expected?" if unit == "mm" else "?"
-        table.fail(
-            f"no flange is farther from the base than {distance[index] * 1e3:.4g} mm: are they a "
-            f"thousand times too near{why}",
-            index,
-            axis,
-        )
+    unit = "mm" if columns == POSITION["mm"] else "m"
+    if (fault := flange_unit_fault(position, unit)) is not None:
+        index, words = fault
+        table.fail(words, index, columns[int(np.argmax(np.abs(position[index])))])
 
 
 def read_profile(path: Path, name: str) -> Profile:

@@ -64,6 +64,14 @@ def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
                    "--state", tmp_path, "--by", "me", "--reason", "another sensor")  # fmt: skip
     assert back.returncode == 0, back.stderr
     assert f"nothing is in force again, as hand_eye/{FRAME} revision 2" in back.stdout.lower()
+    # What the history shows is exported to a robot description.
+    shown = robocal("history", "show", "1", "--state", tmp_path, "--json")
+    file = tmp_path / "laser.json"
+    file.write_text(shown.stdout)
+    export = robocal("hand-eye", "export", "--result", file, "--format", "urdf", "--child", FRAME)
+    x, y, z = (float(v) for v in export.stdout.partition('xyz="')[2].partition('"')[0].split())
+    found = robocal_json(SCHEMA, "replay", bag)["final_sensor"]["xyz_mm"]
+    assert 1e3 * np.array([x, y, z]) == pytest.approx(found, abs=1e-4)
     unknown = robocal("history", "rollback", "--kind", "hand_eye/", "--state", tmp_path)
     assert unknown.returncode == 2
     assert "none of thermal, reference" in unknown.stderr

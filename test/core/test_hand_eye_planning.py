@@ -20,7 +20,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_problem import PoseNoise
 from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
 from robocal_ros.core.hand_eye.planning import SensorRange, check_plan
-from robocal_ros.core.hand_eye.quality import HandEyeSettings
+from robocal_ros.core.hand_eye.quality import HandEyeSettings, expected_error_m
 from robocal_ros.core.hand_eye.result import at_origin
 from robocal_ros.core.hand_eye.solve import solve_sphere
 from robocal_ros.core.hand_eye.targets import SphereTarget
@@ -68,6 +68,26 @@ def test_expected_error_is_that_of_a_calibration_from_these_poses():
     assert plan.rank == plan.unknowns == 9
     achieved = np.sqrt(np.diag(at_origin(result.covariance, result.pivot)))
     assert plan.sigma == pytest.approx(achieved, rel=0.1)  # the robot's error rules, not the arc
+
+
+@pytest.mark.parametrize("strays", [0, 2])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_sphere_of_unknown_place_is_where_the_poses_see_it(seed, strays):
+    """Poses that saw it when they were shot see it in the plan, whatever side they pass it on."""
+    rng = np.random.default_rng(100 + seed)
+    shots = sphere_shots(CELL, CENTRE, RADIUS_M, 12, rng)
+    rough = CELL.T_flange_sensor.copy()
+    rough[:3, 3] += rng.normal(0.0, 1e-3, 3)
+    poses = shots.true_T_base_flange.copy()
+    poses[12 - strays :, :3, 3] += 0.3  # those look elsewhere
+    plan = check_plan(PlannedSphere(RADIUS_M, SENSOR), poses, rough, SENSOR, NOISE, LIMIT_M)
+    assert sorted(plan.unseen) == list(range(12 - strays, 12))
+    if not strays:  # against what is achieved, at the same points of the field
+        settings = HandEyeSettings(POSE_M, 1e-6)
+        result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", settings)
+        covariance = at_origin(result.covariance, result.pivot)
+        achieved_m = expected_error_m(covariance, SENSOR.field_points)
+        assert 1 / 1.5 < plan.working_error_m / achieved_m < 1.5
 
 
 @pytest.mark.parametrize("kind", PLANNED)

@@ -80,10 +80,12 @@ class LiveSensor:
         """Ask for a capture; the answer comes at once."""
         return self.graph.call(CaptureHandEye, f"{NAME}/capture", mark=mark)
 
-    def capture(self, shot: Callable[[int], Recorded] | None, seconds: float = 0.7) -> Any:
+    def capture(
+        self, shot: Callable[[int], Recorded] | None, seconds: float = 0.7, mark: str = ""
+    ) -> Any:
         """A capture at rest, and how it ended."""
         self.robot.rest(0.1)
-        asked = self.ask_capture()
+        asked = self.ask_capture(mark)
         assert asked.success, asked.message
         self.robot.rest(seconds, shot)
         return self.ended(asked.handle)

@@ -36,6 +36,11 @@ def matrix(transform: Any) -> np.ndarray:
     return frames.transform_from_quat(np.array([t.x, t.y, t.z]), np.array([r.x, r.y, r.z, r.w]))
 
 
+def taken(sensor: LiveSensor) -> str:
+    """Why the sensor's frame cannot stand below the flange."""
+    return str(sensor.node._frames.conflict("tool0", np.eye(4)))
+
+
 @pytest.fixture
 def sensor(graph: Any, tmp_path: Path) -> LiveSensor:
     return LiveSensor(graph, tmp_path)
@@ -52,7 +57,7 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     assert (result.status, result.samples) == (CalibrationQuality.ACCEPT, 10)
     truth, found = sphere_set()[0].T_flange_sensor, matrix(result.sensor)
     away_m = np.linalg.norm(((found - truth) @ [0.0, 0.0, 0.2, 1.0])[:3])
-    assert away_m < 2e-4  # at the working distance; the limit of what is accepted is 0.5 mm
+    assert away_m < 2e-4  # at the working distance; the limit of what is accepted is 1 mm
     covariance = np.array(result.covariance).reshape(6, 6)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
     graph.spin_until(lambda: quality, "the verdict")
@@ -68,13 +73,17 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     assert (transform.header.frame_id, transform.child_frame_id) == ("tool0", FRAME)
     assert transform.transform == result.sensor
     graph.spin_until(lambda: sensor.status[-1].revision == 1, "the status")
-    # A node that starts anew publishes it again.
+    # A node that starts anew publishes it again, also after a crash.
     sensor.node.trigger_deactivate()
     sensor.node.trigger_cleanup()
     again = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
     settings = {n: v for n, v in settings_of(tmp_path).items() if n != "target_file"}
     process = graph.start("hand_eye_node", settings, {"__node": "second_node"})
-    graph.spin_until(lambda: again and again[-1].transforms, f"after the start {process.output}")
+    graph.spin_until(lambda: again and again[-1].transforms, "after the start")
+    process.kill()
+    again.clear()
+    graph.start("hand_eye_node", settings, {"__node": "second_node"})
+    graph.spin_until(lambda: again and again[-1].transforms, "after the crash")
     assert again[-1].transforms == [transform]
     back = graph.call(Trigger, "/second_node/rollback_trigger")
     assert back.message == "0 ACCEPT revision 2: nothing in force"
@@ -200,7 +209,7 @@ def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSen
     wrong.header.frame_id = "camera_rail"
     wrong.transform.rotation.w = 1.0
     others.publish(TFMessage(transforms=[wrong]))
-    graph.spin_until(lambda: sensor.node._frames.conflict("tool0"), "the transform is seen")
+    graph.spin_until(lambda: taken(sensor), "the transform is seen")
     refused = graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me")
     assert (refused.success, refused.status) == (False, Code.BAD_INPUT)
     assert "'camera_rail'" in refused.message
@@ -211,7 +220,7 @@ def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSen
     assert [entry.state for entry in listed] == ["pending"]
     # Once the other publisher has gone, nothing stands in the way.
     graph.probe.destroy_publisher(others)
-    graph.spin_until(lambda: not sensor.node._frames.conflict("tool0"), "it is forgotten")
+    graph.spin_until(lambda: not taken(sensor), "it is forgotten")
     assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
 
 
@@ -224,8 +233,9 @@ def test_what_another_process_accepts_is_not_put_below_two_parents(
     wrong = TransformStamped(child_frame_id=FRAME)
     wrong.header.frame_id = "camera_rail"
     others.publish(TFMessage(transforms=[wrong]))
-    graph.spin_until(lambda: sensor.node._frames.conflict("tool0"), "the transform is seen")
+    graph.spin_until(lambda: taken(sensor), "the transform is seen")
     # Accepted elsewhere it is in force, but not put onto tf, and that is said.
+    graph.spin_until(lambda: sensor.node._frames.settled, "it would publish")
     tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
     sensor.node._history.accept(result.candidate_id, by="cli", reason="", wall_ns=1)
     graph.spin_until(lambda: sensor.status[-1].revision == 1, "it is taken over")

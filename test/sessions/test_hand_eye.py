@@ -26,6 +26,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.hand_eye.planning import SensorRange
+from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.target_documents import target_document
 from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
 from robocal_ros.core.proposals import THERMAL, hand_eye_kind
@@ -44,7 +45,7 @@ from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.hand_eye_bags import read_data_set, write_data_set
 
 KIND = hand_eye_kind(FRAME)
-LIMIT_M = HandEyeConfig.limit_m  # what is accepted is as good as that at the working distance
+LIMIT_M = 5e-4  # at the working distance
 SHOTS = list(sphere_shots_of(14))
 
 
@@ -72,6 +73,10 @@ def off_m(history, outcome, truth: np.ndarray, depth_m: float = 0.2) -> float:
     """How far a point at the working distance is off."""
     T = np.array(history.model(outcome.calibration_id)["T_parent_sensor"])
     return float(np.linalg.norm(((T - truth) @ [0.0, 0.0, depth_m, 1.0])[:3]))
+
+
+def test_nodes_and_commands_accept_alike():
+    assert HandEyeConfig().limit_m == HandEyeSettings().limit_m
 
 
 # ---- a whole calibration ------------------------------------------------------------------------

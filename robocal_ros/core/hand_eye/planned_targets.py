@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.look_point import OFF_EQUATOR, looked_at
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
@@ -17,7 +18,7 @@ from robocal_ros.core.hand_eye.targets import StepTarget
 
 Array = NDArray[np.float64]
 
-OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
+SMALLEST = 0.2  # of the radius: a circle that the laser plane cuts out
 STEEPEST_RAD = float(np.radians(60.0))  # slope of a surface that still returns light
 NEEDED = 0.3  # of a circle's radius: how deep an arc must be seen to know its centre
 CUT = 0.3  # of that depth: what may be cut off at the near end
@@ -70,7 +71,7 @@ def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict
 
 @dataclass(frozen=True)
 class PlannedSphere:
-    """A sphere; ``centre`` (3,) in base, or None: where the poses look."""
+    """A sphere; ``centre`` (3,) in base, or None: where most poses see it."""
 
     radius_m: float
     sensor: SensorRange
@@ -81,8 +82,11 @@ class PlannedSphere:
         """Its centre."""
         if self.centre is not None:
             return np.array(self.centre)
-        at = np.array([0.0, OFF_EQUATOR * self.radius_m, self.sensor.middle_m, 1.0])
-        return np.asarray((T_base_sensor @ at).mean(axis=0)[:3])
+        centres, misfit = looked_at(T_base_sensor, self.radius_m, self.sensor)
+        blind = [
+            len(self.unseen(self.view(T_base_sensor, np.eye(4), centre))) for centre in centres
+        ]
+        return np.asarray(centres[min(range(len(blind)), key=lambda i: (blind[i], misfit[i]))])
 
     def view(self, T_base_flange: Array, T_flange_sensor: Array, place: Array) -> View:
         """Circles, with the covariance that their arcs will have."""
@@ -102,7 +106,7 @@ class PlannedSphere:
         """Out of the field of view, or beside the sphere."""
         x, z, r = view.sightings.value.T
         found = _out_of_range(x, z - r, NEEDED * r, self.sensor)
-        for i in np.flatnonzero(r < 0.2 * self.radius_m):
+        for i in np.flatnonzero(r < SMALLEST * self.radius_m):
             found.setdefault(int(i), "the laser plane passes beside the sphere")
         return found
 

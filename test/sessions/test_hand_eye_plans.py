@@ -1,0 +1,133 @@
+"""What a request to judge planned poses is taken to mean."""
+
+import numpy as np
+import pytest
+from hand_eye_driver import ARM, CENTRE, FRAME, Driver, sphere_set
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError, LimitError
+from robocal_ros.core.hand_eye.planning import SensorRange
+from robocal_ros.core.samples import JointSample
+from robocal_ros.sessions import events
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_config import HandEyeConfig
+from robocal_ros.sessions.hand_eye_planning import (
+    MOST_POSES,
+    judged_plan,
+    pose_of,
+    poses_of_flange,
+    poses_of_joints,
+    require_count,
+    rough_mount,
+    sphere_centre,
+)
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+TRUTH = sphere_set()[0].T_flange_sensor
+GIVEN = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] + 2e-3)
+CONFIGURED = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] - 2e-3)
+QUAT = np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def history(tmp_path):
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
+        yield opened
+
+
+def driver_of(history, **changes) -> Driver:
+    config = HandEyeConfig(sensor_frame=FRAME, **changes)
+    return Driver(HandEyeSession(ARM, history, config, "test"))
+
+
+def test_the_request_wins_over_what_is_in_force_and_that_over_candidates(history):
+    driver = driver_of(history)
+    session = driver.session
+    with pytest.raises(InputError, match="nothing says where the sensor sits"):
+        rough_mount(session, history, None, None)
+    driver.sphere(8)
+    assert rough_mount(session, history, None, CONFIGURED)[1] == "rough_xyz_mm and rough_quat_xyzw"
+    number = driver.ask(events.CALIBRATE).calibration_id
+    assert rough_mount(session, history, None, CONFIGURED)[1] == f"candidate {number}"
+    assert driver.ask(events.ACCEPT, id=number, by="me").done
+    assert driver.ask(events.CALIBRATE).calibration_id == number + 1
+    mount, who = rough_mount(session, history, None, CONFIGURED)
+    assert who == f"calibration {number} in force"
+    assert mount.tolist() == history.model(number)["T_parent_sensor"]
+    mount, who = rough_mount(session, history, GIVEN, CONFIGURED)
+    assert (who, mount is GIVEN) == ("the request", True)
+
+
+@pytest.mark.parametrize("refused", ["by its verdict", "by somebody"])
+def test_a_refused_candidate_is_not_gone_by(history, refused):
+    driver = driver_of(history, limit_m=1e-6 if refused == "by its verdict" else 1e-3)
+    driver.sphere(8)
+    number = driver.ask(events.CALIBRATE).calibration_id
+    assert number
+    if refused == "by somebody":
+        assert driver.ask(events.REJECT, id=number, by="me").done
+    mount, who = rough_mount(driver.session, history, None, CONFIGURED)
+    assert (who, mount is CONFIGURED) == ("rough_xyz_mm and rough_quat_xyzw", True)
+
+
+def test_the_sphere_is_where_it_was_seen(history):
+    driver = driver_of(history)
+    driver.sphere(2)
+    data = driver.session.data
+    assert sphere_centre(data, history, TRUTH) is None  # two profiles do not tell their sides
+    driver.sphere(6)
+    data = driver.session.data
+    # Off by what the mount is off: 2 mm along each axis.
+    assert np.linalg.norm(sphere_centre(data, history, CONFIGURED) - CENTRE) < 4e-3
+    number = driver.ask(events.CALIBRATE).calibration_id
+    found_mm = history.document(number)["target"]["center_mm"]
+    assert sphere_centre(data, history, CONFIGURED) == pytest.approx(1e-3 * np.array(found_mm))
+
+
+def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):
+    driver = driver_of(history)
+    driver.sphere(1)
+    poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(width_m=0.09)
+
+    def unseen(centre: np.ndarray | None) -> int:
+        config = driver.session.config
+        return len(
+            judged_plan(driver.session.data, poses, [], TRUTH, sensor, config, centre).unseen
+        )
+
+    assert unseen(CENTRE) == 0
+    assert unseen(None) == 0
+    assert unseen(CENTRE + np.array([0.0, 0.0, 0.2])) == len(poses)
+    assert driver.ask(events.START, target={"kind": "line"}, method="best", mount="in-hand",
+                      feature="edge").done  # fmt: skip
+    with pytest.raises(InputError, match="center is a sphere's"):
+        unseen(CENTRE)
+
+
+def test_other_units_are_named():
+    q = np.array([-30.0, -100.0, -110.0, -60.0, 90.0, 20.0])
+    with pytest.raises(InputError, match=r"planned pose 2: joint .* is at -110 rad: degrees"):
+        poses_of_joints(ARM, [JointSample(0, ARM.joint_names, x) for x in (np.radians(q), q)])
+    with pytest.raises(InputError, match=r"flange pose 1 is 943.* m away: .*thousand.*mm where m"):
+        poses_of_flange(np.array([[800.0, 0.0, 500.0]]), QUAT)
+    with pytest.raises(InputError, match=r"planned pose 1: .*a thousand times too near"):
+        poses_of_flange(np.array([[8e-4, 0.0, 5e-4]]), QUAT)
+    with pytest.raises(InputError, match=r"sensor is 90 m away: .*mm where m are expected"):
+        pose_of([0.0, 0.0, 90.0], QUAT[0], "sensor")
+
+
+def test_what_is_no_pose_is_refused():
+    for quat in ([0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, np.nan], [0.0, 0.0, 0.0, 1.1]):
+        with pytest.raises(InputError, match="quaternion has length"):
+            pose_of([0.5, 0.0, 0.5], quat, "flange pose 1")
+    with pytest.raises(InputError, match="its position is"):
+        pose_of([np.inf, 0.0, 0.5], QUAT[0], "flange pose 1")
+
+
+def test_as_many_poses_as_can_be_judged():
+    for joints, flange in ((0, 0), (1, 1)):
+        with pytest.raises(InputError, match="in one of the two ways"):
+            require_count(joints, flange)
+    require_count(MOST_POSES, 0)
+    with pytest.raises(LimitError, match=f"at most {MOST_POSES}"):
+        require_count(0, MOST_POSES + 1)
