@@ -15,7 +15,7 @@ from robocal_msgs.srv import (
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.nodes.conversions import transform_message, trigger_text
 from robocal_ros.nodes.decision_services import answer, twin
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
@@ -24,6 +24,7 @@ from robocal_ros.nodes.hand_eye_plan import HandEyePlan
 from robocal_ros.nodes.hand_eye_settings import start_arguments
 from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_data import TOPIC_OF
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 Ask = Callable[[Command], Awaitable[Outcome]]
@@ -148,13 +149,11 @@ class HandEyeServices:
         from robocal_ros.storage.hand_eye_bags import write_data_set
 
         session, path = self._session, _path(request)
-        data = session.data
-        if data is None or not data.samples:
-            raise ConflictError("nothing was captured yet: there is nothing to save")
-        frame = session.config.sensor_frame
-        write_data_set(path, data.document(), data.topic, frame, session.nominal)
+        document = session.document()
+        topic = TOPIC_OF[document["target"]["kind"]]
+        write_data_set(path, document, topic, session.config.sensor_frame, session.nominal)
         response.success, response.status = True, int(Code.ACCEPT)
-        response.samples = len(data.samples)
+        response.samples = len(document["samples"])
         response.message = f"{response.samples} samples saved in {path}"
         return response
 

@@ -5,6 +5,7 @@ No clock, no ROS.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import (
@@ -186,9 +187,8 @@ class HandEyeSession(Commanded):
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
         _, q = self.stream.window(at_ns - int(rule.before_s * 1e9), reading.ready_ns)
         mean = q.mean(axis=0)
-        T_base_flange = self.current.arm.fk(mean)
         handle, mark = capture.handle, capture.mark
-        words = data.put(HandEyeSample(handle, mark, at_ns, mean, T_base_flange, shot.values))
+        words = data.put(HandEyeSample(handle, mark, at_ns, mean, shot.values))
         return Outcome(command, Code.ACCEPT, f"capture {handle}: {words}", samples=1)
 
     def _break_off(self, command: Command, wall_ns: int) -> Outcome:
@@ -222,6 +222,28 @@ class HandEyeSession(Commanded):
         data.candidate = outcome.calibration_id
         return outcome
 
+    def document(self) -> dict[str, Any]:
+        """The open data set for a file, with the model that its flange poses come from now.
+
+        Raises
+        ------
+        ConflictError
+            When nothing was captured.
+        """
+        if self.data is None or not self.data.samples:
+            raise ConflictError("nothing was captured yet: there is nothing to save")
+        thermal = {"revision": self.current.thermal.revision, "hash": self.current.arm.model_hash}
+        return self.data.document() | {"thermal": thermal}
+
+    def _other_model(self, saved: Mapping[str, Any] | None) -> str:
+        """Tells when flange poses are no longer those with which a data set was saved."""
+        if saved is None or saved["hash"] == self.current.arm.model_hash:
+            return ""
+        return (
+            f"; its flange poses come from thermal revision {self.current.thermal.revision} now, "
+            f"when it was saved they came from revision {saved['revision']}"
+        )
+
     def _load(self, command: Command, wall_ns: int) -> Outcome:
         arguments = command.arguments
         data = data_set_of(arguments["set"], self.current.arm)
@@ -230,4 +252,5 @@ class HandEyeSession(Commanded):
         self._handle = max(self._handle, *data.samples, 0)
         count = len(data.samples)
         words = f"{count} samples of a {data.kind} loaded from {arguments.get('path', 'a file')}"
+        words += self._other_model(arguments["set"].get("thermal"))
         return Outcome(command, Code.ACCEPT, words, samples=count)

@@ -34,7 +34,6 @@ class HandEyeSample:
     mark : of a step target the mark that the laser plane lies through; else empty.
     stamp_ns : of the shot.
     q : (n,) mean of the joint readings at standstill, rad (prismatic: m).
-    T_base_flange : (4, 4) of q, with the model then in force.
     values : see `hand_eye_shots.Shot`.
     """
 
@@ -42,7 +41,6 @@ class HandEyeSample:
     mark: str
     stamp_ns: int
     q: Array
-    T_base_flange: Array
     values: Array
 
 
@@ -165,7 +163,7 @@ def data_set_begun(document: Mapping[str, Any]) -> DataSet:
 
 
 def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
-    """Read what `DataSet.document` gave, also after JSON; flange poses are those of ``arm``.
+    """Read what `DataSet.document` gave, also after JSON; ``arm``: whose joints they are.
 
     Raises
     ------
@@ -176,12 +174,12 @@ def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
         found = data_set_begun(document)
         columns = 7 if found.topic == TARGET_POSE else 2
         for row in document["samples"]:
-            q = np.array(row["q"], dtype=np.float64)
+            q = np.array(row["q"], dtype=np.float64).reshape(arm.n)
             values = np.array(row["values"], dtype=np.float64).reshape(-1, columns)
             if not (np.all(np.isfinite(q)) and np.all(np.isfinite(values))):
                 raise InputError(f"sample {row['handle']} of the data set holds what is no number")
             mark, at_ns = str(row["mark"]), int(row["stamp_ns"])
-            found.put(HandEyeSample(int(row["handle"]), mark, at_ns, q, arm.fk(q), values))
+            found.put(HandEyeSample(int(row["handle"]), mark, at_ns, q, values))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the data set cannot be read: {error}") from error
     return found

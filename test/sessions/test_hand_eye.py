@@ -109,19 +109,30 @@ def test_each_sample_is_a_command_that_names_its_shot(history):
     assert sample.q == pytest.approx(np.mean(near, axis=0), abs=1e-15)
     q, _ = SHOTS[2]
     assert sample.q == pytest.approx(q, abs=1e-7)  # the readings scatter by that
-    assert sample.T_base_flange == pytest.approx(ARM.fk(sample.q), abs=0)
 
 
-def test_flange_poses_come_from_the_thermal_model_in_force(history):
-    warm = ARM.with_mdh(ARM.mdh * 1.0002)
-    bring_into_force(history, THERMAL, ARM, model_document(warm), "test")
-    driver = begun(history)
-    driver.ask(events.CAPTURE)
-    driver.robot.rest(0.7, SHOTS[0][1])
-    (sample,) = driver.session.data.samples.values()
-    assert sample.T_base_flange == pytest.approx(warm.fk(sample.q), abs=0)
-    moved = np.linalg.norm((warm.fk(sample.q) - ARM.fk(sample.q))[:3, 3])
+WARM = ARM.with_mdh(ARM.mdh * 1.0002)
+
+
+def test_flange_poses_of_all_samples_come_from_the_thermal_model_in_force(history):
+    """Also of those that were captured before it came into force; its revision is the one told."""
+    driver = driver_of(history)
+    driver.sphere(10)
+    cold = driver.ask(events.CALIBRATE)
+    bring_into_force(history, THERMAL, ARM, model_document(WARM), "test")
+    warm = driver.ask(events.CALIBRATE)
+    moved = np.linalg.norm((WARM.fk(SHOTS[0][0]) - ARM.fk(SHOTS[0][0]))[:3, 3])
     assert moved > 1e-4
+    for outcome, arm, revision in ((cold, ARM, 0), (warm, WARM, 1)):
+        inputs = history.inputs(outcome.calibration_id)
+        assert inputs["T_base_flange"] == pytest.approx(arm.fk(inputs["q"]), abs=0)
+        assert history.model(outcome.calibration_id)["thermal_revision"] == revision
+    assert digest(warm.document) != digest(cold.document)
+    # so a replay, whose history has only what was in force at the beginning, finds the same
+    assert "model" not in cold.command.arguments
+    obeyed = json.loads(json.dumps(dict(warm.command.arguments)))
+    history.rollback(None, by="me", reason="", expected_head=1, wall_ns=9, kind=THERMAL)
+    assert digest(driver.ask(events.CALIBRATE, **obeyed).document) == digest(warm.document)
 
 
 def test_a_subset_is_calibrated_and_a_removed_sample_is_gone(history):
@@ -445,7 +456,7 @@ def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):
     first = driver.ask(events.CALIBRATE)
     path = tmp_path / "set.mcap"
     data = driver.session.data
-    write_data_set(path, data.document(), data.topic, FRAME, ARM)
+    write_data_set(path, driver.session.document(), data.topic, FRAME, ARM)
     with CalibrationHistory.open("K2", state_dir=tmp_path) as other:
         fresh = driver_of(other)
         loaded = fresh.ask(events.LOAD, path=str(path), set=read_data_set(path, ARM))
@@ -455,6 +466,14 @@ def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):
         assert other.model(again.calibration_id) == history.model(first.calibration_id)
         fresh.robot.rest(0.1)
         assert fresh.ask(events.CAPTURE).command.arguments["handle"] == 11
+        # with another thermal model in force it cannot be identical, and that is said
+        bring_into_force(other, THERMAL, ARM, model_document(WARM), "test")
+        moved = fresh.ask(events.LOAD, path=str(path), set=read_data_set(path, ARM))
+        assert moved.message.endswith(
+            "its flange poses come from thermal revision 1 now, when it was saved they came from "
+            "revision 0"
+        )
+        assert digest(fresh.ask(events.CALIBRATE).document) != digest(first.document)
 
 
 def test_a_data_set_that_is_none_is_refused():
