@@ -47,7 +47,7 @@ class HandEyeServices:
         session: Callable[[], HandEyeSession | None],
         history: CalibrationHistory,
     ) -> None:
-        self._settings, self._ask = settings, ask
+        self._node, self._settings, self._ask = node, settings, ask
         self._session_now, self._history = session, history
         add = node.add_service
         add(StartHandEye, "~/start", self._start)
@@ -84,14 +84,19 @@ class HandEyeServices:
             return response
         return await twin(self._ask, START, arguments)(request, response)
 
+    async def _capture_now(self, arguments: Mapping[str, Any]) -> Outcome:
+        """A capture takes nothing that was received before its call."""
+        self._node.take_waiting()
+        return await self._ask(Command(CAPTURE, arguments))
+
     async def _capture(self, request: Any, response: Any) -> Any:
-        outcome = await self._ask(Command(CAPTURE, {"mark": request.mark}))
+        outcome = await self._capture_now({"mark": request.mark})
         response.handle = _handle(outcome)
         return answer(response, outcome)
 
     async def _capture_twin(self, request: Any, response: Any) -> Any:
         try:
-            outcome = await self._ask(Command(CAPTURE, {}))
+            outcome = await self._capture_now({})
         except RobocalError as error:  # deactivated meanwhile
             response.message = trigger_text(0, error.code, str(error))
             return response

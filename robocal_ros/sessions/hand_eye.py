@@ -17,7 +17,7 @@ from robocal_ros.core.errors import (
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import hand_eye_kind
 from robocal_ros.core.samples import JointSample
-from robocal_ros.core.streams import NotStillError
+from robocal_ros.core.streams import CLOCK_JUMP_NS, NotStillError
 from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import Commanded, Handler
 from robocal_ros.sessions.events import Command, Outcome
@@ -62,6 +62,7 @@ class HandEyeSession(Commanded):
         self._handle = 0
         self._why: RobocalError | None = None  # why the latest shot was of no use
         self._seen_ns = 0  # shots before it were looked at
+        self._leap_ns = 0  # longest step of the joints' stamps since the capture
         self._found: Command | None = None
         self.data: DataSet | None = None
 
@@ -82,10 +83,16 @@ class HandEyeSession(Commanded):
             self.received[sample.topic] += 1
             newest = self.newest_ns.get(sample.topic, 0)
             self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
-        elif self._take_joints(sample):
+        else:
+            self._add_joints(sample)
+        self._look()
+
+    def _add_joints(self, sample: JointSample) -> None:
+        before_ns = self.newest_joints_ns or sample.stamp_ns
+        if self._take_joints(sample):
             self._shots.clear()
             self._found = self._broken_off(Code.CONFLICT, "the clock jumped back: capture again")
-        self._look()
+        self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""
@@ -100,21 +107,35 @@ class HandEyeSession(Commanded):
             return
         for shot in self._shots.since(self.data.topic, max(capture.from_ns, self._seen_ns)):
             try:
+                shot.read()
                 reading = self.stream.standstill(shot.stamp_ns, self.config.standstill)
             except NotStillError as error:
                 self._why, self._seen_ns = error, shot.stamp_ns + 1
+                continue
+            except RobocalError as error:
+                self.refuse(shot.topic, error)
+                self._seen_ns = shot.stamp_ns + 1
                 continue
             if reading is None:
                 break
             arguments = {"handle": capture.handle, "shot_ns": shot.stamp_ns}
             self._found = Command(events.SAMPLE, arguments, self.newest_joints_ns)
             return
+        self._found = self._timed_out(capture, self.data.topic)
+
+    def _timed_out(self, capture: Capture, topic: str) -> Command | None:
         limit_s = self.config.capture_timeout_s
-        if self.newest_joints_ns - capture.from_ns > limit_s * 1e9:
-            words = f"no {self.data.topic} with the robot at standstill within {limit_s:g} s"
-            hint = "does the sensor publish it, is it triggered?"
-            code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
-            self._found = self._broken_off(code, f"{words}: {self._why or hint}")
+        waited_ns, limit_ns = self.newest_joints_ns - capture.from_ns, limit_s * 1e9
+        if waited_ns <= limit_ns:
+            return None
+        if waited_ns - self._leap_ns <= limit_ns and self._leap_ns > CLOCK_JUMP_NS:
+            leap_s = self._leap_ns * 1e-9
+            words = f"the joint states' clock jumped by {leap_s:.1f} s, or they paused for so long"
+            return self._broken_off(Code.CONFLICT, f"{words}: capture again")
+        words = f"no {topic} with the robot at standstill within {limit_s:g} s"
+        hint = "does the sensor publish it, is it triggered?"
+        code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
+        return self._broken_off(code, f"{words}: {self._why or hint}")
 
     def silent(self, seconds: float) -> Command | None:
         """The command by which a capture fails when no usable joint reading comes any more."""
@@ -172,11 +193,22 @@ class HandEyeSession(Commanded):
         mark = str(command.arguments.get("mark", ""))
         data.require_mark(mark)
         handle = int(command.arguments.get("handle", self._handle + 1))
-        self._handle, self._why, self._seen_ns = handle, None, 0
+        from_ns = int(command.arguments.get("from_ns", self._after_all_ns(data.topic)))
+        self._handle, self._why, self._seen_ns, self._leap_ns = handle, None, 0, 0
         words = f"waits for {data.topic} with the robot at standstill"
-        data.captures[handle] = Capture(handle, mark, command.stamp_ns or 0, words)
-        command = replace(command, arguments={**command.arguments, "handle": handle})
+        data.captures[handle] = Capture(handle, mark, from_ns, words)
+        told = {"handle": handle, "from_ns": from_ns}
+        command = replace(command, arguments={**command.arguments, **told})
         return Outcome(command, Code.ACCEPT, f"capture {handle} {words}")
+
+    def _after_all_ns(self, topic: str) -> int:
+        """The earliest stamp of a shot that is newer than all that was received.
+
+        No clock of ours is asked: those of robot and sensor need not be set to it. Who gives a
+        command for a call gives the messages first that came before it.
+        """
+        newest = self.newest_ns.get(topic)
+        return max(self.newest_joints_ns, 0 if newest is None else newest + 1)
 
     def _sample(self, command: Command, wall_ns: int) -> Outcome:
         data, at_ns = self._require_set(), int(command.arguments["shot_ns"])
@@ -188,7 +220,7 @@ class HandEyeSession(Commanded):
         _, q = self.stream.window(at_ns - int(rule.before_s * 1e9), reading.ready_ns)
         mean = q.mean(axis=0)
         handle, mark = capture.handle, capture.mark
-        words = data.put(HandEyeSample(handle, mark, at_ns, mean, shot.values))
+        words = data.put(HandEyeSample(handle, mark, at_ns, mean, shot.read()))
         return Outcome(command, Code.ACCEPT, f"capture {handle}: {words}", samples=1)
 
     def _break_off(self, command: Command, wall_ns: int) -> Outcome:
@@ -218,6 +250,7 @@ class HandEyeSession(Commanded):
 
     def _calibrate(self, command: Command, wall_ns: int) -> Outcome:
         data = self._require_set()
+        data.candidate = 0
         outcome = self._results.calibrate(data, command, wall_ns)
         data.candidate = outcome.calibration_id
         return outcome

@@ -1,5 +1,6 @@
 """hand_eye_node over DDS: a simulated robot brings a laser sensor before a sphere."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from command import robocal_json
 from geometry_msgs.msg import TransformStamped
-from hand_eye_driver import ARM, FRAME, TYPE, Recorded, joints, profile, sphere_set
+from hand_eye_driver import ARM, FRAME, TYPE, Recorded, Robot, joints, profile, sphere_set
 from hand_eye_live import NAME, SHOTS, LiveSensor, settings_of
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import (
@@ -190,6 +191,26 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
     assert call("accept") == (True, "1 ACCEPT revision 1: calibration 1 in force")
     assert call("rollback") == (True, "0 ACCEPT revision 2: nothing in force")
     assert call("remove") == (True, "0 ACCEPT capture 8 removed, 7 samples are left")
+
+
+def test_a_capture_comes_after_all_that_the_node_has_received(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    """A node that was busy has joint states and profiles in its queues: none of them is taken."""
+    assert sensor.start().success
+    robot, publish = sensor.robot, sensor.publish
+    backlog = Robot(publish)
+    backlog.q, backlog.now_ns = robot.q, robot.now_ns
+    backlog.rest(0.9, SHOTS[1][1])
+    time.sleep(0.3)  # all is in the queues of the node, which does not spin
+    assert sensor.ask_capture().success
+    robot.now_ns = backlog.now_ns
+    graph.spin_for(0.2)
+    assert sensor.of(1).state == HandEyeSample.WAITING
+    robot.rest(0.8, SHOTS[0][1])
+    assert sensor.ended(1).state == HandEyeSample.CAPTURED
+    stamp = sensor.of(1).stamp
+    assert stamp.sec * 10**9 + stamp.nanosec >= backlog.now_ns
 
 
 def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSensor) -> None:

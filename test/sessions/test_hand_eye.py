@@ -15,6 +15,7 @@ from hand_eye_driver import (
     Driver,
     Recorded,
     joints,
+    namespace,
     profile,
     sphere_set,
     sphere_shots_of,
@@ -29,13 +30,14 @@ from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.target_documents import target_document
 from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
 from robocal_ros.core.proposals import THERMAL, hand_eye_kind
-from robocal_ros.sessions import events
+from robocal_ros.sessions import events, hand_eye_shots
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import data_set_begun, data_set_of
 from robocal_ros.sessions.hand_eye_planning import judged_plan
 from robocal_ros.sessions.hand_eye_recorded import configuration, hand_eye_session_as_recorded
+from robocal_ros.sessions.hand_eye_shots import MOST_BYTES, MOST_KEPT, Shot, ShotLog
 from robocal_ros.sessions.records import digest
 from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, groove_shots, step_shots
@@ -260,6 +262,68 @@ def test_a_capture_takes_the_first_shot_at_standstill_not_one_from_before(histor
     driver.robot.rest(0.8, shot)
     (sample,) = driver.session.data.samples.values()
     assert sample.values == pytest.approx(np.float32(_seen(0)).astype(float), abs=0)
+
+
+def test_a_capture_takes_no_shot_that_was_received_before_it(history):
+    """Not even one that is stamped a little ahead of the joint states."""
+    driver = begun(history)
+    ahead_ns = driver.robot.now_ns + 400_000_000
+    driver.give(SHOTS[1][1](ahead_ns))
+    asked = driver.ask(events.CAPTURE)
+    assert asked.command.arguments["from_ns"] == ahead_ns + 1  # a replay obeys it
+    driver.robot.rest(1.2, SHOTS[0][1])
+    (sample,) = driver.session.data.samples.values()
+    assert sample.stamp_ns > ahead_ns
+    assert sample.values == pytest.approx(np.float32(_seen(0)).astype(float), abs=0)
+    again = driver.ask(events.CAPTURE)
+    newest = max(m.stamp_ns for m in driver.recorded if isinstance(m, Recorded))
+    assert again.command.arguments["from_ns"] == newest
+    # a replay in which messages of the topics come in another order keeps to the recorded bound
+    driver.ask(events.REMOVE, handle=2)
+    late = driver.ask(events.CAPTURE, from_ns=newest + 500_000_000)
+    driver.robot.rest(1.2, SHOTS[0][1])
+    assert driver.session.data.samples[3].stamp_ns >= late.command.arguments["from_ns"]
+
+
+def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkeypatch):
+    driver = begun(history)
+    read = []
+    points = hand_eye_shots.cloud_points
+    monkeypatch.setattr(hand_eye_shots, "cloud_points", lambda m: read.append(m) or points(m))
+    driver.robot.rest(1.0, SHOTS[0][1])
+    assert not read
+    driver.ask(events.CAPTURE)
+    driver.robot.rest(0.7, SHOTS[0][1])
+    assert 0 < len(read) < 7
+    log = ShotLog()
+    for i in range(3 * MOST_KEPT):
+        log.add(Shot("profile", i, FRAME, namespace({"data": b"x" * 1_000_000})), FRAME, 0)
+    kept = list(log.since("profile", 0))
+    assert sum(shot.size for shot in kept) <= MOST_BYTES
+    assert kept[-1].stamp_ns == 3 * MOST_KEPT - 1
+    assert len(kept) == MOST_BYTES // 1_000_000
+
+
+def test_a_clock_that_jumps_ahead_is_told_as_that(history):
+    driver = begun(history)
+    driver.ask(events.CAPTURE)
+    driver.robot.now_ns += 3600 * 10**9
+    driver.robot.rest(0.2)
+    failed = last_capture(driver)
+    assert failed.code is Code.CONFLICT
+    assert failed.reason.startswith("the joint states' clock jumped by 3600.0 s")
+    driver.ask(events.CAPTURE)
+    driver.robot.rest(0.9, SHOTS[0][1])
+    assert last_capture(driver).code is Code.ACCEPT
+
+
+def test_a_calibration_that_fails_leaves_no_earlier_candidate(history):
+    driver = driver_of(history)
+    driver.sphere(8)
+    first = driver.ask(events.CALIBRATE)
+    assert driver.session.data.candidate == first.calibration_id > 0
+    assert not driver.ask(events.CALIBRATE, handles=[99]).done
+    assert driver.session.data.candidate == 0
 
 
 def _seen(number):
