@@ -23,6 +23,8 @@ from robocal_ros.sessions.commanded import Commanded, Handler
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import (
+    MOST_CAPTURES,
+    MOST_HANDLE,
     Capture,
     DataSet,
     HandEyeSample,
@@ -36,7 +38,6 @@ from robocal_ros.sessions.hand_eye_solving import require_known
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
 
-MOST_CAPTURES = 500
 _NO_SET = "no data set is open: call start, or load one"
 
 
@@ -190,6 +191,8 @@ class HandEyeSession(Commanded):
             raise ConflictError(f"no joint states yet: {told}")
         if len(data.captures) >= MOST_CAPTURES:
             raise LimitError(f"{MOST_CAPTURES} captures: remove some, or start a new data set")
+        if self._handle >= MOST_HANDLE:
+            raise LimitError(f"handle {self._handle} was the last: begin a new session")
         mark = str(command.arguments.get("mark", ""))
         data.require_mark(mark)
         handle = int(command.arguments.get("handle", self._handle + 1))

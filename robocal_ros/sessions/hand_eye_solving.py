@@ -49,6 +49,8 @@ def require_known(data: DataSet, method: str) -> None:
     ):
         if value not in known:
             raise InputError(f"{what} '{value}' is none of {', '.join(known)}")
+    if target_of(data.target) is None and data.kind not in WITHOUT_FILE:
+        raise InputError(f"nothing is known of the {data.kind}: name the file that describes it")
     if data.mount == TO_HAND and data.kind != "camera":
         raise InputError(
             f"a {data.kind} is seen by a sensor on the flange: one that stands still is calibrated "

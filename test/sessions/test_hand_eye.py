@@ -445,7 +445,7 @@ def test_a_data_set_that_nothing_answers_for_is_refused(history, words):
 def test_a_mark_must_be_one_of_the_target(history):
     driver = begun(history)
     assert "none of the target's: none" in driver.ask(events.CAPTURE, mark="near").message
-    stairs = {"kind": "step", "corners": {"near": [[0, 0, 0]], "far": [[0, 0, 0]]}}
+    stairs = target_document("step", STEP)
     assert driver.ask(events.START, **(SPHERE | {"target": stairs})).done
     assert driver.ask(events.CAPTURE).status is Code.BAD_INPUT
     assert driver.ask(events.CAPTURE, mark="far").done
@@ -540,12 +540,66 @@ def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):
         assert digest(fresh.ask(events.CALIBRATE).document) != digest(first.document)
 
 
+POINTS = [[1e-3 * i, 0.2] for i in range(12)]
+ROW = {"handle": 1, "mark": "", "stamp_ns": 1, "q": [0.0] * 6, "values": POINTS}
+
+
+def rows(count: int, points: int = 12) -> list[dict]:
+    return [ROW | {"handle": i + 1, "values": POINTS * (points // 12)} for i in range(count)]
+
+
+BAD_SETS = {
+    "handle 0": {"samples": [ROW | {"handle": 0}]},
+    "handle -1": {"samples": [ROW | {"handle": -1}]},
+    "handle 4294967296": {"samples": [ROW | {"handle": 2**32}]},
+    "handle 1.5": {"samples": [ROW | {"handle": 1.5}]},
+    "two samples of handle 1": {"samples": [ROW, ROW]},
+    "mark 'near' is none": {"samples": [ROW | {"mark": "near"}]},
+    "501 samples": {"samples": rows(501)},
+    "points in 21 samples": {"samples": rows(21, 12_000)},
+    "no time stamp": {"samples": [ROW | {"stamp_ns": 0}]},
+    "profile of sample 1 has 3 points": {"samples": [ROW | {"values": POINTS[:3]}]},
+    "is no pose": {"target": {"kind": "camera"}, "samples": [ROW | {"values": [[0.0] * 7]}]},
+    "target cannot be read": {"target": {"kind": "sphere", "radius_m": -1.0}},
+    "nothing is known of the sphere": {"target": {"kind": "sphere"}},
+    "cannot be read": {"target": {"kind": "cone"}},
+}
+
+
+@pytest.mark.parametrize("words", list(BAD_SETS))
+def test_a_file_that_is_refused_replaces_nothing(history, words):
+    driver = begun(history)
+    driver.ask(events.CAPTURE)
+    driver.robot.rest(0.7, SHOTS[0][1])
+    before = driver.session.data
+    refused = driver.ask(events.LOAD, path="x", set=SPHERE | {"samples": [ROW]} | BAD_SETS[words])
+    assert not refused.done
+    assert words in refused.message
+    assert driver.session.data is before
+    assert driver.ask(events.CAPTURE).command.arguments["handle"] == 2
+
+
+def test_handles_end_where_a_message_can_no_longer_carry_them(history):
+    driver = begun(history)
+    full = SPHERE | {"samples": [ROW | {"handle": 2**32 - 1}]}
+    assert driver.ask(events.LOAD, path="x", set=full).done
+    refused = driver.ask(events.CAPTURE)
+    assert refused.status is Code.LIMIT_EXCEEDED
+    assert "4294967295" in refused.message
+
+
+def test_a_data_set_holds_so_many_captures_and_no_more(history):
+    driver = begun(history)
+    assert driver.ask(events.LOAD, path="x", set=SPHERE | {"samples": rows(499)}).done
+    assert driver.ask(events.CAPTURE).done
+    driver.robot.rest(0.7, SHOTS[0][1])
+    refused = driver.ask(events.CAPTURE)
+    assert refused.status is Code.LIMIT_EXCEEDED
+    assert refused.message.startswith("500 captures")
+
+
 def test_a_data_set_that_is_none_is_refused():
-    whole = SPHERE | {
-        "samples": [
-            {"handle": 1, "mark": "", "stamp_ns": 1, "q": [0.0] * 6, "values": [[0.0, 0.2]] * 10}
-        ]
-    }
+    whole = SPHERE | {"samples": [ROW]}
     assert len(data_set_of(json.loads(json.dumps(whole)), ARM).samples) == 1
     (sample,) = whole["samples"]
     for broken in (
