@@ -4,6 +4,8 @@ docs/hand_eye_node.md.
 """
 
 import time
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import hand_eye_kind
 from robocal_ros.nodes import qos
@@ -93,7 +96,14 @@ class HandEyeNode(HouseNode):
         self._outputs.status(self._session, None)
 
     def deactivate(self) -> None:
-        """End the session; calls that wait are answered."""
+        """End the session; the capture that waits fails, and calls that wait are answered."""
+        session = self._session
+        if session is not None:
+            words = "the node was deactivated: capture again"
+            if (command := session.broken_off(Code.CONFLICT, words)) is not None:
+                self._desk.ask(command)
+            session.data = None
+            self._publish("the end", lambda: self._outputs.status(session, self._last))
         self._session = None
         self._frames.close()
         self._desk.close()
@@ -158,7 +168,7 @@ class HandEyeNode(HouseNode):
         self._frames.look()
         for outcome in self._session.poll():
             self._show(outcome)
-        self._show_in_force()
+        self._publish("a decision", self._show_in_force)
 
     # ---- outputs --------------------------------------------------------------------------------
 
@@ -172,14 +182,19 @@ class HandEyeNode(HouseNode):
         if session is None:
             return
         self._last = outcome
+        self._publish(name, lambda: self._outputs.event(outcome.command, outcome))
+        if name == CALIBRATE:
+            self._publish(name, lambda: self._show_quality(outcome))
+        self._publish(name, self._show_in_force)
+        self._publish(name, lambda: self._outputs.status(session, outcome))
+
+    def _publish(self, name: str, publish: Callable[[], None]) -> None:
+        """What is done stays done, and is shown as far as it can be."""
         try:
-            self._outputs.event(outcome.command, outcome)
-            if name == CALIBRATE:
-                self._show_quality(outcome)
-            self._show_in_force()
-        except (RobocalError, ValueError) as error:  # what is done stays done
-            self.get_logger().error(f"{name} was done but not published: {error}")
-        self._outputs.status(session, outcome)
+            publish()
+        except Exception as error:
+            told = str(error) if isinstance(error, RobocalError) else traceback.format_exc()
+            self.get_logger().error(f"{name} was done but not published: {told}")
 
     def _show_quality(self, outcome: Outcome) -> None:
         history, number = self._history, outcome.calibration_id

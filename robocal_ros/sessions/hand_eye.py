@@ -92,7 +92,7 @@ class HandEyeSession(Commanded):
         before_ns = self.newest_joints_ns or sample.stamp_ns
         if self._take_joints(sample):
             self._shots.clear()
-            self._found = self._broken_off(Code.CONFLICT, "the clock jumped back: capture again")
+            self._found = self.broken_off(Code.CONFLICT, "the clock jumped back: capture again")
         self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
 
     def refuse(self, kind: str, error: RobocalError) -> None:
@@ -132,11 +132,11 @@ class HandEyeSession(Commanded):
         if waited_ns - self._leap_ns <= limit_ns and self._leap_ns > CLOCK_JUMP_NS:
             leap_s = self._leap_ns * 1e-9
             words = f"the joint states' clock jumped by {leap_s:.1f} s, or they paused for so long"
-            return self._broken_off(Code.CONFLICT, f"{words}: capture again")
+            return self.broken_off(Code.CONFLICT, f"{words}: capture again")
         words = f"no {topic} with the robot at standstill within {limit_s:g} s"
         hint = "does the sensor publish it, is it triggered?"
         code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
-        return self._broken_off(code, f"{words}: {self._why or hint}")
+        return self.broken_off(code, f"{words}: {self._why or hint}")
 
     def silent(self, seconds: float) -> Command | None:
         """The command by which a capture fails when no usable joint reading comes any more."""
@@ -144,9 +144,10 @@ class HandEyeSession(Commanded):
             return None
         told = self.ignored.words() or "check the robot's driver"
         words = f"joint states are silent for {seconds:.1f} s: {told}"
-        return self._broken_off(Code.TOO_FEW_SAMPLES, words)
+        return self.broken_off(Code.TOO_FEW_SAMPLES, words)
 
-    def _broken_off(self, code: Code, reason: str) -> Command | None:
+    def broken_off(self, code: Code, reason: str) -> Command | None:
+        """The command by which the capture that waits fails; None when none waits."""
         capture = None if self.data is None else self.data.waiting
         if capture is None:
             return None
@@ -200,8 +201,8 @@ class HandEyeSession(Commanded):
         self._handle, self._why, self._seen_ns, self._leap_ns = handle, None, 0, 0
         words = f"waits for {data.topic} with the robot at standstill"
         data.captures[handle] = Capture(handle, mark, from_ns, words)
-        told = {"handle": handle, "from_ns": from_ns}
-        command = replace(command, arguments={**command.arguments, **told})
+        bound = {"handle": handle, "from_ns": from_ns}
+        command = replace(command, arguments={**command.arguments, **bound})
         return Outcome(command, Code.ACCEPT, f"capture {handle} {words}")
 
     def _after_all_ns(self, topic: str) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from command import robocal_json
 from geometry_msgs.msg import TransformStamped
-from hand_eye_driver import ARM, FRAME, TYPE, Recorded, Robot, joints, profile, sphere_set
+from hand_eye_driver import ARM, FRAME, RADIUS_M, TYPE, Recorded, Robot, joints, profile, sphere_set
 from hand_eye_live import NAME, SHOTS, LiveSensor, settings_of
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import (
@@ -24,12 +24,15 @@ from tf2_msgs.msg import TFMessage
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.targets import LineTarget
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.diagnostics import ERROR
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.nodes.tool_messages import pose_message
+from robocal_ros.sessions.hand_eye_data import Capture
 from robocal_ros.storage.bags import BagWriter, read_bag
+from robocal_ros.storage.hand_eye_targets import write_target
 
 
 def matrix(transform: Any) -> np.ndarray:
@@ -313,6 +316,59 @@ def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
         assert node.state == "unconfigured"
 
 
+def test_a_status_that_cannot_be_carried_takes_no_answer_from_its_caller(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    assert sensor.start().success
+    sensor.node._session.data.captures[7] = Capture(-7, "", 0, "", Code.ACCEPT)  # no uint32
+    assert sensor.ask_capture().handle == 1
+    missing = graph.call(RemoveHandEye, f"{NAME}/remove", handle=99)
+    assert (missing.success, missing.message) == (False, "no capture 99; there are 7, 1")
+    gone = graph.call(RemoveHandEye, f"{NAME}/remove", handle=1)
+    assert gone.message == "capture 1 removed, 0 samples are left"
+    assert sensor.calibrate().status == Code.TOO_FEW_SAMPLES
+    assert sensor.ask_capture().handle == 2
+    assert graph.call(RemoveHandEye, f"{NAME}/remove", handle=7).success
+    graph.spin_until(lambda: [s.handle for s in sensor.status[-1].samples] == [2], "the status")
+
+
+def test_the_desk_answers_each_caller_though_nothing_can_be_shown(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    """Whoever uses it: an outcome that cannot be published is logged, its caller is answered."""
+    assert sensor.start().success
+    shown = []
+
+    def show(outcome: Any) -> None:
+        shown.append(outcome)
+        HandEyeStatus(candidate_id=-1)
+
+    sensor.node._desk._show = show
+    assert sensor.ask_capture().handle == 1
+    assert sensor.calibrate().status == Code.TOO_FEW_SAMPLES
+    assert graph.call(RemoveHandEye, f"{NAME}/remove", handle=1).success
+    assert [outcome.command.name for outcome in shown] == ["capture", "calibrate", "remove"]
+
+
+def test_a_configured_file_counts_for_the_target_that_it_describes(
+    graph: Any, sensor: LiveSensor, tmp_path: Path
+) -> None:
+    assert sensor.start(target=HandEyeStatus.LINE).success  # of the line nothing is known
+    assert sensor.node._session.data.target == {"kind": "line"}
+    assert sensor.start(target=HandEyeStatus.CAMERA).success
+    assert sensor.start(target=HandEyeStatus.CAMERA, mount=HandEyeStatus.FIXED).success
+    refused = sensor.start(target=HandEyeStatus.STEP)
+    assert (refused.success, refused.status) == (False, Code.BAD_INPUT)
+    assert "describes a sphere: name the file that describes the step" in refused.message
+    line = tmp_path / "line.yaml"
+    write_target(line, LineTarget(np.array([0.7, 0.0, 0.1]), np.array([1.0, 0.0, 0.0])))
+    assert not sensor.start(target_file=str(line)).success  # named, so it is meant
+    assert sensor.start(target=HandEyeStatus.LINE, target_file=str(line)).success
+    assert sensor.node._session.data.target["point_base"] == [0.7, 0.0, 0.1]
+    assert sensor.start().success
+    assert sensor.node._session.data.target["radius_m"] == RADIUS_M
+
+
 def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> None:
     sensor = LiveSensor(graph, tmp_path, capture_timeout_s=1.0)
     assert sensor.start().success
@@ -333,7 +389,13 @@ def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> Non
 def test_nothing_is_left_of_an_earlier_session(graph: Any, sensor: LiveSensor) -> None:
     assert sensor.start().success
     assert sensor.ask_capture().success
+    events = graph.collect(SessionEvent, f"{NAME}/session_events", EVENTS)
     sensor.node.trigger_deactivate()
+    graph.spin_until(lambda: sensor.status[-1].state == HandEyeStatus.IDLE, "it is idle")
+    told = [s for status in sensor.status for s in status.samples if s.state == s.FAILED]
+    assert [(s.handle, s.status) for s in told] == [(1, Code.CONFLICT)]
+    assert sensor.status[-1].last_message.startswith("capture 1: the node was deactivated")
+    graph.spin_until(lambda: events and events[-1].command == "break_off", "the event")
     inactive = sensor.ask_capture()
     assert (inactive.success, inactive.status) == (False, Code.CONFLICT)
     sensor.node.trigger_activate()
