@@ -300,7 +300,9 @@ def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
     graph: Any, sensor: LiveSensor
 ) -> None:
     """The third profile is one of another pose."""
+    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", qos.LATCHED)
     assert sensor.start().success
+    assert sensor.status[-1].header.frame_id == "tool0"
     for number, (q, shot) in enumerate(SHOTS[:10], 1):
         sensor.robot.move(q, 0.2)
         assert sensor.capture(SHOTS[11][1] if number == 3 else shot).handle == number
@@ -308,6 +310,23 @@ def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
     assert result.candidate_id, result.message
     assert [told.partition(":")[0] for told in result.rejected] == ["3"]
     assert result.samples == 9
+    graph.spin_until(lambda: quality, "the verdict")
+    assert list(quality[-1].rejected) == ["3"]
+    few = sensor.calibrate(handles=[1, 2, 3, 4])
+    graph.spin_until(lambda: quality[-1].code == few.status, "why there is none")
+    assert few.status == Code.RANK_DEFICIENT, few.message
+    assert list(quality[-1].unobservable) == list(few.unobservable) != []
+
+
+def test_settings_reach_the_session(graph: Any, tmp_path: Path) -> None:
+    sensor = LiveSensor(graph, tmp_path, robot_sigma_mm=0.04, robot_sigma_deg=0.01, limit_mm=0.7)
+    config = sensor.node._session.config
+    assert config.robot_sigma_m == pytest.approx(4e-5)
+    assert config.robot_sigma_rad == pytest.approx(np.radians(0.01))
+    assert config.limit_m == pytest.approx(7e-4)
+    assert sensor.start(target=HandEyeStatus.CAMERA, mount=HandEyeStatus.FIXED).success
+    graph.spin_until(lambda: sensor.status[-1].mount == HandEyeStatus.FIXED, "the status")
+    assert sensor.status[-1].header.frame_id == "base"
 
 
 def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:

@@ -304,6 +304,21 @@ def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkey
     assert len(kept) == MOST_BYTES // 1_000_000
 
 
+def test_the_given_error_of_the_robot_is_the_one_that_is_used(history):
+    """The error to expect is that of the robot's poses, four times as large, and the profiles'."""
+    told = {}
+    for sigma in (5e-5, 2e-4):
+        driver = driver_of(history, robot_sigma_m=sigma, robot_sigma_rad=1e-5)
+        driver.sphere(10)
+        told[sigma] = driver.ask(events.CALIBRATE).document["working_error_mm"]
+    assert 2.0 < told[2e-4] / told[5e-5] <= 4.0
+
+
+def test_without_a_candidate_the_twin_says_what_gives_one(history):
+    told = driver_of(history).ask(events.ACCEPT, choose="only", by="me")
+    assert told.message == "no fresh candidate is pending: calibrate first"
+
+
 def test_a_clock_that_jumps_ahead_is_told_as_that(history):
     driver = begun(history)
     driver.ask(events.CAPTURE)
