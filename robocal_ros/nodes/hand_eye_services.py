@@ -24,7 +24,7 @@ from robocal_ros.nodes.hand_eye_plan import HandEyePlan
 from robocal_ros.nodes.hand_eye_settings import start_arguments
 from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_data import TOPIC_OF
+from robocal_ros.sessions.hand_eye_data import MOST_POINTS, TOPIC_OF
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 Ask = Callable[[Command], Awaitable[Outcome]]
@@ -160,6 +160,9 @@ class HandEyeServices:
         response.success, response.status = True, int(Code.ACCEPT)
         response.samples = len(document["samples"])
         response.message = f"{response.samples} samples saved in {path}"
+        points = sum(len(row["values"]) for row in document["samples"])
+        if points > MOST_POINTS:
+            response.message += f"; {points} points are too many to load (at most {MOST_POINTS})"
         return response
 
 
