@@ -102,8 +102,7 @@ class HandEyeNode(HouseNode):
             words = "the node was deactivated: capture again"
             if (command := session.broken_off(Code.CONFLICT, words)) is not None:
                 self._desk.ask(command)
-            session.data = None
-            self._publish("the end", lambda: self._outputs.status(session, self._last))
+            self._publish("the end", lambda: self._outputs.status(session, self._last, ended=True))
         self._session = None
         self._frames.close()
         self._desk.close()

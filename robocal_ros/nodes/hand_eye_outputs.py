@@ -25,7 +25,7 @@ TARGETS = {
     HandEyeStatus.CAMERA: "camera",
 }
 MOUNTS = {HandEyeStatus.ON_FLANGE: IN_HAND, HandEyeStatus.FIXED: TO_HAND}
-NUMBER_OF = {name: number for number, name in (TARGETS | {}).items()}
+NUMBER_OF = {name: number for number, name in TARGETS.items()}
 MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
 
 
@@ -58,9 +58,15 @@ class HandEyeOutputs:
             self._tf_message = TFMessage
             self._tf = add(TFMessage, "/tf_static", qos.LATCHED)
 
-    def status(self, session: HandEyeSession, last: Outcome | None) -> None:
-        """Say how far the data set is, and what came of the last command."""
-        self._status.publish(status_message(session, last))
+    def status(self, session: HandEyeSession, last: Outcome | None, *, ended: bool = False) -> None:
+        """Say how far the data set is, and what came of the last command.
+
+        ``ended``: the session is over; its captures are told once more, as they ended.
+        """
+        message = status_message(session, last)
+        if ended:
+            message.state = HandEyeStatus.IDLE
+        self._status.publish(message)
 
     def transform(self, head: Head, stamp_ns: int) -> None:
         """Put what is in force onto tf; nothing in force: late subscribers get no transform."""

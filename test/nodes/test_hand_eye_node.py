@@ -2,6 +2,7 @@
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,10 @@ from robocal_ros.core.hand_eye.targets import LineTarget
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.diagnostics import ERROR
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.nodes.tool_messages import pose_message
+from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_data import Capture
 from robocal_ros.storage.bags import BagWriter, read_bag
 from robocal_ros.storage.hand_eye_targets import write_target
@@ -312,10 +315,18 @@ def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
     assert result.samples == 9
     graph.spin_until(lambda: quality, "the verdict")
     assert list(quality[-1].rejected) == ["3"]
-    few = sensor.calibrate(handles=[1, 2, 3, 4])
-    graph.spin_until(lambda: quality[-1].code == few.status, "why there is none")
-    assert few.status == Code.RANK_DEFICIENT, few.message
-    assert list(quality[-1].unobservable) == list(few.unobservable) != []
+
+
+def test_the_verdict_names_the_directions_that_stay_open() -> None:
+    """Without a candidate there are no figures, but the reason and the directions."""
+    published: list[Any] = []
+    add: Any = lambda *_: SimpleNamespace(publish=published.append)  # noqa: E731
+    open_ways = {"unobservable": ["along the light", "about z"]}
+    refused = Outcome(Command("calibrate"), Code.RANK_DEFICIENT, "not determined", open_ways)
+    HandEyeOutputs(add, "ur10", "K7").quality(refused, "tool0", None)
+    assert list(published[0].unobservable) == open_ways["unobservable"]
+    assert (published[0].code, published[0].accept) == (Code.RANK_DEFICIENT, False)
+    assert published[0].reason == "not determined"
 
 
 def test_settings_reach_the_session(graph: Any, tmp_path: Path) -> None:
@@ -383,7 +394,7 @@ def test_a_configured_file_counts_for_the_target_that_it_describes(
     write_target(line, LineTarget(np.array([0.7, 0.0, 0.1]), np.array([1.0, 0.0, 0.0])))
     assert not sensor.start(target_file=str(line)).success  # named, so it is meant
     assert sensor.start(target=HandEyeStatus.LINE, target_file=str(line)).success
-    assert sensor.node._session.data.target["point_base"] == [0.7, 0.0, 0.1]
+    assert sensor.node._session.data.target["point_base"] == pytest.approx([0.7, 0.0, 0.1])
     assert sensor.start().success
     assert sensor.node._session.data.target["radius_m"] == RADIUS_M
 
@@ -411,8 +422,9 @@ def test_nothing_is_left_of_an_earlier_session(graph: Any, sensor: LiveSensor) -
     events = graph.collect(SessionEvent, f"{NAME}/session_events", EVENTS)
     sensor.node.trigger_deactivate()
     graph.spin_until(lambda: sensor.status[-1].state == HandEyeStatus.IDLE, "it is idle")
-    told = [s for status in sensor.status for s in status.samples if s.state == s.FAILED]
-    assert [(s.handle, s.status) for s in told] == [(1, Code.CONFLICT)]
+    (failed,) = sensor.status[-1].samples
+    assert (failed.handle, failed.state) == (1, HandEyeSample.FAILED)
+    assert failed.status == Code.CONFLICT
     assert sensor.status[-1].last_message.startswith("capture 1: the node was deactivated")
     graph.spin_until(lambda: events and events[-1].command == "break_off", "the event")
     inactive = sensor.ask_capture()
