@@ -17,7 +17,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import hand_eye_kind
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.decision_services import DecisionServices
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -27,7 +27,6 @@ from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
-from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
 from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
@@ -41,7 +40,7 @@ from robocal_ros.storage.robots import load_robot
 COMMAND_S = 1.0
 WATCH_S = 0.1
 INPUTS = {
-    JOINTS: (JointState, STREAM),
+    JOINTS: (JointState, qos.STREAM),
     PROFILE: (PointCloud2, qos.SENSOR),
     TARGET_POSE: (PoseStamped, qos.SENSOR),
 }

@@ -641,6 +641,14 @@ def test_a_session_begins_where_a_recorded_one_did(history, tmp_path):
         assert again.in_force.model == driver.session.in_force.model
 
 
+@pytest.mark.parametrize("name", ["config", "model", "sensor"])
+def test_a_recording_that_lacks_a_setting_is_refused(history, name):
+    configured = configuration(driver_of(history).session, {})
+    left = {key: value for key, value in configured.arguments.items() if key != name}
+    with pytest.raises(InputError, match=f"lacks {name}"):
+        hand_eye_session_as_recorded(ARM, history, Command(configured.name, left), "test")
+
+
 def test_what_is_decided_elsewhere_is_taken_over(history):
     driver = driver_of(history)
     driver.sphere(10)
