@@ -13,6 +13,7 @@ from hand_eye_driver import ARM, FRAME, RADIUS_M, TYPE, Recorded, Robot, joints,
 from hand_eye_live import NAME, SHOTS, LiveSensor, settings_of
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import (
+    CaptureHandEye,
     CheckHandEyePlan,
     Decide,
     HandEyeFile,
@@ -204,18 +205,22 @@ def test_a_capture_comes_after_all_that_the_node_has_received(
 ) -> None:
     """A node that was busy has joint states and profiles in its queues: none of them is taken."""
     assert sensor.start().success
-    robot, publish = sensor.robot, sensor.publish
-    backlog = Robot(publish)
+    assert sensor.ask_capture().success
+    assert graph.call(RemoveHandEye, f"{NAME}/remove", handle=1).success
+    robot = sensor.robot
+    backlog = Robot(sensor.publish)
     backlog.q, backlog.now_ns = robot.q, robot.now_ns
     backlog.rest(0.9, SHOTS[1][1])
-    time.sleep(0.3)  # all is in the queues of the node, which does not spin
-    assert sensor.ask_capture().success
+    asked = graph._clients[f"{NAME}/capture"].call_async(CaptureHandEye.Request())
+    time.sleep(0.3)  # all is in the queues of the node, which does not spin, and the call too
+    graph.spin_until(asked.done, "the answer")
+    assert asked.result().handle == 2
     robot.now_ns = backlog.now_ns
     graph.spin_for(0.2)
-    assert sensor.of(1).state == HandEyeSample.WAITING
+    assert sensor.of(2).state == HandEyeSample.WAITING
     robot.rest(0.8, SHOTS[0][1])
-    assert sensor.ended(1).state == HandEyeSample.CAPTURED
-    stamp = sensor.of(1).stamp
+    assert sensor.ended(2).state == HandEyeSample.CAPTURED
+    stamp = sensor.of(2).stamp
     assert stamp.sec * 10**9 + stamp.nanosec >= backlog.now_ns
 
 
