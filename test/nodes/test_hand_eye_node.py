@@ -38,6 +38,8 @@ from robocal_ros.sessions.hand_eye_data import Capture
 from robocal_ros.storage.bags import BagWriter, read_bag
 from robocal_ros.storage.hand_eye_targets import write_target
 
+NO_TEXT = "\ud800"  # cannot be carried: it has no UTF-8
+
 
 def matrix(transform: Any) -> np.ndarray:
     t, r = transform.translation, transform.rotation
@@ -355,7 +357,7 @@ def test_a_status_that_cannot_be_carried_takes_no_answer_from_its_caller(
     graph: Any, sensor: LiveSensor
 ) -> None:
     assert sensor.start().success
-    sensor.node._session.data.captures[7] = Capture(-7, "", 0, "", Code.ACCEPT)  # no uint32
+    sensor.node._session.data.captures[7] = Capture(7, "", 0, NO_TEXT, Code.ACCEPT)
     assert sensor.ask_capture().handle == 1
     missing = graph.call(RemoveHandEye, f"{NAME}/remove", handle=99)
     assert (missing.success, missing.message) == (False, "no capture 99; there are 7, 1")
@@ -376,7 +378,7 @@ def test_the_desk_answers_each_caller_though_nothing_can_be_shown(
 
     def show(outcome: Any) -> None:
         shown.append(outcome)
-        HandEyeStatus(candidate_id=-1)
+        sensor.node._outputs._status.publish(HandEyeStatus(last_message=NO_TEXT))
 
     sensor.node._desk._show = show
     assert sensor.ask_capture().handle == 1
