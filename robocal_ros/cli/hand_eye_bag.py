@@ -65,7 +65,7 @@ def _saved(path: Path, arm: SerialArm) -> HandEyeData:
     names = tuple(str(sample.handle) for sample in samples)
     return HandEyeData(
         names,
-        np.array([sample.T_base_flange for sample in samples]),
+        arm.fk(np.array([sample.q for sample in samples])),
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
         _marks([sample.mark for sample in samples]),
     )
@@ -94,7 +94,7 @@ def _recorded(recording: "Recording", arm: SerialArm) -> BagShots:
     return HandEyeData(
         tuple(one.name for one in kept),
         np.array([arm.fk(one.q) for one in kept]),
-        [Profile(one.shot.values, one.name) for one in kept],
+        [Profile(one.shot.read(), one.name) for one in kept],
         _marks([one.mark for one in kept]),
     ), rejected
 

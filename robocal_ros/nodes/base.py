@@ -23,6 +23,8 @@ from robocal_ros.nodes.diagnostics import ERROR, Diagnostics, Health
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.parameters import ParameterTable, Setting
 
+NO_SERIAL = "unset"  # the history's name where none is set
+POLL_S = 0.5  # between two looks at what others decided in the history
 AUTOSTART = Setting("autostart", True, "Configure and activate at the start")
 SERIAL = Setting("serial", "", "Serial number of the robot; its history is kept under this name")
 

@@ -1,6 +1,7 @@
 """Commands of callers, carried out by a session in their turn; each caller gets the outcome."""
 
 import time
+import traceback
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -69,10 +70,18 @@ class CommandDesk:
                 continue
             if not outcomes:
                 return
+            asked = self._asked.popleft()  # before it is shown: that may give a command too
             for outcome in outcomes:
-                self._show(outcome)
-            self._asked.popleft().set_result(outcomes[-1])
+                self._show_safely(outcome)
+            asked.set_result(outcomes[-1])
         self._deadline.cancel()
+
+    def _show_safely(self, outcome: Outcome) -> None:
+        """A defect in showing what was done must not take the answer from its caller."""
+        try:
+            self._show(outcome)
+        except Exception:
+            self._node.get_logger().error(f"not shown:\n{traceback.format_exc()}")
 
     def close(self) -> None:
         """End the session; calls that wait are answered."""

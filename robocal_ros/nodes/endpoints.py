@@ -13,6 +13,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
 from robocal_ros.core.codes import Code
@@ -21,6 +22,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.sessions.ignored import MOST_REASONS, kind_of
 
 LOG_EVERY_S = 5.0
+MOST_WAITING = 10_000  # messages of an input that are taken at once
 
 
 class NotActiveError(RobocalError):
@@ -65,6 +67,7 @@ class EndpointNode(LifecycleNode):
         self._log_limit = LogLimit()
         self.async_group = ReentrantCallbackGroup()
         self._release: list[Callable[[], object]] = []
+        self._takers: list[tuple[Subscription, Callable[[Any], None]]] = []
 
     @property
     def state(self) -> str:
@@ -109,7 +112,21 @@ class EndpointNode(LifecycleNode):
             event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             qos_overriding_options=qos.overridable(),
         )
+        self._takers.append((subscription, receive))
         self._release.append(lambda: self.destroy_subscription(subscription))
+
+    def take_waiting(self) -> None:
+        """Take now what the inputs have received, in place of one message of each in its turn.
+
+        So a call comes after all that was there before it, however long the node was busy.
+        """
+        for subscription, receive in self._takers:
+            for _ in range(MOST_WAITING):
+                with subscription.handle:
+                    taken = subscription.handle.take_message(subscription.msg_type, False)
+                if taken is None:
+                    break
+                receive(taken[0])
 
     def add_output(self, kind: type, topic: str, profile: QoSProfile) -> Any:
         """Return a publisher that is silent while the node is inactive, until cleanup."""
@@ -165,6 +182,7 @@ class EndpointNode(LifecycleNode):
 
     def release_endpoints(self) -> None:
         """Take down all of them, the last one first."""
+        self._takers.clear()
         while self._release:
             self._release.pop()()
 

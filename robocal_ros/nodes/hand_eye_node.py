@@ -4,7 +4,8 @@ docs/hand_eye_node.md.
 """
 
 import time
-from collections.abc import Mapping
+import traceback
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros import __version__
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import Head, hand_eye_kind
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.decision_services import DecisionServices
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -26,7 +28,6 @@ from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
-from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
 from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
@@ -40,7 +41,7 @@ from robocal_ros.storage.robots import load_robot
 COMMAND_S = 1.0
 WATCH_S = 0.1
 INPUTS = {
-    JOINTS: (JointState, STREAM),
+    JOINTS: (JointState, qos.STREAM),
     PROFILE: (PointCloud2, qos.SENSOR),
     TARGET_POSE: (PoseStamped, qos.SENSOR),
 }
@@ -96,7 +97,13 @@ class HandEyeNode(HouseNode):
         self._outputs.status(self._session, None)
 
     def deactivate(self) -> None:
-        """End the session; calls that wait are answered."""
+        """End the session; the capture that waits fails, and calls that wait are answered."""
+        session = self._session
+        if session is not None:
+            words = "the node was deactivated: capture again"
+            if (command := session.broken_off(Code.CONFLICT, words)) is not None:
+                self._desk.ask(command)
+            self._publish("the end", lambda: self._outputs.status(session, self._last, ended=True))
         self._session = None
         self._frames.close()
         self._desk.close()
@@ -161,7 +168,7 @@ class HandEyeNode(HouseNode):
         self._frames.look()
         for outcome in self._session.poll():
             self._show(outcome)
-        self._show_in_force()
+        self._publish("a decision", self._show_in_force)
 
     # ---- outputs --------------------------------------------------------------------------------
 
@@ -175,14 +182,19 @@ class HandEyeNode(HouseNode):
         if session is None:
             return
         self._last = outcome
+        self._publish(name, lambda: self._outputs.event(outcome.command, outcome))
+        if name == CALIBRATE:
+            self._publish(name, lambda: self._show_quality(outcome))
+        self._publish(name, self._show_in_force)
+        self._publish(name, lambda: self._outputs.status(session, outcome))
+
+    def _publish(self, name: str, publish: Callable[[], None]) -> None:
+        """What is done stays done, and is shown as far as it can be."""
         try:
-            self._outputs.event(outcome.command, outcome)
-            if name == CALIBRATE:
-                self._show_quality(outcome)
-            self._show_in_force()
-        except (RobocalError, ValueError) as error:  # what is done stays done
-            self.get_logger().error(f"{name} was done but not published: {error}")
-        self._outputs.status(session, outcome)
+            publish()
+        except Exception as error:
+            told = str(error) if isinstance(error, RobocalError) else traceback.format_exc()
+            self.get_logger().error(f"{name} was done but not published: {told}")
 
     def _show_quality(self, outcome: Outcome) -> None:
         history, number = self._history, outcome.calibration_id

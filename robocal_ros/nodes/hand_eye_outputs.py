@@ -11,6 +11,7 @@ from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, S
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import Entry, Head
 from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.static_tf import StaticTf
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
@@ -25,7 +26,7 @@ TARGETS = {
     HandEyeStatus.CAMERA: "camera",
 }
 MOUNTS = {HandEyeStatus.ON_FLANGE: IN_HAND, HandEyeStatus.FIXED: TO_HAND}
-NUMBER_OF = {name: number for number, name in (TARGETS | {}).items()}
+NUMBER_OF = {name: number for number, name in TARGETS.items()}
 MOUNT_NUMBER_OF = {name: number for number, name in MOUNTS.items()}
 
 
@@ -50,27 +51,24 @@ class HandEyeOutputs:
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
         self._events = add(SessionEvent, "~/session_events", EVENTS)
         self.transforms: list[TransformStamped] = []
-        self._tf: Any = None
-        self.missing = ""
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            self.missing = "no /tf_static: tf2_msgs is missing (apt install ros-jazzy-tf2-msgs)"
-        else:
-            self._tf_message = TFMessage
-            self._tf = add(TFMessage, "/tf_static", qos.LATCHED)
+        self._tf = StaticTf(add)
+        self.missing = self._tf.missing
 
-    def status(self, session: HandEyeSession, last: Outcome | None) -> None:
-        """Say how far the data set is, and what came of the last command."""
-        self._status.publish(status_message(session, last))
+    def status(self, session: HandEyeSession, last: Outcome | None, *, ended: bool = False) -> None:
+        """Say how far the data set is, and what came of the last command.
+
+        ``ended``: the session is over; its captures are told once more, as they ended.
+        """
+        message = status_message(session, last)
+        if ended:
+            message.state = HandEyeStatus.IDLE
+        self._status.publish(message)
 
     def transform(self, head: Head, stamp_ns: int) -> None:
         """Put what is in force onto tf; nothing in force: late subscribers get no transform."""
-        if self._tf is None:
-            return
         transforms = [] if head.model is None else [transform_message(head.model, stamp_ns)]
         self.transforms += transforms
-        self._tf.publish(self._tf_message(transforms=transforms))
+        self._tf.publish(transforms)
 
     def quality(self, outcome: Outcome, frame: str, entry: Entry | None) -> None:
         """Show the verdict on a calibration, or why there is none."""

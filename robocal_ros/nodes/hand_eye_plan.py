@@ -65,7 +65,7 @@ class HandEyePlan:
         if request.center:
             centre: Array | None = require_near(_point(request.center[0]), "center")
         else:
-            centre = sphere_centre(data, self._history, mount)
+            centre = sphere_centre(data, self._history, session.current.arm, mount)
         config = session.config
         found = judged_plan(data, poses, list(request.marks), mount, sensor, config, centre)
         return _answered(response, found, who)

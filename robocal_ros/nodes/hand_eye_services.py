@@ -15,7 +15,7 @@ from robocal_msgs.srv import (
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.nodes.conversions import transform_message, trigger_text
 from robocal_ros.nodes.decision_services import answer, twin
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
@@ -24,6 +24,7 @@ from robocal_ros.nodes.hand_eye_plan import HandEyePlan
 from robocal_ros.nodes.hand_eye_settings import start_arguments
 from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_data import MOST_POINTS, TOPIC_OF
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 Ask = Callable[[Command], Awaitable[Outcome]]
@@ -46,7 +47,7 @@ class HandEyeServices:
         session: Callable[[], HandEyeSession | None],
         history: CalibrationHistory,
     ) -> None:
-        self._settings, self._ask = settings, ask
+        self._node, self._settings, self._ask = node, settings, ask
         self._session_now, self._history = session, history
         add = node.add_service
         add(StartHandEye, "~/start", self._start)
@@ -83,14 +84,19 @@ class HandEyeServices:
             return response
         return await twin(self._ask, START, arguments)(request, response)
 
+    async def _capture_now(self, arguments: Mapping[str, Any]) -> Outcome:
+        """A capture takes nothing that was received before its call."""
+        self._node.take_waiting()
+        return await self._ask(Command(CAPTURE, arguments))
+
     async def _capture(self, request: Any, response: Any) -> Any:
-        outcome = await self._ask(Command(CAPTURE, {"mark": request.mark}))
+        outcome = await self._capture_now({"mark": request.mark})
         response.handle = _handle(outcome)
         return answer(response, outcome)
 
     async def _capture_twin(self, request: Any, response: Any) -> Any:
         try:
-            outcome = await self._ask(Command(CAPTURE, {}))
+            outcome = await self._capture_now({})
         except RobocalError as error:  # deactivated meanwhile
             response.message = trigger_text(0, error.code, str(error))
             return response
@@ -148,14 +154,15 @@ class HandEyeServices:
         from robocal_ros.storage.hand_eye_bags import write_data_set
 
         session, path = self._session, _path(request)
-        data = session.data
-        if data is None or not data.samples:
-            raise ConflictError("nothing was captured yet: there is nothing to save")
-        frame = session.config.sensor_frame
-        write_data_set(path, data.document(), data.topic, frame, session.nominal)
+        document = session.document()
+        topic = TOPIC_OF[document["target"]["kind"]]
+        write_data_set(path, document, topic, session.config.sensor_frame, session.nominal)
         response.success, response.status = True, int(Code.ACCEPT)
-        response.samples = len(data.samples)
+        response.samples = len(document["samples"])
         response.message = f"{response.samples} samples saved in {path}"
+        points = sum(len(row["values"]) for row in document["samples"])
+        if points > MOST_POINTS:
+            response.message += f"; {points} points are too many to load (at most {MOST_POINTS})"
         return response
 
 

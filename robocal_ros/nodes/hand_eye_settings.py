@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.target_documents import target_document
+from robocal_ros.core.hand_eye.target_documents import KIND_OF, Document, target_document
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import pose_settings
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import FEATURES, TOPIC_OF
 from robocal_ros.sessions.hand_eye_solving import METHODS, MOUNTS, WITHOUT_FILE
+from robocal_ros.storage.hand_eye_targets import KINDS as DESCRIBED
 from robocal_ros.storage.hand_eye_targets import read_target
 
 
@@ -30,7 +31,7 @@ SETTINGS = (
     Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
     Setting("sensor_frame", "sensor", "Name of the sensor's frame, in its messages and on tf"),
     Setting("target", "sphere", "Target where a call names none", choices=tuple(TOPIC_OF)),
-    Setting("target_file", "", "File of the target where a call names none"),
+    Setting("target_file", "", "File where a call names none; for the target that it describes"),
     Setting("feature", FEATURES[0], "What a line is in a profile", choices=FEATURES),
     Setting("method", METHODS[0], "Estimator where a call names none", choices=METHODS),
     Setting("mount", MOUNTS[0], "Where the sensor is, where a call does not say", choices=MOUNTS),
@@ -107,18 +108,33 @@ def start_arguments(
 ) -> dict[str, Any]:
     """Arguments of the command that begins a data set; what is empty comes from the settings.
 
+    The configured file counts for the target that it describes, and for no other.
+
     Raises
     ------
     InputError
         When the target's file is missing, or describes another target.
     """
-    kind, name = kind or settings["target"], file or settings["target_file"]
-    if not name and kind not in WITHOUT_FILE:
-        raise InputError(f"target_file is empty: name the file that describes the {kind}")
-    target = read_target(Path(name)) if name else None
+    kind = kind or settings["target"]
     return {
-        "target": target_document(kind, target),
+        "target": _given(kind, file) if file else _configured(kind, settings["target_file"]),
         "feature": feature or settings["feature"],
         "method": method or settings["method"],
         "mount": mount or settings["mount"],
     }
+
+
+def _given(kind: str, file: str) -> Document:
+    return target_document(kind, read_target(Path(file)))
+
+
+def _configured(kind: str, file: str) -> Document:
+    """The target of the configured file; nothing is known of one that it does not describe."""
+    if not file or kind not in DESCRIBED:
+        found = ""
+    elif (found := KIND_OF[type(target := read_target(Path(file)))]) == kind:
+        return target_document(kind, target)
+    if kind not in WITHOUT_FILE:
+        told = f"'{file}' describes a {found}" if found else "is empty"
+        raise InputError(f"target_file {told}: name the file that describes the {kind}")
+    return {"kind": kind}

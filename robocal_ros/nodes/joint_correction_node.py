@@ -15,7 +15,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
 from robocal_ros.nodes.run import run
@@ -33,9 +33,6 @@ from robocal_ros.sessions.correction import (
     offered_tool,
     trajectory_command,
 )
-
-NO_SERIAL = "unset"
-POLL_S = 0.5
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"

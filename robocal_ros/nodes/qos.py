@@ -28,6 +28,9 @@ SENSOR = _profile(100, ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = _profile(100, ReliabilityPolicy.RELIABLE)
 """Commands and events, where none may be lost."""
 
+STREAM = _profile(1000, ReliabilityPolicy.BEST_EFFORT)
+"""What a session is computed from: deep enough for the seconds that a large solution takes."""
+
 
 def own(profile: QoSProfile) -> QoSProfile:
     """Return a copy, because overrides are written into the profile that an entity is given."""

@@ -14,7 +14,7 @@ from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.motion.loading import load_motion
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import qos, tcf_motion
-from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
@@ -24,7 +24,6 @@ from robocal_ros.nodes.tcf_motion import TcfMotion
 from robocal_ros.nodes.tcf_outputs import TcfOutputs
 from robocal_ros.nodes.tcf_services import Runner, TcfServices
 from robocal_ros.nodes.tcf_settings import SETTINGS, TRAJECTORY, session_config, taught_tool
-from robocal_ros.nodes.thermal_node import NO_SERIAL, POLL_S, STREAM
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import (
     BREAK_OFF,
@@ -44,7 +43,7 @@ from robocal_ros.storage.robots import load_robot
 
 COMMAND_S = 1.0
 WATCH_S = 0.02
-INPUTS = {JOINTS: (JointState, STREAM), EDGES: (BeamEvent, qos.RELIABLE)}
+INPUTS = {JOINTS: (JointState, qos.STREAM), EDGES: (BeamEvent, qos.RELIABLE)}
 
 
 class TcfNode(HouseNode):

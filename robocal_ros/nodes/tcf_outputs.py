@@ -12,6 +12,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.static_tf import StaticTf
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.nodes.tool_messages import ToolMessages, step_message
 from robocal_ros.sessions.events import Command, Outcome
@@ -49,15 +50,8 @@ class TcfOutputs:
         self._frame = add(TransformStamped, "~/tool_frame", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
         self._events = add(SessionEvent, "~/session_events", EVENTS)
-        self._tf: Any = None
-        self.missing = ""
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError:
-            self.missing = "no /tf_static: tf2_msgs is missing (apt install ros-jazzy-tf2-msgs)"
-        else:
-            self._tf_message = TFMessage
-            self._tf = add(TFMessage, "/tf_static", qos.LATCHED)
+        self._tf = StaticTf(add)
+        self.missing = self._tf.missing
 
     def step(self, step: PlannedStep | None, run: int, stamp_ns: int) -> ToolStep:
         """Say what is awaited; None: nothing is."""
@@ -76,8 +70,7 @@ class TcfOutputs:
         self._tool.publish(self._messages.frame(known, revision, thermal, state, stamp_ns))
         transform = self._messages.transform(known, stamp_ns)
         self._frame.publish(transform)
-        if self._tf is not None:
-            self._tf.publish(self._tf_message(transforms=[transform]))
+        self._tf.publish([transform])
 
     def frame(self, model: Document, stamp_ns: int) -> ToolFrame:
         """A measured tool."""

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PointStamped, PoseStamped
 from numpy.typing import NDArray
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState, PointCloud2, Temperature
 
 from robocal_ros import __version__
@@ -15,7 +14,8 @@ from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.identification import require_parameters
-from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.data_clock import DataClock
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -38,8 +38,6 @@ from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
 
-NO_SERIAL = "unset"
-POLL_S = 0.5
 ACCURACY_S = 1.0
 INPUTS = {
     JOINTS: JointState,
@@ -50,11 +48,6 @@ INPUTS = {
     POSE: PoseStamped,
     TEMPERATURES: Temperature,
 }
-
-# Deep enough for the seconds that a large identification takes.
-STREAM = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT
-)
 
 
 class ThermalNode(HouseNode):
@@ -88,7 +81,7 @@ class ThermalNode(HouseNode):
         self._guard = SourceGuard(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, message_type in INPUTS.items():
-            self.add_input(message_type, kind, self._taker(kind), STREAM)
+            self.add_input(message_type, kind, self._taker(kind), qos.STREAM)
         self._desk = CommandDesk(self, settings["command_timeout_s"], self._show)
         ThermalServices(self.add_service, self._desk.ask, self._history)
         SetUpServices(

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.proposals import BEFORE_ANY, THERMAL
+from robocal_ros.core.proposals import BEFORE_ANY, THERMAL, TOOL
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 
+FIRST = {THERMAL: "identify", TOOL: "measure"}  # what gives a candidate of a kind
 ONLY, NEWEST = "only", "newest"  # which pending candidate a command without an id is about
 
 
@@ -65,7 +66,8 @@ def _named(history: History, command: Command, kind: str) -> Command:
     pending = [entry.id for entry in history.pending(kind)]
     choose = arguments.pop("choose")
     if not pending:
-        arguments["refused"] = "no fresh candidate is pending: identify first"
+        first = FIRST.get(kind, "calibrate")
+        arguments["refused"] = f"no fresh candidate is pending: {first} first"
     elif choose == ONLY and len(pending) > 1:
         found = ", ".join(map(str, pending))
         arguments["refused"] = (

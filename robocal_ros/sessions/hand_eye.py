@@ -5,6 +5,7 @@ No clock, no ROS.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import (
@@ -16,12 +17,14 @@ from robocal_ros.core.errors import (
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import hand_eye_kind
 from robocal_ros.core.samples import JointSample
-from robocal_ros.core.streams import NotStillError
+from robocal_ros.core.streams import CLOCK_JUMP_NS, NotStillError
 from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import Commanded, Handler
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import (
+    MOST_CAPTURES,
+    MOST_HANDLE,
     Capture,
     DataSet,
     HandEyeSample,
@@ -35,7 +38,6 @@ from robocal_ros.sessions.hand_eye_solving import require_known
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
 
-MOST_CAPTURES = 500
 _NO_SET = "no data set is open: call start, or load one"
 
 
@@ -61,6 +63,7 @@ class HandEyeSession(Commanded):
         self._handle = 0
         self._why: RobocalError | None = None  # why the latest shot was of no use
         self._seen_ns = 0  # shots before it were looked at
+        self._leap_ns = 0  # longest step of the joints' stamps since the capture
         self._found: Command | None = None
         self.data: DataSet | None = None
 
@@ -81,10 +84,16 @@ class HandEyeSession(Commanded):
             self.received[sample.topic] += 1
             newest = self.newest_ns.get(sample.topic, 0)
             self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
-        elif self._take_joints(sample):
-            self._shots.clear()
-            self._found = self._broken_off(Code.CONFLICT, "the clock jumped back: capture again")
+        else:
+            self._add_joints(sample)
         self._look()
+
+    def _add_joints(self, sample: JointSample) -> None:
+        before_ns = self.newest_joints_ns or sample.stamp_ns
+        if self._take_joints(sample):
+            self._shots.clear()
+            self._found = self.broken_off(Code.CONFLICT, "the clock jumped back: capture again")
+        self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""
@@ -99,21 +108,35 @@ class HandEyeSession(Commanded):
             return
         for shot in self._shots.since(self.data.topic, max(capture.from_ns, self._seen_ns)):
             try:
+                shot.read()
                 reading = self.stream.standstill(shot.stamp_ns, self.config.standstill)
             except NotStillError as error:
                 self._why, self._seen_ns = error, shot.stamp_ns + 1
+                continue
+            except RobocalError as error:
+                self.refuse(shot.topic, error)
+                self._seen_ns = shot.stamp_ns + 1
                 continue
             if reading is None:
                 break
             arguments = {"handle": capture.handle, "shot_ns": shot.stamp_ns}
             self._found = Command(events.SAMPLE, arguments, self.newest_joints_ns)
             return
+        self._found = self._timed_out(capture, self.data.topic)
+
+    def _timed_out(self, capture: Capture, topic: str) -> Command | None:
         limit_s = self.config.capture_timeout_s
-        if self.newest_joints_ns - capture.from_ns > limit_s * 1e9:
-            words = f"no {self.data.topic} with the robot at standstill within {limit_s:g} s"
-            hint = "does the sensor publish it, is it triggered?"
-            code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
-            self._found = self._broken_off(code, f"{words}: {self._why or hint}")
+        waited_ns, limit_ns = self.newest_joints_ns - capture.from_ns, limit_s * 1e9
+        if waited_ns <= limit_ns:
+            return None
+        if waited_ns - self._leap_ns <= limit_ns and self._leap_ns > CLOCK_JUMP_NS:
+            leap_s = self._leap_ns * 1e-9
+            words = f"the joint states' clock jumped by {leap_s:.1f} s, or they paused for so long"
+            return self.broken_off(Code.CONFLICT, f"{words}: capture again")
+        words = f"no {topic} with the robot at standstill within {limit_s:g} s"
+        hint = "does the sensor publish it, is it triggered?"
+        code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
+        return self.broken_off(code, f"{words}: {self._why or hint}")
 
     def silent(self, seconds: float) -> Command | None:
         """The command by which a capture fails when no usable joint reading comes any more."""
@@ -121,9 +144,10 @@ class HandEyeSession(Commanded):
             return None
         told = self.ignored.words() or "check the robot's driver"
         words = f"joint states are silent for {seconds:.1f} s: {told}"
-        return self._broken_off(Code.TOO_FEW_SAMPLES, words)
+        return self.broken_off(Code.TOO_FEW_SAMPLES, words)
 
-    def _broken_off(self, code: Code, reason: str) -> Command | None:
+    def broken_off(self, code: Code, reason: str) -> Command | None:
+        """The command by which the capture that waits fails; None when none waits."""
         capture = None if self.data is None else self.data.waiting
         if capture is None:
             return None
@@ -168,14 +192,27 @@ class HandEyeSession(Commanded):
             raise ConflictError(f"no joint states yet: {told}")
         if len(data.captures) >= MOST_CAPTURES:
             raise LimitError(f"{MOST_CAPTURES} captures: remove some, or start a new data set")
+        if self._handle >= MOST_HANDLE:
+            raise LimitError(f"handle {self._handle} was the last: begin a new session")
         mark = str(command.arguments.get("mark", ""))
         data.require_mark(mark)
         handle = int(command.arguments.get("handle", self._handle + 1))
-        self._handle, self._why, self._seen_ns = handle, None, 0
+        from_ns = int(command.arguments.get("from_ns", self._after_all_ns(data.topic)))
+        self._handle, self._why, self._seen_ns, self._leap_ns = handle, None, 0, 0
         words = f"waits for {data.topic} with the robot at standstill"
-        data.captures[handle] = Capture(handle, mark, command.stamp_ns or 0, words)
-        command = replace(command, arguments={**command.arguments, "handle": handle})
+        data.captures[handle] = Capture(handle, mark, from_ns, words)
+        bound = {"handle": handle, "from_ns": from_ns}
+        command = replace(command, arguments={**command.arguments, **bound})
         return Outcome(command, Code.ACCEPT, f"capture {handle} {words}")
+
+    def _after_all_ns(self, topic: str) -> int:
+        """The earliest stamp of a shot that is newer than all that was received.
+
+        No clock of ours is asked: those of robot and sensor need not be set to it. Who gives a
+        command for a call gives the messages first that came before it.
+        """
+        newest = self.newest_ns.get(topic)
+        return max(self.newest_joints_ns, 0 if newest is None else newest + 1)
 
     def _sample(self, command: Command, wall_ns: int) -> Outcome:
         data, at_ns = self._require_set(), int(command.arguments["shot_ns"])
@@ -184,9 +221,8 @@ class HandEyeSession(Commanded):
         mean = self.stream.resting(at_ns, self.config.standstill)
         if mean is None:
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
-        T_base_flange = self.current.arm.fk(mean)
         handle, mark = capture.handle, capture.mark
-        words = data.put(HandEyeSample(handle, mark, at_ns, mean, T_base_flange, shot.values))
+        words = data.put(HandEyeSample(handle, mark, at_ns, mean, shot.read()))
         return Outcome(command, Code.ACCEPT, f"capture {handle}: {words}", samples=1)
 
     def _break_off(self, command: Command, wall_ns: int) -> Outcome:
@@ -216,9 +252,32 @@ class HandEyeSession(Commanded):
 
     def _calibrate(self, command: Command, wall_ns: int) -> Outcome:
         data = self._require_set()
+        data.candidate = 0
         outcome = self._results.calibrate(data, command, wall_ns)
         data.candidate = outcome.calibration_id
         return outcome
+
+    def document(self) -> dict[str, Any]:
+        """The open data set for a file, with the model that its flange poses come from now.
+
+        Raises
+        ------
+        ConflictError
+            When nothing was captured.
+        """
+        if self.data is None or not self.data.samples:
+            raise ConflictError("nothing was captured yet: there is nothing to save")
+        thermal = {"revision": self.current.thermal.revision, "hash": self.current.arm.model_hash}
+        return self.data.document() | {"thermal": thermal}
+
+    def _other_model(self, saved: Mapping[str, Any] | None) -> str:
+        """Tells when flange poses are no longer those with which a data set was saved."""
+        if saved is None or saved["hash"] == self.current.arm.model_hash:
+            return ""
+        return (
+            f"; its flange poses come from thermal revision {self.current.thermal.revision} now, "
+            f"when it was saved they came from revision {saved['revision']}"
+        )
 
     def _load(self, command: Command, wall_ns: int) -> Outcome:
         arguments = command.arguments
@@ -228,4 +287,5 @@ class HandEyeSession(Commanded):
         self._handle = max(self._handle, *data.samples, 0)
         count = len(data.samples)
         words = f"{count} samples of a {data.kind} loaded from {arguments.get('path', 'a file')}"
+        words += self._other_model(arguments["set"].get("thermal"))
         return Outcome(command, Code.ACCEPT, words, samples=count)

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import InputError, LimitError
+from robocal_ros.core.hand_eye.profile import profile_of
+from robocal_ros.core.hand_eye.target_documents import target_of
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
 
@@ -23,6 +25,11 @@ TO_HAND: Mount = "to-hand"
 FEATURES: tuple[Feature, ...] = ("edge", "groove")
 TOPIC_OF = {"sphere": PROFILE, "step": PROFILE, "line": PROFILE, "camera": TARGET_POSE}
 
+MOST_CAPTURES = 500
+MOST_HANDLE = 2**32 - 1
+MOST_POINTS = 250_000  # of a set that is loaded: some 10 MB of text in the recording
+UNIT = 1e-3  # length of a quaternion, from 1
+
 
 @dataclass(eq=False)
 class HandEyeSample:
@@ -34,7 +41,6 @@ class HandEyeSample:
     mark : of a step target the mark that the laser plane lies through; else empty.
     stamp_ns : of the shot.
     q : (n,) mean of the joint readings at standstill, rad (prismatic: m).
-    T_base_flange : (4, 4) of q, with the model then in force.
     values : see `hand_eye_shots.Shot`.
     """
 
@@ -42,7 +48,6 @@ class HandEyeSample:
     mark: str
     stamp_ns: int
     q: Array
-    T_base_flange: Array
     values: Array
 
 
@@ -165,23 +170,55 @@ def data_set_begun(document: Mapping[str, Any]) -> DataSet:
 
 
 def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
-    """Read what `DataSet.document` gave, also after JSON; flange poses are those of ``arm``.
+    """Read what `DataSet.document` gave, also after JSON; ``arm``: whose joints they are.
 
     Raises
     ------
     InputError
         When it is no such document.
+    TooFewSamplesError, LimitError
+        When a profile shows too little, or there are more samples or points than are kept.
     """
     try:
         found = data_set_begun(document)
-        columns = 7 if found.topic == TARGET_POSE else 2
-        for row in document["samples"]:
-            q = np.array(row["q"], dtype=np.float64)
-            values = np.array(row["values"], dtype=np.float64).reshape(-1, columns)
-            if not (np.all(np.isfinite(q)) and np.all(np.isfinite(values))):
-                raise InputError(f"sample {row['handle']} of the data set holds what is no number")
-            mark, at_ns = str(row["mark"]), int(row["stamp_ns"])
-            found.put(HandEyeSample(int(row["handle"]), mark, at_ns, q, arm.fk(q), values))
-    except (KeyError, TypeError, ValueError) as error:
+        target_of(found.target)
+        rows = document["samples"]
+        _require_few(rows)
+        for row in rows:
+            sample = _sample_of(row, found.topic, arm)
+            if sample.handle in found.samples:
+                raise InputError(f"the data set has two samples of handle {sample.handle}")
+            found.require_mark(sample.mark)
+            found.put(sample)
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"the data set cannot be read: {error}") from error
     return found
+
+
+def _require_few(rows: Sequence[Document]) -> None:
+    if len(rows) > MOST_CAPTURES:
+        raise LimitError(f"{len(rows)} samples: a data set has at most {MOST_CAPTURES}")
+    points = sum(len(row["values"]) for row in rows)
+    if points > MOST_POINTS:
+        raise LimitError(
+            f"{points} points in {len(rows)} samples: at most {MOST_POINTS} can be loaded, since "
+            "the recording holds them; save fewer samples, or profiles of fewer points"
+        )
+
+
+def _sample_of(row: Document, topic: str, arm: SerialArm) -> HandEyeSample:
+    """One sample of a document, checked as one that is captured."""
+    handle, at_ns = row["handle"], row["stamp_ns"]
+    if type(handle) is not int or not 1 <= handle <= MOST_HANDLE:
+        raise InputError(f"handle {handle} of the data set is none of 1 to {MOST_HANDLE}")
+    if type(at_ns) is not int or not 0 < at_ns < 2**63:
+        raise InputError(f"sample {handle} of the data set has no time stamp, but {at_ns}")
+    q = np.array(row["q"], dtype=np.float64).reshape(arm.n)
+    values = np.array(row["values"], dtype=np.float64)
+    if not (np.all(np.isfinite(q)) and np.all(np.isfinite(values))):
+        raise InputError(f"sample {handle} of the data set holds what is no number")
+    if topic == PROFILE:
+        profile_of(values, f"of sample {handle}")
+    elif values.shape != (1, 7) or abs(float(np.linalg.norm(values[0, 3:])) - 1.0) > UNIT:
+        raise InputError(f"sample {handle} of the data set is no pose: {values.tolist()}")
+    return HandEyeSample(handle, str(row["mark"]), at_ns, q, values)

@@ -5,7 +5,7 @@ from typing import Any
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE, pose_shot, profile_shot
+from robocal_ros.sessions.hand_eye_shots import SHOTS, shot_of
 from robocal_ros.sessions.observations import JOINTS
 
 
@@ -14,9 +14,7 @@ def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> N
     try:
         if kind == JOINTS:
             session.add(joint_sample(message))
-        elif kind == PROFILE:
-            session.add(profile_shot(message))
-        elif kind == TARGET_POSE:
-            session.add(pose_shot(message))
+        elif kind in SHOTS:
+            session.add(shot_of(kind, message))
     except RobocalError as error:
         session.refuse(kind, error)

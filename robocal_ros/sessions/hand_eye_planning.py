@@ -160,7 +160,9 @@ def _candidate(data: DataSet | None, history: History) -> int:
     return number if number and history.get(number).state in TO_GO_BY else 0
 
 
-def sphere_centre(data: DataSet, history: History, T_flange_sensor: Array) -> Array | None:
+def sphere_centre(
+    data: DataSet, history: History, arm: SerialArm, T_flange_sensor: Array
+) -> Array | None:
     """Where the sphere was last found (3,), base; None where neither result nor samples tell."""
     from robocal_ros.core.hand_eye.tasks import HandEyeData, SphereTask
 
@@ -174,7 +176,7 @@ def sphere_centre(data: DataSet, history: History, T_flange_sensor: Array) -> Ar
         return None
     names = tuple(str(sample.handle) for sample in samples)
     profiles = [Profile(sample.values, str(sample.handle)) for sample in samples]
-    poses = np.array([sample.T_base_flange for sample in samples])
+    poses = arm.fk(np.array([sample.q for sample in samples]))
     task = SphereTask(target)
     try:
         view = task.read(HandEyeData(names, poses, profiles), T_flange_sensor).view

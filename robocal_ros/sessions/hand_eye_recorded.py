@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, hand_eye_kind
-from robocal_ros.sessions.events import CONFIGURE, Command
+from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.seeding import bring_into_force, require_robot
+from robocal_ros.sessions.recorded import configured_with, recorded_arguments
+from robocal_ros.sessions.seeding import bring_into_force
 
 OWN = "sensor"  # only a hand-eye session's configuration has it
 
@@ -19,15 +19,9 @@ def configuration(session: HandEyeSession, topics: Mapping[str, str]) -> Command
 
     ``topics``: name of each input's topic.
     """
-    arguments = {
-        "robot": session.nominal.name,
-        "model_hash": session.nominal.model_hash,
-        "topics": dict(topics),
-        "config": session.config.document(),
-        "model": session.current.thermal.model,
-        OWN: session.current.head.model,
-    }
-    return Command(CONFIGURE, arguments, session.newest_joints_ns, session.marks)
+    current = session.current
+    in_force = {"model": current.thermal.model, OWN: current.head.model}
+    return configured_with(session, topics, session.config.document(), in_force)
 
 
 def is_hand_eye_session(configured: Command | None) -> bool:
@@ -47,11 +41,7 @@ def hand_eye_session_as_recorded(
     InputError
         The configuration cannot be read.
     """
-    require_robot(nominal, configured)
-    arguments = configured.arguments
-    missing = [name for name in ("config", "model") if name not in arguments]
-    if missing:
-        raise InputError(f"the recorded configuration lacks {', '.join(missing)}")
+    arguments = recorded_arguments(nominal, configured, ("model", OWN))
     config = HandEyeConfig.of_document(arguments["config"])
     if not history.list(1):
         own = hand_eye_kind(config.sensor_frame)

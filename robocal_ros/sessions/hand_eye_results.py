@@ -1,11 +1,13 @@
 """From captured samples to a calibration in the history."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.documents import arm_of
 from robocal_ros.core.errors import RankDeficientError, ResidualError
 from robocal_ros.core.hand_eye.result import HandEyeResult, hand_eye_document
 from robocal_ros.core.kinematics import SerialArm
@@ -16,6 +18,8 @@ from robocal_ros.sessions.hand_eye_data import DataSet, HandEyeSample
 from robocal_ros.sessions.hand_eye_in_force import HandEyeInForce
 from robocal_ros.sessions.hand_eye_solving import solved
 from robocal_ros.sessions.history import History
+
+MODEL = "model"
 
 
 class HandEyeResults:
@@ -37,6 +41,7 @@ class HandEyeResults:
     ) -> None:
         self._nominal, self._history, self._config = nominal, history, config
         self._software, self._current = software, current
+        self._began_with = current.thermal.revision
 
     def calibrate(self, data: DataSet, command: Command, wall_ns: int) -> Outcome:
         """Solve for the samples that the command names, and propose the result.
@@ -46,26 +51,41 @@ class HandEyeResults:
         RobocalError
             When they cannot answer, or the history refuses.
         """
+        command = self._with_model(command)
         arguments = command.arguments
         samples = data.chosen([int(handle) for handle in arguments.get("handles", ())])
         method = str(arguments.get("method") or data.method)
+        q = np.array([sample.q for sample in samples]).reshape(-1, self._nominal.n)
+        model = arguments.get(MODEL, self._current.thermal.model)
+        arm = self._nominal if model is None else arm_of(model, self._nominal)
+        T_base_flange = arm.fk(q)  # one model for all, whenever they were captured
         try:
-            result = solved(data, samples, method, self._config)
+            result = solved(data, samples, T_base_flange, method, self._config)
         except RankDeficientError as error:
             told = {"unobservable": list(error.directions)}
             return Outcome(command, error.code, str(error), told, samples=len(samples))
         except np.linalg.LinAlgError as error:
             raise ResidualError(f"no pose of the sensor explains the samples: {error}") from error
         document = hand_eye_document(result)
-        kept = self._keep(data, samples, result, document, command, wall_ns)
+        inputs = _inputs(data, samples, T_base_flange)
+        kept = self._keep(inputs, result, document, command, wall_ns)
         verdict = result.verdict
         used = len({name.partition("/")[0] for name in result.samples})  # a step names corners
         return Outcome(command, verdict.code, verdict.reason, document, kept, samples=used)
 
+    def _with_model(self, command: Command) -> Command:
+        """The command with the thermal model, where another one than at the beginning is in force.
+
+        So a replay, which knows that of the beginning, takes the same flange poses.
+        """
+        thermal = self._current.thermal
+        if MODEL in command.arguments or thermal.revision == self._began_with:
+            return command
+        return replace(command, arguments={**command.arguments, MODEL: thermal.model})
+
     def _keep(
         self,
-        data: DataSet,
-        samples: Sequence[HandEyeSample],
+        inputs: dict[str, NDArray[Any]],
         result: HandEyeResult,
         document: dict[str, Any],
         command: Command,
@@ -90,7 +110,7 @@ class HandEyeResults:
                 else float(np.sqrt(np.mean(left_out**2))) * 1e3,
                 document=document,
                 model=self._model(result),
-                inputs=_inputs(data, samples),
+                inputs=inputs,
             )
         )
 
@@ -107,13 +127,15 @@ class HandEyeResults:
         }
 
 
-def _inputs(data: DataSet, samples: Sequence[HandEyeSample]) -> dict[str, NDArray[Any]]:
+def _inputs(
+    data: DataSet, samples: Sequence[HandEyeSample], T_base_flange: NDArray[np.float64]
+) -> dict[str, NDArray[Any]]:
     return {
         "handle": np.array([sample.handle for sample in samples]),
         "mark": np.array([sample.mark for sample in samples]),
         "stamp_ns": np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
         "q": np.array([sample.q for sample in samples]),
-        "T_base_flange": np.array([sample.T_base_flange for sample in samples]),
+        "T_base_flange": T_base_flange,
         "count": np.array([len(sample.values) for sample in samples]),
         data.topic: np.concatenate([sample.values for sample in samples]),
     }

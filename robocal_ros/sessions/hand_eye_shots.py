@@ -1,8 +1,13 @@
-"""What the sensor sent: profiles and target poses, kept until a capture takes them."""
+"""What the sensor sent: profiles and target poses, kept until a capture takes them.
+
+They are kept as they came, and read only when a capture waits: a sensor that runs freely costs
+next to nothing while nobody asks.
+"""
 
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,34 +24,50 @@ Array = NDArray[np.float64]
 PROFILE, TARGET_POSE = "profile", "target_pose"
 SHOTS = (PROFILE, TARGET_POSE)
 PLANE_M = 1e-5  # a profile's points lie so near to y = 0
-MOST_KEPT = 500
+MOST_KEPT, MOST_BYTES = 500, 64 << 20
 AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One profile or target pose.
-
-    ``values``: of a profile its points (n, 2), x and z, m, sensor frame; of a target pose
-    (1, 7) position, m, and quaternion x, y, z, w of the target in the sensor frame.
-    """
+    """One profile (``sensor_msgs/PointCloud2``) or target pose (``geometry_msgs/PoseStamped``)."""
 
     topic: str
     stamp_ns: int
     frame: str
-    values: Array
+    message: Any
+
+    @property
+    def size(self) -> int:
+        """Bytes of a cloud's points."""
+        return len(getattr(self.message, "data", ()))
+
+    @cached_property
+    def _values(self) -> Array:
+        return _points(self.message) if self.topic == PROFILE else _pose(self.message)
+
+    def read(self) -> Array:
+        """Of a profile its points (n, 2), x and z, m, sensor frame; of a target pose (1, 7).
+
+        That is position, m, and quaternion x, y, z, w of the target in the sensor frame.
+
+        Raises
+        ------
+        InputError
+            When the message is no cloud, its points are not in the plane y = 0, a value of a pose
+            is not finite or its quaternion is not of unit length.
+        TooFewSamplesError
+            When nearly nothing was seen.
+        """
+        return self._values
 
 
-def profile_shot(message: Any) -> Shot:
-    """Build a shot from a ``sensor_msgs/PointCloud2``.
+def shot_of(topic: str, message: Any) -> Shot:
+    """A shot from the message of an input; its content is not looked at."""
+    return Shot(topic, stamp_ns(message.header.stamp), message.header.frame_id, message)
 
-    Raises
-    ------
-    InputError
-        When the message is no cloud, or its points are not in the plane y = 0.
-    TooFewSamplesError
-        When nearly nothing was seen.
-    """
+
+def _points(message: Any) -> Array:
     at_ns = stamp_ns(message.header.stamp)
     points = cloud_points(message)
     points = points[np.all(np.isfinite(points), axis=1)]
@@ -57,21 +78,13 @@ def profile_shot(message: Any) -> Shot:
             f"profile {profile.name} has points {off_m * 1e3:.4g} mm beside the plane y = 0: "
             "x is along the laser line, z along the beam; turn the sensor's axes accordingly"
         )
-    return Shot(PROFILE, at_ns, message.header.frame_id, profile.points)
+    return profile.points
 
 
-def pose_shot(message: Any) -> Shot:
-    """Build a shot from a ``geometry_msgs/PoseStamped``: the target in the sensor frame.
-
-    Raises
-    ------
-    InputError
-        When a value is not finite or the quaternion is not of unit length.
-    """
+def _pose(message: Any) -> Array:
     pose_sample(message)
     p, o = message.pose.position, message.pose.orientation
-    values = np.array([[p.x, p.y, p.z, o.x, o.y, o.z, o.w]])
-    return Shot(TARGET_POSE, stamp_ns(message.header.stamp), message.header.frame_id, values)
+    return np.array([[p.x, p.y, p.z, o.x, o.y, o.z, o.w]])
 
 
 def target_poses(values: Array) -> Array:
@@ -83,7 +96,8 @@ class ShotLog:
     """The latest shots, oldest first."""
 
     def __init__(self) -> None:
-        self._shots: deque[Shot] = deque(maxlen=MOST_KEPT)
+        self._shots: deque[Shot] = deque()
+        self._bytes = 0
 
     def add(self, shot: Shot, frame: str, joints_ns: int) -> None:
         """Take a shot; ``joints_ns``: newest stamp of the joints, 0 before any.
@@ -105,6 +119,9 @@ class ShotLog:
                 "states: stamp both on one clock"
             )
         self._shots.append(shot)
+        self._bytes += shot.size
+        while len(self._shots) > MOST_KEPT or (self._bytes > MOST_BYTES and len(self._shots) > 1):
+            self._bytes -= self._shots.popleft().size
 
     def since(self, topic: str, from_ns: int) -> Iterator[Shot]:
         """Shots of a topic from a stamp on, by stamp."""
@@ -127,3 +144,4 @@ class ShotLog:
     def clear(self) -> None:
         """Forget all."""
         self._shots.clear()
+        self._bytes = 0

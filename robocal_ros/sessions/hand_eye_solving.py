@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.hand_eye.profile import Profile
@@ -23,7 +24,9 @@ from robocal_ros.sessions.hand_eye_data import (
 )
 from robocal_ros.sessions.hand_eye_shots import target_poses
 
-Solver = Callable[[DataSet, Sequence[HandEyeSample], Method, HandEyeConfig], HandEyeResult]
+Array = NDArray[np.float64]
+Samples = Sequence[HandEyeSample]
+Solver = Callable[[DataSet, Samples, Array, Method, HandEyeConfig], HandEyeResult]
 
 METHODS = ("best", "classic")
 MOUNTS = (IN_HAND, TO_HAND)
@@ -46,6 +49,8 @@ def require_known(data: DataSet, method: str) -> None:
     ):
         if value not in known:
             raise InputError(f"{what} '{value}' is none of {', '.join(known)}")
+    if target_of(data.target) is None and data.kind not in WITHOUT_FILE:
+        raise InputError(f"nothing is known of the {data.kind}: name the file that describes it")
     if data.mount == TO_HAND and data.kind != "camera":
         raise InputError(
             f"a {data.kind} is seen by a sensor on the flange: one that stands still is calibrated "
@@ -54,9 +59,9 @@ def require_known(data: DataSet, method: str) -> None:
 
 
 def solved(
-    data: DataSet, samples: Sequence[HandEyeSample], method: str, config: HandEyeConfig
+    data: DataSet, samples: Samples, T_base_flange: Array, method: str, config: HandEyeConfig
 ) -> HandEyeResult:
-    """Where the sensor sits.
+    """Where the sensor sits; ``T_base_flange`` (k, 4, 4), m, of the samples.
 
     Raises
     ------
@@ -66,11 +71,11 @@ def solved(
     require_known(data, method)
     if not samples:
         raise TooFewSamplesError("nothing was captured yet: capture the target from several poses")
-    return _SOLVERS[data.kind](data, samples, cast(Method, method), config)
+    return _SOLVERS[data.kind](data, samples, T_base_flange, cast(Method, method), config)
 
 
 def _of_profiles(
-    data: DataSet, samples: Sequence[HandEyeSample], method: Method, config: HandEyeConfig
+    data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
 ) -> HandEyeResult:
     from robocal_ros.core.fitting.edge import EdgeRule
     from robocal_ros.core.hand_eye.quality import HandEyeSettings
@@ -80,7 +85,7 @@ def _of_profiles(
     names = tuple(str(sample.handle) for sample in samples)
     shots = HandEyeData(
         names,
-        np.array([sample.T_base_flange for sample in samples]),
+        T_base_flange,
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
         tuple(sample.mark for sample in samples) if data.kind == "step" else None,
     )
@@ -93,14 +98,14 @@ def _of_profiles(
 
 
 def _of_poses(
-    data: DataSet, samples: Sequence[HandEyeSample], method: Method, config: HandEyeConfig
+    data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
 ) -> HandEyeResult:
     from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
     from robocal_ros.core.hand_eye.camera_fit import GivenNoise
     from robocal_ros.core.hand_eye.pose_pairs import PosePairs
 
     pairs = PosePairs(
-        np.array([sample.T_base_flange for sample in samples]),
+        T_base_flange,
         target_poses(np.concatenate([sample.values for sample in samples])),
         tuple(str(sample.handle) for sample in samples),
         data.mount,

@@ -15,7 +15,7 @@ from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import GAP_NS
 from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.hand_eye_shots import PROFILE, Shot, profile_shot
+from robocal_ros.sessions.hand_eye_shots import PROFILE, Shot, shot_of
 from robocal_ros.sessions.ignored import Ignored
 from robocal_ros.sessions.observations import JOINTS
 
@@ -76,7 +76,8 @@ class Standstills:
         self._count += 1
         name = f"shot_{self._count:02d}"
         try:
-            shot = profile_shot(message)
+            shot = shot_of(PROFILE, message)
+            shot.read()
         except RobocalError as error:
             self.rejected[name] = str(error)
             return

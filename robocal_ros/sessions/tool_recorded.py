@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL
-from robocal_ros.sessions.events import CONFIGURE, Command
+from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.seeding import bring_into_force, require_robot
+from robocal_ros.sessions.recorded import configured_with, recorded_arguments
+from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig
 
@@ -21,16 +21,12 @@ def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
     ``topics``: name of each input's topic.
     """
     current = session.current
-    arguments = {
-        "robot": session.nominal.name,
-        "model_hash": session.nominal.model_hash,
-        "topics": dict(topics),
-        "config": session.config.document(),
+    in_force = {
         "model": current.thermal.model,
         "tool": current.head.model,
-        "healthy": current.healthy.model,
+        OWN: current.healthy.model,
     }
-    return Command(CONFIGURE, arguments, session.newest_joints_ns, session.marks)
+    return configured_with(session, topics, session.config.document(), in_force)
 
 
 def is_tool_session(configured: Command | None) -> bool:
@@ -50,11 +46,7 @@ def tool_session_as_recorded(
     InputError
         The configuration cannot be read.
     """
-    require_robot(nominal, configured)
-    arguments = configured.arguments
-    missing = [name for name in ("config", *IN_FORCE) if name not in arguments]
-    if missing:
-        raise InputError(f"the recorded configuration lacks {', '.join(missing)}")
+    arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
     if not history.list(1):
         for name, kind in IN_FORCE.items():
             bring_into_force(history, kind, nominal, arguments[name], software)

@@ -19,7 +19,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.point_clouds import cloud_points
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.storage.bag_writer import BagWriter, ros_time
-from robocal_ros.storage.bags import BagMessage, BagReader
+from robocal_ros.storage.bags import BagInfo, BagMessage, BagReader
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -47,6 +47,8 @@ def write_data_set(
     """
     if path.exists():
         raise InputError("is there already: name another file", file=str(path))
+    if not path.parent.is_dir():
+        raise InputError(f"cannot be written: no folder {path.parent}", file=str(path))
     samples = sorted(document["samples"], key=lambda row: (row["stamp_ns"], row["handle"]))
     rows = [{name: row[name] for name in ("handle", "mark", "stamp_ns")} for row in samples]
     made_with = {"robot": arm.name, "model_hash": arm.model_hash, "sensor_frame": frame}
@@ -105,6 +107,7 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
     """
     with BagReader(path) as reader:
         found = list(reader.messages([DATA_SET, JOINTS, PROFILE, POSE]))
+        _require_whole(reader.info, path)
     texts = [m.message.data for m in found if m.topic == DATA_SET]
     if len(texts) != 1:
         raise InputError(f"is no data file of hand_eye_node: no topic {DATA_SET}", file=str(path))
@@ -125,6 +128,13 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the data set cannot be read: {error}", file=str(path)) from error
     return dict(document)
+
+
+def _require_whole(info: BagInfo, path: Path) -> None:
+    """Refuse a file that was cut off or damaged: what is missing cannot be told from the rest."""
+    if info.notes or info.lost:
+        told = "; ".join([*info.notes, *(part.why for part in info.lost)])
+        raise InputError(f"is truncated or damaged: copy it again ({told})", file=str(path))
 
 
 def _values(recorded: BagMessage) -> Array:

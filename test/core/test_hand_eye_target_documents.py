@@ -41,6 +41,14 @@ def test_nothing_known_stays_nothing_known():
 def test_another_target_than_named_is_refused():
     with pytest.raises(InputError, match="describes a line, not a sphere"):
         target_document("sphere", LINE)
-    for broken in ({"kind": "cone", "x": 1}, {"kind": "sphere", "width_m": 1}, {"radius_m": 1}):
+    step, line = target_document("step", STEP), target_document("line", LINE)
+    for broken in (
+        {"kind": "cone", "x": 1}, {"kind": "sphere", "width_m": 1}, {"radius_m": 1},
+        {"kind": "sphere", "radius_m": "x"}, {"kind": "sphere", "radius_m": 0.0},
+        {"kind": "sphere", "radius_m": float("nan")}, {"kind": "sphere", "radius_m": [0.02]},
+        line | {"point_base": [0.0, 1.0]}, line | {"direction_base": 3.0},
+        step | {"corners": {}}, step | {"corners": {"near": []}}, step | {"corners": 3.0},
+        step | {"corners": {"near": [[0.0, 1.0]]}}, step | {"sigma_m": None},
+    ):  # fmt: skip
         with pytest.raises(InputError, match="cannot be read"):
             target_of(broken)

@@ -60,11 +60,15 @@ class LiveSensor:
         self.sent: list[Recorded] = []
         self._count = 0
 
-    def give(self, message: Recorded) -> None:
-        """Publish a message; at most two are on their way, so that topics stay in step."""
+    def publish(self, message: Recorded) -> None:
+        """Publish a message, whether or not it is taken."""
         self.sent.append(message)
         self._count += 1
         self._publishers[message.kind].publish(filled(TYPES[message.kind](), message.fields))
+
+    def give(self, message: Recorded) -> None:
+        """Publish a message; at most two are on their way, so that topics stay in step."""
+        self.publish(message)
         inputs = self.node.inputs
 
         def near() -> bool:

@@ -1,16 +1,19 @@
 """hand_eye_node over DDS: a simulated robot brings a laser sensor before a sphere."""
 
+import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from command import robocal_json
 from geometry_msgs.msg import TransformStamped
-from hand_eye_driver import ARM, FRAME, TYPE, Recorded, joints, profile, sphere_set
+from hand_eye_driver import ARM, FRAME, RADIUS_M, TYPE, Recorded, Robot, joints, profile, sphere_set
 from hand_eye_live import NAME, SHOTS, LiveSensor, settings_of
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import (
+    CaptureHandEye,
     CheckHandEyePlan,
     Decide,
     HandEyeFile,
@@ -23,12 +26,19 @@ from tf2_msgs.msg import TFMessage
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.targets import LineTarget
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.diagnostics import ERROR
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.nodes.tool_messages import pose_message
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.hand_eye_data import Capture
 from robocal_ros.storage.bags import BagWriter, read_bag
+from robocal_ros.storage.hand_eye_targets import write_target
+
+NO_TEXT = "\ud800"  # cannot be carried: it has no UTF-8
 
 
 def matrix(transform: Any) -> np.ndarray:
@@ -201,6 +211,30 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
     assert call("remove") == (True, "0 ACCEPT capture 8 removed, 7 samples are left")
 
 
+def test_a_capture_comes_after_all_that_the_node_has_received(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    """A node that was busy has joint states and profiles in its queues: none of them is taken."""
+    assert sensor.start().success
+    assert sensor.ask_capture().success
+    assert graph.call(RemoveHandEye, f"{NAME}/remove", handle=1).success
+    robot = sensor.robot
+    backlog = Robot(sensor.publish)
+    backlog.q, backlog.now_ns = robot.q, robot.now_ns
+    backlog.rest(0.9, SHOTS[1][1])
+    asked = graph._clients[f"{NAME}/capture"].call_async(CaptureHandEye.Request())
+    time.sleep(0.3)  # all is in the queues of the node, which does not spin, and the call too
+    graph.spin_until(asked.done, "the answer")
+    assert asked.result().handle == 2
+    robot.now_ns = backlog.now_ns
+    graph.spin_for(0.2)
+    assert sensor.of(2).state == HandEyeSample.WAITING
+    robot.rest(0.8, SHOTS[0][1])
+    assert sensor.ended(2).state == HandEyeSample.CAPTURED
+    stamp = sensor.of(2).stamp
+    assert stamp.sec * 10**9 + stamp.nanosec >= backlog.now_ns
+
+
 def test_a_frame_with_another_parent_is_not_accepted(graph: Any, sensor: LiveSensor) -> None:
     sensor.sphere(8)
     result = sensor.calibrate()
@@ -286,7 +320,9 @@ def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
     graph: Any, sensor: LiveSensor
 ) -> None:
     """The third profile is one of another pose."""
+    quality = graph.collect(CalibrationQuality, f"{NAME}/quality", qos.LATCHED)
     assert sensor.start().success
+    assert sensor.status[-1].header.frame_id == "tool0"
     for number, (q, shot) in enumerate(SHOTS[:10], 1):
         sensor.robot.move(q, 0.2)
         assert sensor.capture(SHOTS[11][1] if number == 3 else shot).handle == number
@@ -294,12 +330,90 @@ def test_a_sample_that_does_not_fit_is_rejected_by_its_handle(
     assert result.candidate_id, result.message
     assert [told.partition(":")[0] for told in result.rejected] == ["3"]
     assert result.samples == 9
+    graph.spin_until(lambda: quality, "the verdict")
+    assert list(quality[-1].rejected) == ["3"]
+
+
+def test_the_verdict_names_the_directions_that_stay_open() -> None:
+    """Without a candidate there are no figures, but the reason and the directions."""
+    published: list[Any] = []
+    add: Any = lambda *_: SimpleNamespace(publish=published.append)  # noqa: E731
+    open_ways = {"unobservable": ["along the light", "about z"]}
+    refused = Outcome(Command("calibrate"), Code.RANK_DEFICIENT, "not determined", open_ways)
+    HandEyeOutputs(add, "ur10", "K7").quality(refused, "tool0", None)
+    assert list(published[0].unobservable) == open_ways["unobservable"]
+    assert (published[0].code, published[0].accept) == (Code.RANK_DEFICIENT, False)
+    assert published[0].reason == "not determined"
+
+
+def test_settings_reach_the_session(graph: Any, tmp_path: Path) -> None:
+    sensor = LiveSensor(graph, tmp_path, robot_sigma_mm=0.04, robot_sigma_deg=0.01, limit_mm=0.7)
+    config = sensor.node._session.config
+    assert config.robot_sigma_m == pytest.approx(4e-5)
+    assert config.robot_sigma_rad == pytest.approx(np.radians(0.01))
+    assert config.limit_m == pytest.approx(7e-4)
+    assert sensor.start(target=HandEyeStatus.CAMERA, mount=HandEyeStatus.FIXED).success
+    graph.spin_until(lambda: sensor.status[-1].mount == HandEyeStatus.FIXED, "the status")
+    assert sensor.status[-1].header.frame_id == "base"
 
 
 def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
     for frame in ("", "tool0"):
         node = graph.add(HandEyeNode, settings_of(tmp_path, sensor_frame=frame))
         assert node.state == "unconfigured"
+
+
+def test_a_status_that_cannot_be_carried_takes_no_answer_from_its_caller(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    assert sensor.start().success
+    sensor.node._session.data.captures[7] = Capture(7, "", 0, NO_TEXT, Code.ACCEPT)
+    assert sensor.ask_capture().handle == 1
+    missing = graph.call(RemoveHandEye, f"{NAME}/remove", handle=99)
+    assert (missing.success, missing.message) == (False, "no capture 99; there are 7, 1")
+    gone = graph.call(RemoveHandEye, f"{NAME}/remove", handle=1)
+    assert gone.message == "capture 1 removed, 0 samples are left"
+    assert sensor.calibrate().status == Code.TOO_FEW_SAMPLES
+    assert sensor.ask_capture().handle == 2
+    assert graph.call(RemoveHandEye, f"{NAME}/remove", handle=7).success
+    graph.spin_until(lambda: [s.handle for s in sensor.status[-1].samples] == [2], "the status")
+
+
+def test_the_desk_answers_each_caller_though_nothing_can_be_shown(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    """Whoever uses it: an outcome that cannot be published is logged, its caller is answered."""
+    assert sensor.start().success
+    shown = []
+
+    def show(outcome: Any) -> None:
+        shown.append(outcome)
+        sensor.node._outputs._status.publish(HandEyeStatus(last_message=NO_TEXT))
+
+    sensor.node._desk._show = show
+    assert sensor.ask_capture().handle == 1
+    assert sensor.calibrate().status == Code.TOO_FEW_SAMPLES
+    assert graph.call(RemoveHandEye, f"{NAME}/remove", handle=1).success
+    assert [outcome.command.name for outcome in shown] == ["capture", "calibrate", "remove"]
+
+
+def test_a_configured_file_counts_for_the_target_that_it_describes(
+    graph: Any, sensor: LiveSensor, tmp_path: Path
+) -> None:
+    assert sensor.start(target=HandEyeStatus.LINE).success  # of the line nothing is known
+    assert sensor.node._session.data.target == {"kind": "line"}
+    assert sensor.start(target=HandEyeStatus.CAMERA).success
+    assert sensor.start(target=HandEyeStatus.CAMERA, mount=HandEyeStatus.FIXED).success
+    refused = sensor.start(target=HandEyeStatus.STEP)
+    assert (refused.success, refused.status) == (False, Code.BAD_INPUT)
+    assert "describes a sphere: name the file that describes the step" in refused.message
+    line = tmp_path / "line.yaml"
+    write_target(line, LineTarget(np.array([0.7, 0.0, 0.1]), np.array([1.0, 0.0, 0.0])))
+    assert not sensor.start(target_file=str(line)).success  # named, so it is meant
+    assert sensor.start(target=HandEyeStatus.LINE, target_file=str(line)).success
+    assert sensor.node._session.data.target["point_base"] == pytest.approx([0.7, 0.0, 0.1])
+    assert sensor.start().success
+    assert sensor.node._session.data.target["radius_m"] == RADIUS_M
 
 
 def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> None:
@@ -322,7 +436,14 @@ def test_joint_states_that_stop_end_a_capture(graph: Any, tmp_path: Path) -> Non
 def test_nothing_is_left_of_an_earlier_session(graph: Any, sensor: LiveSensor) -> None:
     assert sensor.start().success
     assert sensor.ask_capture().success
+    events = graph.collect(SessionEvent, f"{NAME}/session_events", EVENTS)
     sensor.node.trigger_deactivate()
+    graph.spin_until(lambda: sensor.status[-1].state == HandEyeStatus.IDLE, "it is idle")
+    (failed,) = sensor.status[-1].samples
+    assert (failed.handle, failed.state) == (1, HandEyeSample.FAILED)
+    assert failed.status == Code.CONFLICT
+    assert sensor.status[-1].last_message.startswith("capture 1: the node was deactivated")
+    graph.spin_until(lambda: events and events[-1].command == "break_off", "the event")
     inactive = sensor.ask_capture()
     assert (inactive.success, inactive.status) == (False, Code.CONFLICT)
     sensor.node.trigger_activate()

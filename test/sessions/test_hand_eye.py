@@ -15,6 +15,7 @@ from hand_eye_driver import (
     Driver,
     Recorded,
     joints,
+    namespace,
     profile,
     sphere_set,
     sphere_shots_of,
@@ -30,13 +31,14 @@ from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.target_documents import target_document
 from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
 from robocal_ros.core.proposals import THERMAL, hand_eye_kind
-from robocal_ros.sessions import events
+from robocal_ros.sessions import events, hand_eye_shots
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import data_set_begun, data_set_of
 from robocal_ros.sessions.hand_eye_planning import judged_plan
 from robocal_ros.sessions.hand_eye_recorded import configuration, hand_eye_session_as_recorded
+from robocal_ros.sessions.hand_eye_shots import MOST_BYTES, MOST_KEPT, Shot, ShotLog
 from robocal_ros.sessions.records import digest
 from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, groove_shots, step_shots
@@ -114,19 +116,30 @@ def test_each_sample_is_a_command_that_names_its_shot(history):
     assert sample.q == pytest.approx(np.mean(near, axis=0), abs=1e-15)
     q, _ = SHOTS[2]
     assert sample.q == pytest.approx(q, abs=1e-7)  # the readings scatter by that
-    assert sample.T_base_flange == pytest.approx(ARM.fk(sample.q), abs=0)
 
 
-def test_flange_poses_come_from_the_thermal_model_in_force(history):
-    warm = ARM.with_mdh(ARM.mdh * 1.0002)
-    bring_into_force(history, THERMAL, ARM, model_document(warm), "test")
-    driver = begun(history)
-    driver.ask(events.CAPTURE)
-    driver.robot.rest(0.7, SHOTS[0][1])
-    (sample,) = driver.session.data.samples.values()
-    assert sample.T_base_flange == pytest.approx(warm.fk(sample.q), abs=0)
-    moved = np.linalg.norm((warm.fk(sample.q) - ARM.fk(sample.q))[:3, 3])
+WARM = ARM.with_mdh(ARM.mdh * 1.0002)
+
+
+def test_flange_poses_of_all_samples_come_from_the_thermal_model_in_force(history):
+    """Also of those that were captured before it came into force; its revision is the one told."""
+    driver = driver_of(history)
+    driver.sphere(10)
+    cold = driver.ask(events.CALIBRATE)
+    bring_into_force(history, THERMAL, ARM, model_document(WARM), "test")
+    warm = driver.ask(events.CALIBRATE)
+    moved = np.linalg.norm((WARM.fk(SHOTS[0][0]) - ARM.fk(SHOTS[0][0]))[:3, 3])
     assert moved > 1e-4
+    for outcome, arm, revision in ((cold, ARM, 0), (warm, WARM, 1)):
+        inputs = history.inputs(outcome.calibration_id)
+        assert inputs["T_base_flange"] == pytest.approx(arm.fk(inputs["q"]), abs=0)
+        assert history.model(outcome.calibration_id)["thermal_revision"] == revision
+    assert digest(warm.document) != digest(cold.document)
+    # so a replay, whose history has only what was in force at the beginning, finds the same
+    assert "model" not in cold.command.arguments
+    obeyed = json.loads(json.dumps(dict(warm.command.arguments)))
+    history.rollback(None, by="me", reason="", expected_head=1, wall_ns=9, kind=THERMAL)
+    assert digest(driver.ask(events.CALIBRATE, **obeyed).document) == digest(warm.document)
 
 
 def test_a_subset_is_calibrated_and_a_removed_sample_is_gone(history):
@@ -256,6 +269,83 @@ def test_a_capture_takes_the_first_shot_at_standstill_not_one_from_before(histor
     assert sample.values == pytest.approx(np.float32(_seen(0)).astype(float), abs=0)
 
 
+def test_a_capture_takes_no_shot_that_was_received_before_it(history):
+    """Not even one that is stamped a little ahead of the joint states."""
+    driver = begun(history)
+    ahead_ns = driver.robot.now_ns + 400_000_000
+    driver.give(SHOTS[1][1](ahead_ns))
+    asked = driver.ask(events.CAPTURE)
+    assert asked.command.arguments["from_ns"] == ahead_ns + 1  # a replay obeys it
+    driver.robot.rest(1.2, SHOTS[0][1])
+    (sample,) = driver.session.data.samples.values()
+    assert sample.stamp_ns > ahead_ns
+    assert sample.values == pytest.approx(np.float32(_seen(0)).astype(float), abs=0)
+    again = driver.ask(events.CAPTURE)
+    newest = max(m.stamp_ns for m in driver.recorded if isinstance(m, Recorded))
+    assert again.command.arguments["from_ns"] == newest
+    # a replay in which messages of the topics come in another order keeps to the recorded bound
+    driver.ask(events.REMOVE, handle=2)
+    late = driver.ask(events.CAPTURE, from_ns=newest + 500_000_000)
+    driver.robot.rest(1.2, SHOTS[0][1])
+    assert driver.session.data.samples[3].stamp_ns >= late.command.arguments["from_ns"]
+
+
+def test_shots_are_not_read_while_nobody_asks_and_little_is_kept(history, monkeypatch):
+    driver = begun(history)
+    read = []
+    points = hand_eye_shots.cloud_points
+    monkeypatch.setattr(hand_eye_shots, "cloud_points", lambda m: read.append(m) or points(m))
+    driver.robot.rest(1.0, SHOTS[0][1])
+    assert not read
+    driver.ask(events.CAPTURE)
+    driver.robot.rest(0.7, SHOTS[0][1])
+    assert 0 < len(read) < 7
+    log = ShotLog()
+    for i in range(3 * MOST_KEPT):
+        log.add(Shot("profile", i, FRAME, namespace({"data": b"x" * 1_000_000})), FRAME, 0)
+    kept = list(log.since("profile", 0))
+    assert sum(shot.size for shot in kept) <= MOST_BYTES
+    assert kept[-1].stamp_ns == 3 * MOST_KEPT - 1
+    assert len(kept) == MOST_BYTES // 1_000_000
+
+
+def test_the_given_error_of_the_robot_is_the_one_that_is_used(history):
+    """The error to expect is that of the robot's poses, four times as large, and the profiles'."""
+    told = {}
+    for sigma in (5e-5, 2e-4):
+        driver = driver_of(history, robot_sigma_m=sigma, robot_sigma_rad=1e-5)
+        driver.sphere(10)
+        told[sigma] = driver.ask(events.CALIBRATE).document["working_error_mm"]
+    assert 2.0 < told[2e-4] / told[5e-5] <= 4.0
+
+
+def test_without_a_candidate_the_twin_says_what_gives_one(history):
+    told = driver_of(history).ask(events.ACCEPT, choose="only", by="me")
+    assert told.message == "no fresh candidate is pending: calibrate first"
+
+
+def test_a_clock_that_jumps_ahead_is_told_as_that(history):
+    driver = begun(history)
+    driver.ask(events.CAPTURE)
+    driver.robot.now_ns += 3600 * 10**9
+    driver.robot.rest(0.2)
+    failed = last_capture(driver)
+    assert failed.code is Code.CONFLICT
+    assert failed.reason.startswith("the joint states' clock jumped by 3600.0 s")
+    driver.ask(events.CAPTURE)
+    driver.robot.rest(0.9, SHOTS[0][1])
+    assert last_capture(driver).code is Code.ACCEPT
+
+
+def test_a_calibration_that_fails_leaves_no_earlier_candidate(history):
+    driver = driver_of(history)
+    driver.sphere(8)
+    first = driver.ask(events.CALIBRATE)
+    assert driver.session.data.candidate == first.calibration_id > 0
+    assert not driver.ask(events.CALIBRATE, handles=[99]).done
+    assert driver.session.data.candidate == 0
+
+
 def _seen(number):
     points = sphere_set()[1].profiles[number]
     return points[np.isfinite(points).all(axis=1)]
@@ -375,7 +465,7 @@ def test_a_data_set_that_nothing_answers_for_is_refused(history, words):
 def test_a_mark_must_be_one_of_the_target(history):
     driver = begun(history)
     assert "none of the target's: none" in driver.ask(events.CAPTURE, mark="near").message
-    stairs = {"kind": "step", "corners": {"near": [[0, 0, 0]], "far": [[0, 0, 0]]}}
+    stairs = target_document("step", STEP)
     assert driver.ask(events.START, **(SPHERE | {"target": stairs})).done
     assert driver.ask(events.CAPTURE).status is Code.BAD_INPUT
     assert driver.ask(events.CAPTURE, mark="far").done
@@ -450,7 +540,7 @@ def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):
     first = driver.ask(events.CALIBRATE)
     path = tmp_path / "set.mcap"
     data = driver.session.data
-    write_data_set(path, data.document(), data.topic, FRAME, ARM)
+    write_data_set(path, driver.session.document(), data.topic, FRAME, ARM)
     with CalibrationHistory.open("K2", state_dir=tmp_path) as other:
         fresh = driver_of(other)
         loaded = fresh.ask(events.LOAD, path=str(path), set=read_data_set(path, ARM))
@@ -460,14 +550,76 @@ def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):
         assert other.model(again.calibration_id) == history.model(first.calibration_id)
         fresh.robot.rest(0.1)
         assert fresh.ask(events.CAPTURE).command.arguments["handle"] == 11
+        # with another thermal model in force it cannot be identical, and that is said
+        bring_into_force(other, THERMAL, ARM, model_document(WARM), "test")
+        moved = fresh.ask(events.LOAD, path=str(path), set=read_data_set(path, ARM))
+        assert moved.message.endswith(
+            "its flange poses come from thermal revision 1 now, when it was saved they came from "
+            "revision 0"
+        )
+        assert digest(fresh.ask(events.CALIBRATE).document) != digest(first.document)
+
+
+POINTS = [[1e-3 * i, 0.2] for i in range(12)]
+ROW = {"handle": 1, "mark": "", "stamp_ns": 1, "q": [0.0] * 6, "values": POINTS}
+
+
+def rows(count: int, points: int = 12) -> list[dict]:
+    return [ROW | {"handle": i + 1, "values": POINTS * (points // 12)} for i in range(count)]
+
+
+BAD_SETS = {
+    "handle 0": {"samples": [ROW | {"handle": 0}]},
+    "handle -1": {"samples": [ROW | {"handle": -1}]},
+    "handle 4294967296": {"samples": [ROW | {"handle": 2**32}]},
+    "handle 1.5": {"samples": [ROW | {"handle": 1.5}]},
+    "two samples of handle 1": {"samples": [ROW, ROW]},
+    "mark 'near' is none": {"samples": [ROW | {"mark": "near"}]},
+    "501 samples": {"samples": rows(501)},
+    "points in 21 samples": {"samples": rows(21, 12_000)},
+    "no time stamp": {"samples": [ROW | {"stamp_ns": 0}]},
+    "profile of sample 1 has 3 points": {"samples": [ROW | {"values": POINTS[:3]}]},
+    "is no pose": {"target": {"kind": "camera"}, "samples": [ROW | {"values": [[0.0] * 7]}]},
+    "target cannot be read": {"target": {"kind": "sphere", "radius_m": -1.0}},
+    "nothing is known of the sphere": {"target": {"kind": "sphere"}},
+    "cannot be read": {"target": {"kind": "cone"}},
+}
+
+
+@pytest.mark.parametrize("words", list(BAD_SETS))
+def test_a_file_that_is_refused_replaces_nothing(history, words):
+    driver = begun(history)
+    driver.ask(events.CAPTURE)
+    driver.robot.rest(0.7, SHOTS[0][1])
+    before = driver.session.data
+    refused = driver.ask(events.LOAD, path="x", set=SPHERE | {"samples": [ROW]} | BAD_SETS[words])
+    assert not refused.done
+    assert words in refused.message
+    assert driver.session.data is before
+    assert driver.ask(events.CAPTURE).command.arguments["handle"] == 2
+
+
+def test_handles_end_where_a_message_can_no_longer_carry_them(history):
+    driver = begun(history)
+    full = SPHERE | {"samples": [ROW | {"handle": 2**32 - 1}]}
+    assert driver.ask(events.LOAD, path="x", set=full).done
+    refused = driver.ask(events.CAPTURE)
+    assert refused.status is Code.LIMIT_EXCEEDED
+    assert "4294967295" in refused.message
+
+
+def test_a_data_set_holds_so_many_captures_and_no_more(history):
+    driver = begun(history)
+    assert driver.ask(events.LOAD, path="x", set=SPHERE | {"samples": rows(499)}).done
+    assert driver.ask(events.CAPTURE).done
+    driver.robot.rest(0.7, SHOTS[0][1])
+    refused = driver.ask(events.CAPTURE)
+    assert refused.status is Code.LIMIT_EXCEEDED
+    assert refused.message.startswith("500 captures")
 
 
 def test_a_data_set_that_is_none_is_refused():
-    whole = SPHERE | {
-        "samples": [
-            {"handle": 1, "mark": "", "stamp_ns": 1, "q": [0.0] * 6, "values": [[0.0, 0.2]] * 10}
-        ]
-    }
+    whole = SPHERE | {"samples": [ROW]}
     assert len(data_set_of(json.loads(json.dumps(whole)), ARM).samples) == 1
     (sample,) = whole["samples"]
     for broken in (
@@ -492,6 +644,14 @@ def test_a_session_begins_where_a_recorded_one_did(history, tmp_path):
         again = hand_eye_session_as_recorded(ARM, other, told, "test")
         assert again.config == driver.session.config
         assert again.in_force.model == driver.session.in_force.model
+
+
+@pytest.mark.parametrize("name", ["config", "model", "sensor"])
+def test_a_recording_that_lacks_a_setting_is_refused(history, name):
+    configured = configuration(driver_of(history).session, {})
+    left = {key: value for key, value in configured.arguments.items() if key != name}
+    with pytest.raises(InputError, match=f"lacks {name}"):
+        hand_eye_session_as_recorded(ARM, history, Command(configured.name, left), "test")
 
 
 def test_what_is_decided_elsewhere_is_taken_over(history):

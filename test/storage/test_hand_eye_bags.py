@@ -66,7 +66,7 @@ def test_what_is_no_data_set_of_this_robot_is_refused(tmp_path):
     write_data_set(path, data_set(), PROFILE, "laser", ARM)
     with pytest.raises(InputError, match="there already"):
         write_data_set(path, data_set(), PROFILE, "laser", ARM)
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match=f"cannot be written: no folder {tmp_path / 'none'}"):
         write_data_set(tmp_path / "none" / "set.mcap", data_set(), PROFILE, "laser", ARM)
     with pytest.raises(WrongRobotError, match="made with robot 'UR10'"):
         read_data_set(path, load_robot("kr150_r3100"))
@@ -75,3 +75,12 @@ def test_what_is_no_data_set_of_this_robot_is_refused(tmp_path):
     (tmp_path / "text.mcap").write_text("no bag")
     with pytest.raises(InputError):
         read_data_set(tmp_path / "text.mcap", ARM)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.7, 0.95])
+def test_a_file_that_was_cut_off_is_told_as_that(tmp_path, share):
+    whole, cut = tmp_path / "set.mcap", tmp_path / "cut.mcap"
+    write_data_set(whole, data_set(points=400), PROFILE, "laser", ARM)
+    cut.write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
+    with pytest.raises(InputError, match="truncated"):
+        read_data_set(cut, ARM)

@@ -15,6 +15,9 @@ Document = dict[str, Any]
 Target = SphereTarget | StepTarget | LineTarget
 
 KIND_OF: dict[type[Target], str] = {SphereTarget: "sphere", StepTarget: "step", LineTarget: "line"}
+SHAPE_OF = {
+    "T_base_user": (4, 4), "edge_user": (3,), "point_base": (3,), "direction_base": (3,),
+}  # fmt: skip
 TYPE_OF = {kind: type_ for type_, kind in KIND_OF.items()}
 
 
@@ -45,9 +48,27 @@ def target_of(document: Mapping[str, Any]) -> Target | None:
     if not values:
         return None
     try:
-        return TYPE_OF[document["kind"]](**values)
+        target = TYPE_OF[document["kind"]](**values)
+        for field in fields(target):
+            _require_numbers(field.name, getattr(target, field.name))
+        return target
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the target cannot be read: {error}") from error
+
+
+def _require_numbers(name: str, value: Any) -> None:
+    """Raise ValueError where a value has another shape, or is not finite."""
+    if name == "corners":
+        if not isinstance(value, Mapping) or not value:
+            raise ValueError("corners has no mark")
+        for mark, rows in value.items():
+            _require_numbers(f"corners of {mark}", rows)
+        return
+    shape = SHAPE_OF.get(name, (max(len(value), 1), 3) if name.startswith("corners") else ())
+    if np.shape(value) != shape or not np.all(np.isfinite(np.asarray(value, dtype=np.float64))):
+        raise ValueError(f"{name} must be finite numbers of shape {shape}")
+    if name == "radius_m" and not value > 0.0:
+        raise ValueError(f"radius_m is {value}")
 
 
 def _plain(value: Any) -> Any:
