@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
-from sensor_msgs.msg import JointState, PointCloud2
+from sensor_msgs.msg import Image, JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.core.errors import InputError, RobocalError
@@ -29,7 +29,7 @@ from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_recorded import configuration
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.silence import Silence
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -41,6 +41,7 @@ INPUTS = {
     JOINTS: (JointState, STREAM),
     PROFILE: (PointCloud2, qos.SENSOR),
     TARGET_POSE: (PoseStamped, qos.SENSOR),
+    IMAGE: (Image, qos.SENSOR),
 }
 
 

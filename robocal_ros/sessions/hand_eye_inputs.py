@@ -5,7 +5,14 @@ from typing import Any
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE, pose_shot, profile_shot
+from robocal_ros.sessions.hand_eye_images import image_shot
+from robocal_ros.sessions.hand_eye_shots import (
+    IMAGE,
+    PROFILE,
+    TARGET_POSE,
+    pose_shot,
+    profile_shot,
+)
 from robocal_ros.sessions.observations import JOINTS
 
 
@@ -18,5 +25,7 @@ def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> N
             session.add(profile_shot(message))
         elif kind == TARGET_POSE:
             session.add(pose_shot(message))
+        elif kind == IMAGE:
+            session.add(image_shot(message))
     except RobocalError as error:
         session.refuse(kind, error)

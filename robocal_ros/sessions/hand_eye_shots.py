@@ -1,4 +1,4 @@
-"""What the sensor sent: profiles and target poses, kept until a capture takes them."""
+"""What the sensor sent: profiles, target poses and images, kept until a capture takes them."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -16,25 +16,27 @@ from robocal_ros.core.samples import pose_sample, stamp_ns
 
 Array = NDArray[np.float64]
 
-PROFILE, TARGET_POSE = "profile", "target_pose"
-SHOTS = (PROFILE, TARGET_POSE)
+PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
+SHOTS = (PROFILE, TARGET_POSE, IMAGE)
 PLANE_M = 1e-5  # a profile's points lie so near to y = 0
 MOST_KEPT = 500
+MOST_IMAGE_BYTES = 2**28  # of all images that are kept
 AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One profile or target pose.
+    """One profile, target pose or image.
 
     ``values``: of a profile its points (n, 2), x and z, m, sensor frame; of a target pose
-    (1, 7) position, m, and quaternion x, y, z, w of the target in the sensor frame.
+    (1, 7) position, m, and quaternion x, y, z, w of the target in the sensor frame; of an image
+    its grey pixels (h, w), 8 bits.
     """
 
     topic: str
     stamp_ns: int
     frame: str
-    values: Array
+    values: NDArray[Any]
 
 
 def profile_shot(message: Any) -> Shot:
@@ -105,6 +107,17 @@ class ShotLog:
                 "states: stamp both on one clock"
             )
         self._shots.append(shot)
+        self._drop_images()
+
+    def _drop_images(self) -> None:
+        """Forget the oldest images beyond the memory that they may take, never the newest."""
+        images = [s for s in self._shots if s.topic == IMAGE]
+        taken = sum(s.values.nbytes for s in images)
+        for oldest in images[:-1]:
+            if taken <= MOST_IMAGE_BYTES:
+                return
+            self._shots.remove(oldest)
+            taken -= oldest.values.nbytes
 
     def since(self, topic: str, from_ns: int) -> Iterator[Shot]:
         """Shots of a topic from a stamp on, by stamp."""

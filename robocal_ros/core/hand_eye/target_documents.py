@@ -8,13 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.core.hand_eye.targets import BoardTarget, LineTarget, SphereTarget, StepTarget
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
-Target = SphereTarget | StepTarget | LineTarget
+Target = SphereTarget | StepTarget | LineTarget | BoardTarget
 
-KIND_OF: dict[type[Target], str] = {SphereTarget: "sphere", StepTarget: "step", LineTarget: "line"}
+KIND_OF: dict[type[Target], str] = {
+    SphereTarget: "sphere",
+    StepTarget: "step",
+    LineTarget: "line",
+    BoardTarget: "camera",  # the target of a camera, of which more is known
+}
 TYPE_OF = {kind: type_ for type_, kind in KIND_OF.items()}
 
 
