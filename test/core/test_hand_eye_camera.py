@@ -415,6 +415,19 @@ def test_intrinsics_and_their_sigma_from_corners() -> None:
     assert sound(float(e @ np.linalg.solve(found.covariance, e)), 9)
 
 
+def test_intrinsics_come_again_to_the_last_bit() -> None:
+    import cv2
+
+    _, corners = pixels(BoardCell(), 12, 20)
+    names, threads = [str(i) for i in range(12)], cv2.getNumThreads()
+    first, *others = (boards_of_corners(names, corners, BOARD, (640, 480)) for _ in range(12))
+    for other in others:
+        assert np.array_equal(other.intrinsics.matrix, first.intrinsics.matrix)
+        assert np.array_equal(other.T_camera_board, first.T_camera_board)
+        assert np.array_equal(other.covariance, first.covariance)
+    assert cv2.getNumThreads() == threads
+
+
 def test_an_image_of_something_else_is_left_out() -> None:
     _, corners = pixels(BoardCell(), 12, 21)
     corners[4] += np.random.default_rng(0).standard_normal(corners[4].shape) * 3.0

@@ -24,7 +24,8 @@ BOARD_FILE = f"kind: board\ncolumns: {COLUMNS}\nrows: {ROWS}\nsquare_mm: {SQUARE
 INTRINSICS_FILE = f"""\
 image_width: {LENS.width}
 image_height: {LENS.height}
-camera_matrix: {{rows: 3, cols: 3, data: [{LENS.fx}, 0, {LENS.cx}, 0, {LENS.fy}, {LENS.cy}, 0, 0, 1]}}
+camera_matrix:
+  {{rows: 3, cols: 3, data: [{LENS.fx}, 0, {LENS.cx}, 0, {LENS.fy}, {LENS.cy}, 0, 0, 1]}}
 distortion_model: plumb_bob
 distortion_coefficients: {{rows: 1, cols: 5, data: [{LENS.k1}, {LENS.k2}, 0, 0, 0]}}
 """

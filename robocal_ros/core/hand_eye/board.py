@@ -236,7 +236,12 @@ def _calibrate(corners: Array, board: Chessboard, size: tuple[int, int]) -> Intr
 
     points = [board.points.astype(np.float32)] * len(corners)
     seen = list(corners.astype(np.float32))
-    _, matrix, distortion, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # several add up in any order: the last bits would not come again
+    try:
+        _, matrix, distortion, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
+    finally:
+        cv2.setNumThreads(threads)
     return Intrinsics(
         np.asarray(matrix, dtype=np.float64),
         np.asarray(distortion, dtype=np.float64).ravel(),
