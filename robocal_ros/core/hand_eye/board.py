@@ -178,6 +178,8 @@ def boards_of_corners(
     ------
     TooFewSamplesError, RankDeficientError
         As `see_boards`.
+    InputError
+        When no camera sees a board as the corners lie.
     """
     out = dict(rejected or {})
     _require(len(names), intrinsics, out)
