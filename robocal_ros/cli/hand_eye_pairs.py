@@ -70,6 +70,7 @@ def _arm(args: argparse.Namespace) -> "SerialArm | None":
 
 def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
     from robocal_ros.core.hand_eye.board import Chessboard
+    from robocal_ros.core.hand_eye.board_pairs import intrinsics_document
     from robocal_ros.core.hand_eye.camera import calibrate_camera
     from robocal_ros.storage.camera_files import read_intrinsics
 
@@ -85,7 +86,7 @@ def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandE
         settings,
         check=check,
         rejected=seen.rejected,
-        more={"intrinsics": _intrinsics_document(seen, intrinsics is None)},
+        more={"intrinsics": intrinsics_document(seen, intrinsics is None)},
     )
 
 
@@ -93,40 +94,14 @@ def _pairs_of_images(
     path: Path, args: argparse.Namespace, board: "Chessboard", intrinsics: "Intrinsics | None"
 ) -> "tuple[PosePairs, SeenBoards]":
     from robocal_ros.core.hand_eye.board import see_boards
-    from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.core.hand_eye.board_pairs import board_pairs
     from robocal_ros.storage.camera_files import read_images
 
     table = _read(path, args, "image")
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
-    row = {name: index for index, name in enumerate(table.names)}
-    pairs = PosePairs(
-        T_base_flange=table.T_base_flange[[row[name] for name in seen.names]],
-        T_camera_board=seen.T_camera_board,
-        names=seen.names,
-        mount=args.mount,
-        covariance=seen.covariance,
-        shared=seen.shared,
-    )
+    pairs = board_pairs(seen, table.names, table.T_base_flange, args.mount)
     return pairs, replace(seen, rejected=unread | seen.rejected)
-
-
-def _intrinsics_document(seen: "SeenBoards", from_images: bool) -> dict[str, Any]:
-    camera = seen.intrinsics
-    return {
-        "from_images": from_images,
-        "fx_px": float(camera.matrix[0, 0]),
-        "fy_px": float(camera.matrix[1, 1]),
-        "cx_px": float(camera.matrix[0, 2]),
-        "cy_px": float(camera.matrix[1, 2]),
-        "distortion": camera.distortion.tolist(),
-        "width_px": camera.size[0],
-        "height_px": camera.size[1],
-        "sigma": None
-        if camera.covariance is None
-        else [float(variance) ** 0.5 for variance in camera.covariance.diagonal()],
-        "noise_px": seen.noise_px,
-    }
 
 
 def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":

@@ -205,11 +205,12 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Ta
 def read_target_of(kind: str, path: Path) -> "Target":
     """Read a target file of this kind. Raises as `given_target`."""
     from robocal_ros.core.hand_eye.target_documents import KIND_OF
+    from robocal_ros.core.hand_eye.targets import BoardTarget
     from robocal_ros.storage.hand_eye_targets import read_target
 
     target = read_target(path)
     found = KIND_OF[type(target)]
-    if found != kind:
+    if isinstance(target, BoardTarget) or found != kind:
         raise InputError(f"describes a {found}, not a {kind}", file=str(path))
     return target
 

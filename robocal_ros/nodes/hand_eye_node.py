@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from sensor_msgs.msg import JointState, PointCloud2
+from sensor_msgs.msg import Image, JointState, PointCloud2
 
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
@@ -32,7 +32,7 @@ from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_recorded import configuration
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.silence import Silence
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -44,6 +44,7 @@ INPUTS = {
     JOINTS: (JointState, qos.STREAM),
     PROFILE: (PointCloud2, qos.SENSOR),
     TARGET_POSE: (PoseStamped, qos.SENSOR),
+    IMAGE: (Image, qos.SENSOR),
 }
 
 

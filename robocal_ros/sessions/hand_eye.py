@@ -31,9 +31,10 @@ from robocal_ros.sessions.hand_eye_data import (
     data_set_begun,
     data_set_of,
 )
+from robocal_ros.sessions.hand_eye_images import seen_corners
 from robocal_ros.sessions.hand_eye_in_force import HandEyeInForce
 from robocal_ros.sessions.hand_eye_results import HandEyeResults
-from robocal_ros.sessions.hand_eye_shots import Shot, ShotLog
+from robocal_ros.sessions.hand_eye_shots import IMAGE, Shot, ShotLog
 from robocal_ros.sessions.hand_eye_solving import require_known
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
@@ -222,7 +223,12 @@ class HandEyeSession(Commanded):
         if mean is None:
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
         handle, mark = capture.handle, capture.mark
-        words = data.put(HandEyeSample(handle, mark, at_ns, mean, shot.read()))
+        try:
+            values = seen_corners(data.target, shot) if data.topic == IMAGE else shot.read()
+            words = data.put(HandEyeSample(handle, mark, at_ns, mean, values))
+        except InputError as error:
+            capture.code, capture.reason = error.code, str(error)
+            return Outcome(command, error.code, f"capture {handle}: {error}")
         return Outcome(command, Code.ACCEPT, f"capture {handle}: {words}", samples=1)
 
     def _break_off(self, command: Command, wall_ns: int) -> Outcome:

@@ -12,7 +12,7 @@ from robocal_ros.core.errors import InputError, LimitError
 from robocal_ros.core.hand_eye.profile import profile_of
 from robocal_ros.core.hand_eye.target_documents import target_of
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -41,7 +41,7 @@ class HandEyeSample:
     mark : of a step target the mark that the laser plane lies through; else empty.
     stamp_ns : of the shot.
     q : (n,) mean of the joint readings at standstill, rad (prismatic: m).
-    values : see `hand_eye_shots.Shot`.
+    values : see `hand_eye_shots.Shot`; of an image see `hand_eye_images.seen_corners`.
     """
 
     handle: int
@@ -91,7 +91,7 @@ class DataSet:
     @property
     def topic(self) -> str:
         """The input that shows the target."""
-        return TOPIC_OF[self.kind]
+        return IMAGE if "columns" in self.target else TOPIC_OF[self.kind]
 
     @property
     def waiting(self) -> Capture | None:
@@ -112,15 +112,38 @@ class DataSet:
             raise InputError(f"mark '{mark}' is none of the target's: {words}")
 
     def put(self, sample: HandEyeSample) -> str:
-        """Add a sample; says what it is."""
+        """Add a sample; says what it is.
+
+        Raises
+        ------
+        InputError
+            When it cannot be one of this set.
+        """
         count = len(sample.values)
         seen = f"{count} points" if self.topic == PROFILE else "the target's pose"
+        if self.topic == IMAGE:
+            self._require_image(sample.values)
+            seen = f"{count - 1} corners"
         words = f"{seen}, sample {len(self.samples) + 1}"
         capture = Capture(
             sample.handle, sample.mark, sample.stamp_ns, words, Code.ACCEPT, sample.stamp_ns
         )
         self.samples[sample.handle], self.captures[sample.handle] = sample, capture
         return words
+
+    def _require_image(self, values: Array) -> None:
+        """Refuse corners of another board, or of an image of another size."""
+        count = int(self.target["columns"]) * int(self.target["rows"])
+        if len(values) != 1 + count:
+            raise InputError(f"{len(values) - 1} corners where the board has {count}")
+        first = next(iter(self.samples.values()), None)
+        expected = self.target.get("size") or (values if first is None else first.values)[0]
+        if not np.array_equal(values[0], expected):
+            found, wanted = ("{:.0f}x{:.0f} px".format(*size) for size in (values[0], expected))
+            raise InputError(
+                f"the image has {found} where {wanted} are expected, as the intrinsics or the "
+                "samples before have it: keep the camera at one resolution"
+            )
 
     def chosen(self, handles: Sequence[int]) -> list[HandEyeSample]:
         """The samples of these handles, all without any, in the order of their handles.
@@ -219,6 +242,8 @@ def _sample_of(row: Document, topic: str, arm: SerialArm) -> HandEyeSample:
         raise InputError(f"sample {handle} of the data set holds what is no number")
     if topic == PROFILE:
         profile_of(values, f"of sample {handle}")
+    elif topic == IMAGE:
+        values = values.reshape(-1, 2)
     elif values.shape != (1, 7) or abs(float(np.linalg.norm(values[0, 3:])) - 1.0) > UNIT:
         raise InputError(f"sample {handle} of the data set is no pose: {values.tolist()}")
     return HandEyeSample(handle, str(row["mark"]), at_ns, q, values)

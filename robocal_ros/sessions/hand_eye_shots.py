@@ -1,11 +1,11 @@
-"""What the sensor sent: profiles and target poses, kept until a capture takes them.
+"""What the sensor sent: profiles, target poses and images, kept until a capture takes them.
 
 They are kept as they came, and read only when a capture waits: a sensor that runs freely costs
 next to nothing while nobody asks.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,21 +16,22 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.hand_eye.profile import profile_of
+from robocal_ros.core.images import image_array
 from robocal_ros.core.point_clouds import cloud_points
 from robocal_ros.core.samples import pose_sample, stamp_ns
 
 Array = NDArray[np.float64]
 
-PROFILE, TARGET_POSE = "profile", "target_pose"
-SHOTS = (PROFILE, TARGET_POSE)
+PROFILE, TARGET_POSE, IMAGE = "profile", "target_pose", "image"
+SHOTS = (PROFILE, TARGET_POSE, IMAGE)
 PLANE_M = 1e-5  # a profile's points lie so near to y = 0
-MOST_KEPT, MOST_BYTES = 500, 64 << 20
+MOST_KEPT, MOST_BYTES = 500, 256 << 20  # an image may wait for the joints of a second
 AHEAD_NS, BEHIND_NS = 1_000_000_000, 10_000_000_000  # of the joints, when a shot arrives
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One profile (``sensor_msgs/PointCloud2``) or target pose (``geometry_msgs/PoseStamped``)."""
+    """One profile (``PointCloud2``), target pose (``PoseStamped``) or image (``Image``)."""
 
     topic: str
     stamp_ns: int
@@ -39,23 +40,24 @@ class Shot:
 
     @property
     def size(self) -> int:
-        """Bytes of a cloud's points."""
+        """Bytes of a cloud's points or an image's pixels."""
         return len(getattr(self.message, "data", ()))
 
     @cached_property
-    def _values(self) -> Array:
-        return _points(self.message) if self.topic == PROFILE else _pose(self.message)
+    def _values(self) -> NDArray[Any]:
+        return _READERS[self.topic](self.message)
 
-    def read(self) -> Array:
+    def read(self) -> NDArray[Any]:
         """Of a profile its points (n, 2), x and z, m, sensor frame; of a target pose (1, 7).
 
-        That is position, m, and quaternion x, y, z, w of the target in the sensor frame.
+        That is position, m, and quaternion x, y, z, w of the target in the sensor frame. Of an
+        image its grey pixels (h, w), 8 bits.
 
         Raises
         ------
         InputError
-            When the message is no cloud, its points are not in the plane y = 0, a value of a pose
-            is not finite or its quaternion is not of unit length.
+            When the message is no cloud or image that is read, points are not in the plane y = 0,
+            a value of a pose is not finite or its quaternion is not of unit length.
         TooFewSamplesError
             When nearly nothing was seen.
         """
@@ -85,6 +87,13 @@ def _pose(message: Any) -> Array:
     pose_sample(message)
     p, o = message.pose.position, message.pose.orientation
     return np.array([[p.x, p.y, p.z, o.x, o.y, o.z, o.w]])
+
+
+_READERS: Mapping[str, Callable[[Any], NDArray[Any]]] = {
+    PROFILE: _points,
+    TARGET_POSE: _pose,
+    IMAGE: image_array,
+}
 
 
 def target_poses(values: Array) -> Array:

@@ -22,7 +22,8 @@ from robocal_ros.sessions.hand_eye_data import (
     DataSet,
     HandEyeSample,
 )
-from robocal_ros.sessions.hand_eye_shots import target_poses
+from robocal_ros.sessions.hand_eye_images import board_of
+from robocal_ros.sessions.hand_eye_shots import IMAGE, target_poses
 
 Array = NDArray[np.float64]
 Samples = Sequence[HandEyeSample]
@@ -71,7 +72,8 @@ def solved(
     require_known(data, method)
     if not samples:
         raise TooFewSamplesError("nothing was captured yet: capture the target from several poses")
-    return _SOLVERS[data.kind](data, samples, T_base_flange, cast(Method, method), config)
+    solver = _of_images if data.topic == IMAGE else _SOLVERS[data.kind]
+    return solver(data, samples, T_base_flange, cast(Method, method), config)
 
 
 def _of_profiles(
@@ -112,6 +114,29 @@ def _of_poses(
     )
     noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)
     return calibrate_camera(pairs, CameraSettings(method, noise, config.limit_m))
+
+
+def _of_images(
+    data: DataSet, samples: Samples, T_base_flange: Array, method: Method, config: HandEyeConfig
+) -> HandEyeResult:
+    from robocal_ros.core.hand_eye.board import boards_of_corners
+    from robocal_ros.core.hand_eye.board_pairs import board_pairs, intrinsics_document
+    from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
+    from robocal_ros.core.hand_eye.camera_fit import GivenNoise
+
+    target = board_of(data.target)
+    names = tuple(str(sample.handle) for sample in samples)
+    corners = np.array([sample.values[1:] for sample in samples])
+    width, height = samples[0].values[0]
+    size = int(width), int(height)
+    seen = boards_of_corners(names, corners, target.board, size, target.intrinsics)
+    noise = GivenNoise(config.robot_sigma_m, config.robot_sigma_rad)
+    return calibrate_camera(
+        board_pairs(seen, names, T_base_flange, data.mount),
+        CameraSettings(method, noise, config.limit_m),
+        rejected=seen.rejected,
+        more={"intrinsics": intrinsics_document(seen, target.intrinsics is None)},
+    )
 
 
 _SOLVERS: Mapping[str, Solver] = {

@@ -1,8 +1,9 @@
 """Data files of a hand-eye calibration: what was captured, as an indexed MCAP of common messages.
 
-``joint_states`` holds the mean joint readings of each standstill, ``profile`` (clouds) or
-``target_pose`` what the sensor saw there, both stamped with the time of the shot, and ``data_set``
-(a JSON text) target, method, mount, robot and the samples' names.
+``joint_states`` holds the mean joint readings of each standstill, ``profile`` (clouds),
+``target_pose`` or ``image`` (its size and the board's corners, px) what the sensor saw there, both
+stamped with the time of the shot, and ``data_set`` (a JSON text) target, method, mount, robot and
+the samples' names.
 """
 
 import json
@@ -25,7 +26,12 @@ Array = NDArray[np.float64]
 Document = dict[str, Any]
 
 DATA_SET, JOINTS, PROFILE, POSE = "data_set", "joint_states", "profile", "target_pose"
-_TYPE = {PROFILE: "sensor_msgs/msg/PointCloud2", POSE: "geometry_msgs/msg/PoseStamped"}
+IMAGE = "image"
+_TYPE = {
+    PROFILE: "sensor_msgs/msg/PointCloud2",
+    POSE: "geometry_msgs/msg/PoseStamped",
+    IMAGE: "std_msgs/msg/Float64MultiArray",
+}
 _DOUBLE = 8  # of sensor_msgs/PointField
 _BYTES = 24  # of a point
 
@@ -38,7 +44,7 @@ def write_data_set(
     Parameters
     ----------
     document : of the data set, with its ``samples`` in SI.
-    topic : ``profile`` or ``target_pose``; ``frame``: the sensor's.
+    topic : ``profile``, ``target_pose`` or ``image``; ``frame``: the sensor's.
 
     Raises
     ------
@@ -67,13 +73,26 @@ def write_data_set(
                     "position": row["q"],
                 }
                 writer.write(JOINTS, "sensor_msgs/msg/JointState", joints, at_ns)
-                shot = _cloud(row["values"]) if topic == PROFILE else _pose(row["values"])
-                writer.write(topic, _TYPE[topic], {"header": header, **shot}, at_ns)
+                writer.write(topic, _TYPE[topic], _shot(topic, header, row["values"]), at_ns)
         draft.replace(path)
     except OSError as error:
         raise InputError(f"cannot be written: {error.strerror}", file=str(path)) from error
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _shot(topic: str, header: Document, values: Sequence[Sequence[float]]) -> Document:
+    if topic == IMAGE:
+        return _corners(values)
+    return {"header": header} | (_cloud(values) if topic == PROFILE else _pose(values))
+
+
+def _corners(values: Sequence[Sequence[float]]) -> Document:
+    """Rows of two: width and height of the image, then each corner."""
+    size = 2 * len(values)
+    layout = [("size and corners", len(values), size), ("x, y", 2, 2)]
+    dim = [{"label": label, "size": n, "stride": stride} for label, n, stride in layout]
+    return {"layout": {"dim": dim, "data_offset": 0}, "data": np.ravel(values)}
 
 
 def _cloud(points: Sequence[Sequence[float]]) -> Document:
@@ -106,7 +125,7 @@ def read_data_set(path: Path, arm: SerialArm) -> Document:
         It was made with another nominal model.
     """
     with BagReader(path) as reader:
-        found = list(reader.messages([DATA_SET, JOINTS, PROFILE, POSE]))
+        found = list(reader.messages([DATA_SET, JOINTS, *_TYPE]))
         _require_whole(reader.info, path)
     texts = [m.message.data for m in found if m.topic == DATA_SET]
     if len(texts) != 1:
@@ -138,7 +157,9 @@ def _require_whole(info: BagInfo, path: Path) -> None:
 
 
 def _values(recorded: BagMessage) -> Array:
-    """Points (n, 2) of a cloud; position and quaternion (1, 7) of a pose."""
+    """Points (n, 2) of a cloud; pose (1, 7); size and corners (1 + n, 2) of an image."""
+    if recorded.topic == IMAGE:
+        return np.asarray(recorded.message.data, dtype=np.float64).reshape(-1, 2)
     if recorded.topic == PROFILE:
         return cloud_points(recorded.message)[:, [0, 2]]
     p, o = recorded.message.pose.position, recorded.message.pose.orientation

@@ -1,6 +1,7 @@
 """Target files of a hand-eye calibration: YAML, in millimetres and degrees.
 
-The contract is written in docs/hand_eye_sphere.md, hand_eye_step.md and hand_eye_line.md.
+The contract is written in docs/hand_eye_sphere.md, hand_eye_step.md, hand_eye_line.md and, of a
+board, hand_eye_node.md.
 """
 
 from pathlib import Path
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.documents import transform_document
+from robocal_ros.core.hand_eye.board import FEWEST_CORNERS
 from robocal_ros.core.hand_eye.targets import (
     MACHINING_M,
+    BoardTarget,
     CornerKind,
     FirstStep,
     LineTarget,
@@ -29,16 +32,17 @@ from robocal_ros.storage.robot_fields import Fields
 Array = NDArray[np.float64]
 Target = SphereTarget | StepTarget | LineTarget
 
-KINDS = ("sphere", "step", "line")
+KINDS = ("sphere", "step", "line", "board")
 CORNERS: dict[str, CornerKind] = {"convex": "convex", "concave": "concave", "both": "both"}
 FIRST: dict[str, FirstStep] = {"lowest": "lowest", "highest": "highest"}
 SMALLEST_MM, LARGEST_MM = 1.0, 1000.0  # of a sphere's radius
 FARTHEST_MM = 20e3  # of a target from the base
 ROUNDING = 1e-3  # of the axes of a frame, from unit vectors at right angles
 MOST_STEPS = 100
+MOST_CORNERS = 100  # along a side of a board
 
 
-def read_target(path: Path) -> Target:
+def read_target(path: Path) -> Target | BoardTarget:
     """Read a target file.
 
     Raises
@@ -50,6 +54,8 @@ def read_target(path: Path) -> Target:
     kind = top.choice("kind", KINDS)
     if kind == "sphere":
         return _sphere(top)
+    if kind == "board":
+        return _board(top, path.parent)
     return _step(top) if kind == "step" else _line(top)
 
 
@@ -63,6 +69,19 @@ def _sphere(top: Fields) -> SphereTarget:
             "radius_mm",
         )
     return SphereTarget(radius_mm * 1e-3)
+
+
+def _board(top: Fields, folder: Path) -> BoardTarget:
+    from robocal_ros.storage.camera_files import read_intrinsics  # heavy: not at a node's start
+
+    top.only("kind", "columns", "rows", "square_mm", "intrinsics")
+    columns, rows = (_whole(top, key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows"))
+    square_m = _positive(top, "square_mm") * 1e-3
+    if "intrinsics" not in top.values:
+        return BoardTarget(columns, rows, square_m)
+    camera = read_intrinsics(folder / top.text("intrinsics"))
+    size = np.array(camera.size, dtype=np.float64)
+    return BoardTarget(columns, rows, square_m, camera.matrix, camera.distortion, size)
 
 
 def _line(top: Fields) -> LineTarget:
@@ -99,15 +118,13 @@ def _step(top: Fields) -> StepTarget:
 def _staircase(fields: Fields) -> Staircase:
     lengths = ("length_mm", "height_mm", "depth_mm")
     fields.only("steps", *lengths, "corners", "first")
-    steps = fields.number("steps")
-    if steps != int(steps) or not 1 <= steps <= MOST_STEPS:
-        fields.fail(f"is {steps:g}; it must be a whole number from 1 to {MOST_STEPS}", "steps")
+    steps = _whole(fields, "steps", 1, MOST_STEPS)
     length, height, depth = (_positive(fields, key) * 1e-3 for key in lengths)
     corners = CORNERS[fields.choice("corners", tuple(CORNERS), "convex")]
     if corners == "concave" and steps < 2:
         fields.fail("is 1; only between two steps there is a concave corner", "steps")
     first = FIRST[fields.choice("first", tuple(FIRST), "lowest")]
-    return Staircase(int(steps), length, height, depth, corners, first)
+    return Staircase(steps, length, height, depth, corners, first)
 
 
 def _corners(fields: Fields) -> dict[str, Array]:
@@ -165,6 +182,13 @@ def _direction(fields: Fields, key: str) -> Array:
     if length == 0.0:
         fields.fail("has no length", key)
     return vector / length
+
+
+def _whole(fields: Fields, key: str, low: int, high: int) -> int:
+    value = fields.number(key)
+    if value != int(value) or not low <= value <= high:
+        fields.fail(f"is {value:g}; it must be a whole number from {low} to {high}", key)
+    return int(value)
 
 
 def _positive(fields: Fields, key: str) -> float:

@@ -1,6 +1,7 @@
 """Hand-eye of a camera: truth by the simulated cell, recovered; its covariance, its refusals."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from robocal_ros.core.hand_eye.board import (
     Intrinsics,
     boards_of_corners,
     decode_image,
+    find_corners,
     see_boards,
 )
 from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
@@ -413,6 +415,42 @@ def test_intrinsics_and_their_sigma_from_corners() -> None:
     e = np.array([K[0, 0] - T[0, 0], K[1, 1] - T[1, 1], K[0, 2] - T[0, 2], K[1, 2] - T[1, 2]])
     e = np.concatenate([e, found.distortion - truth.distortion])
     assert sound(float(e @ np.linalg.solve(found.covariance, e)), 9)
+
+
+def test_no_size_of_an_image_is_a_fault() -> None:
+    rng = np.random.default_rng(0)
+    sides = (1, 2, 3, 9, 16, 31, 32, 33, 100)
+    for shape in product(sides, sides):
+        assert find_corners(rng.integers(0, 256, shape, dtype=np.uint8), BOARD) is None
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_corners_that_are_none_are_refused(given: bool) -> None:
+    _, corners = pixels(BoardCell(), 12, 20)
+    names = [str(i) for i in range(12)]
+    wrong = {"in one place": 0.0 * corners, "nearly so": 1e-12 * corners}
+    wrong["in one line"] = corners * [1.0, 0.0]
+    camera = true_intrinsics() if given else None
+    for what, these in wrong.items():
+        try:
+            seen = boards_of_corners(names, these, BOARD, (640, 480), camera)
+        except (InputError, RankDeficientError):
+            continue
+        assert seen.noise_px > 1.0, what  # it is seen later, by what it misses
+        assert np.all(np.isfinite(seen.covariance))
+
+
+def test_intrinsics_come_again_to_the_last_bit() -> None:
+    import cv2
+
+    _, corners = pixels(BoardCell(), 12, 20)
+    names, threads = [str(i) for i in range(12)], cv2.getNumThreads()
+    first, *others = (boards_of_corners(names, corners, BOARD, (640, 480)) for _ in range(12))
+    for other in others:
+        assert np.array_equal(other.intrinsics.matrix, first.intrinsics.matrix)
+        assert np.array_equal(other.T_camera_board, first.T_camera_board)
+        assert np.array_equal(other.covariance, first.covariance)
+    assert cv2.getNumThreads() == threads
 
 
 def test_an_image_of_something_else_is_left_out() -> None:

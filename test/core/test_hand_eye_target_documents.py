@@ -9,18 +9,28 @@ import pytest
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.hand_eye.target_documents import target_document, target_of
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.core.hand_eye.targets import (
+    BoardTarget,
+    LineTarget,
+    SphereTarget,
+    Staircase,
+    StepTarget,
+)
 
 T = frames.transform(frames.exp_rotation([0.1, 0.2, 0.3]), [0.7, 0.1, 1 / 3])
 STAIRS = Staircase(5, 0.09, 0.01, 0.01, "both")
 STEP = StepTarget(T, STAIRS.marked_corners(), STAIRS.edge_user, 1e-5, 2e-4, 1e-3)
 LINE = LineTarget(T[:3, 3], T[:3, 0])
-TARGETS = {"sphere": SphereTarget(0.1 / 3), "step": STEP, "line": LINE}
+K = np.array([[610.0 / 3, 0.0, 322.0], [0.0, 612.0, 236.0], [0.0, 0.0, 1.0]])
+GIVEN = BoardTarget(9, 6, 0.025 / 3, K, np.array([0.1 / 3, 0, 0, 0, 0]), np.array([640.0, 480.0]))
+TARGETS = [
+    ("sphere", SphereTarget(0.1 / 3)), ("step", STEP), ("line", LINE),
+    ("camera", BoardTarget(9, 6, 0.025 / 3)), ("camera", GIVEN),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", list(TARGETS))
-def test_a_target_comes_back_to_the_last_bit(kind):
-    target = TARGETS[kind]
+@pytest.mark.parametrize(("kind", "target"), TARGETS)
+def test_a_target_comes_back_to_the_last_bit(kind, target):
     document = json.loads(json.dumps(target_document(kind, target), allow_nan=False))
     assert document["kind"] == kind
     found = target_of(document)
@@ -36,6 +46,13 @@ def test_a_target_comes_back_to_the_last_bit(kind):
 def test_nothing_known_stays_nothing_known():
     assert target_of(target_document("line", None)) is None
     assert target_of({"kind": "camera"}) is None
+
+
+def test_a_board_with_its_camera_is_known_whole():
+    assert BoardTarget(9, 6, 0.025).intrinsics is None
+    assert GIVEN.intrinsics.size == (640, 480)
+    assert np.array_equal(GIVEN.intrinsics.matrix, K)
+    assert (GIVEN.board.columns, GIVEN.board.rows, GIVEN.board.square_m) == (9, 6, 0.025 / 3)
 
 
 def test_another_target_than_named_is_refused():

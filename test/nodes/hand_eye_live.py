@@ -10,17 +10,17 @@ from hand_eye_driver import FRAME, RADIUS_M, Recorded, Robot, sphere_shots_of
 from rclpy.qos import HistoryPolicy, QoSProfile
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import CalibrateHandEye, CaptureHandEye, StartHandEye
-from sensor_msgs.msg import JointState, PointCloud2, PointField
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 
 from robocal_ros.core.hand_eye.targets import SphereTarget
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.storage.hand_eye_targets import write_target
 
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
-TYPES = {JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped}
+TYPES = {JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped, IMAGE: Image}
 NAME = "/hand_eye_node"
 SHOTS = list(sphere_shots_of(14))
 
@@ -85,13 +85,17 @@ class LiveSensor:
         return self.graph.call(CaptureHandEye, f"{NAME}/capture", mark=mark)
 
     def capture(
-        self, shot: Callable[[int], Recorded] | None, seconds: float = 0.7, mark: str = ""
+        self,
+        shot: Callable[[int], Recorded] | None,
+        seconds: float = 0.7,
+        mark: str = "",
+        hz: int = 10,
     ) -> Any:
         """A capture at rest, and how it ended."""
         self.robot.rest(0.1)
         asked = self.ask_capture(mark)
         assert asked.success, asked.message
-        self.robot.rest(seconds, shot)
+        self.robot.rest(seconds, shot, hz)
         return self.ended(asked.handle)
 
     def ended(self, handle: int) -> Any:

@@ -15,7 +15,7 @@ from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sim.cell import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
@@ -35,6 +35,7 @@ TYPE = {
     JOINTS: "sensor_msgs/msg/JointState",
     PROFILE: "sensor_msgs/msg/PointCloud2",
     TARGET_POSE: "geometry_msgs/msg/PoseStamped",
+    IMAGE: "sensor_msgs/msg/Image",
 }
 SPHERE = {
     "target": target_document("sphere", SphereTarget(RADIUS_M)),

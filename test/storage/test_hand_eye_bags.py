@@ -35,7 +35,9 @@ def data_set(columns: int = 2, points: int = 40) -> dict:
     }
 
 
-@pytest.mark.parametrize(("topic", "columns", "points"), [(PROFILE, 2, 40), ("target_pose", 7, 1)])
+@pytest.mark.parametrize(
+    ("topic", "columns", "points"), [(PROFILE, 2, 40), ("target_pose", 7, 1), ("image", 2, 55)]
+)
 def test_a_data_set_comes_back_to_the_last_bit(tmp_path, topic, columns, points):
     path, document = tmp_path / "set.mcap", data_set(columns, points)
     write_data_set(path, document, topic, "laser", ARM)

@@ -15,6 +15,7 @@ Image = NDArray[np.uint8]
 
 FEWEST_CORNERS = 3  # along each side
 FEWEST_IMAGES = 5  # that give the intrinsics
+SMALLEST_IMAGE_PX = 32  # of a side; OpenCV fails on less
 FIRST_WINDOW_PX = 5  # half of the window in which a corner is refined
 LARGEST_FOCAL_SIGMA = 0.03  # of the focal length; more, and the images do not show it
 GROSS_RATIO = 4.0  # medians of the usual misfit, beyond which an image is left out
@@ -109,6 +110,8 @@ def find_corners(image: Image, board: Chessboard) -> Array | None:
     """Inner corners (n, 2), px, in the order of the board's points; None where no board shows."""
     import cv2
 
+    if min(image.shape) < SMALLEST_IMAGE_PX:
+        return None
     size = (board.columns, board.rows)
     found, corners = cv2.findChessboardCorners(image, size)
     if not found:  # slower, and sees blurred and glaring boards too
@@ -175,6 +178,8 @@ def boards_of_corners(
     ------
     TooFewSamplesError, RankDeficientError
         As `see_boards`.
+    InputError
+        When no camera sees a board as the corners lie.
     """
     out = dict(rejected or {})
     _require(len(names), intrinsics, out)
@@ -236,7 +241,14 @@ def _calibrate(corners: Array, board: Chessboard, size: tuple[int, int]) -> Intr
 
     points = [board.points.astype(np.float32)] * len(corners)
     seen = list(corners.astype(np.float32))
-    _, matrix, distortion, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # several add up in any order: the last bits would not come again
+    try:
+        _, matrix, distortion, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
+    except cv2.error as error:
+        raise InputError(f"no camera sees a board as these corners lie: {error.err}") from error
+    finally:
+        cv2.setNumThreads(threads)
     return Intrinsics(
         np.asarray(matrix, dtype=np.float64),
         np.asarray(distortion, dtype=np.float64).ravel(),
@@ -271,6 +283,8 @@ def _pose(corners: Array, board: Chessboard, camera: Intrinsics) -> tuple[Array,
     points, K, d = board.points, camera.matrix, camera.distortion
     # the better of the two poses in which a flat board looks alike (Collins and Bartoli 2014)
     _, turns, places, _ = cv2.solvePnPGeneric(points, corners, K, d, flags=cv2.SOLVEPNP_IPPE)
+    if not turns:
+        raise InputError("no pose of a board explains the corners: they nearly coincide")
     turn, place = cv2.solvePnPRefineLM(points, corners, K, d, turns[0], places[0])
     seen, J = cv2.projectPoints(points, turn, place, K, d)
     J = np.asarray(J, dtype=np.float64)

@@ -8,15 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.core.hand_eye.targets import BoardTarget, LineTarget, SphereTarget, StepTarget
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
-Target = SphereTarget | StepTarget | LineTarget
+Target = SphereTarget | StepTarget | LineTarget | BoardTarget
 
-KIND_OF: dict[type[Target], str] = {SphereTarget: "sphere", StepTarget: "step", LineTarget: "line"}
+KIND_OF: dict[type[Target], str] = {
+    SphereTarget: "sphere",
+    StepTarget: "step",
+    LineTarget: "line",
+    BoardTarget: "camera",  # the target of a camera, of which more is known
+}
 SHAPE_OF = {
     "T_base_user": (4, 4), "edge_user": (3,), "point_base": (3,), "direction_base": (3,),
+    "matrix": (3, 3), "size": (2,),
 }  # fmt: skip
 TYPE_OF = {kind: type_ for type_, kind in KIND_OF.items()}
 
@@ -50,7 +56,9 @@ def target_of(document: Mapping[str, Any]) -> Target | None:
     try:
         target = TYPE_OF[document["kind"]](**values)
         for field in fields(target):
-            _require_numbers(field.name, getattr(target, field.name))
+            value = getattr(target, field.name)
+            if value is not None or field.default is not None:
+                _require_numbers(field.name, value)
         return target
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"the target cannot be read: {error}") from error
@@ -65,6 +73,8 @@ def _require_numbers(name: str, value: Any) -> None:
             _require_numbers(f"corners of {mark}", rows)
         return
     shape = SHAPE_OF.get(name, (max(len(value), 1), 3) if name.startswith("corners") else ())
+    if name == "distortion":
+        shape = (max(len(value), 1),)
     if np.shape(value) != shape or not np.all(np.isfinite(np.asarray(value, dtype=np.float64))):
         raise ValueError(f"{name} must be finite numbers of shape {shape}")
     if name == "radius_m" and not value > 0.0:

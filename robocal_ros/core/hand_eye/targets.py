@@ -1,4 +1,4 @@
-"""Targets that a line-laser sensor is shown, as they are known before the calibration."""
+"""Targets that a sensor is shown, as they are known before the calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,6 +6,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from robocal_ros.core.hand_eye.board import Chessboard, Intrinsics
 
 Array = NDArray[np.float64]
 
@@ -52,6 +54,37 @@ class LineTarget:
 
     point_base: Array
     direction_base: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BoardTarget:
+    """A chessboard that a camera sees, and what is known of this camera.
+
+    Attributes
+    ----------
+    columns, rows, square_m : see `Chessboard`.
+    matrix, distortion, size : see `Intrinsics`; all three, or None: found from the images.
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+    matrix: Array | None = None
+    distortion: Array | None = None
+    size: Array | None = None
+
+    @property
+    def board(self) -> Chessboard:
+        """The chessboard alone. Raises `InputError` when it has too few corners."""
+        return Chessboard(self.columns, self.rows, self.square_m)
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """The camera as it is given."""
+        if self.matrix is None or self.distortion is None or self.size is None:
+            return None
+        width, height = self.size
+        return Intrinsics(self.matrix, self.distortion, (int(width), int(height)))
 
 
 @dataclass(frozen=True)
