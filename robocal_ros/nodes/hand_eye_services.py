@@ -24,7 +24,7 @@ from robocal_ros.nodes.hand_eye_plan import HandEyePlan
 from robocal_ros.nodes.hand_eye_settings import start_arguments
 from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_data import MOST_POINTS, TOPIC_OF
+from robocal_ros.sessions.hand_eye_data import MOST_POINTS, data_set_begun
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 Ask = Callable[[Command], Awaitable[Outcome]]
@@ -155,7 +155,7 @@ class HandEyeServices:
 
         session, path = self._session, _path(request)
         document = session.document()
-        topic = TOPIC_OF[document["target"]["kind"]]
+        topic = data_set_begun(document).topic
         write_data_set(path, document, topic, session.config.sensor_frame, session.nominal)
         response.success, response.status = True, int(Code.ACCEPT)
         response.samples = len(document["samples"])

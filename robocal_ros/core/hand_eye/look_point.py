@@ -8,6 +8,7 @@ from robocal_ros.core.hand_eye.planning import SensorRange
 Array = NDArray[np.float64]
 
 OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
+BEHIND = 0.7  # of the radius: how far the centre lies behind the arc that is seen
 ROUNDS = 20
 
 
@@ -28,17 +29,18 @@ def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tup
             0.5 * (sensor.far_m - sensor.near_m) + radius_m,
         ]
     )
-    starts = np.array([[0.0, side * off, sensor.middle_m] for side in (-1.0, 1.0)])
+    middle_m = sensor.middle_m + BEHIND * radius_m  # its surface is seen, not its centre
+    starts = np.array([[0.0, side * off, middle_m] for side in (-1.0, 1.0)])
     centres = (np.einsum("mij,sj->smi", R, starts) + origin).reshape(-1, 3)
     for _ in range(ROUNDS):
-        miss, at = _misses(R, origin, centres, off, sensor.middle_m, allowed)
+        miss, at = _misses(R, origin, centres, off, middle_m, allowed)
         weight = 1.0 / (1.0 + np.sum(miss**2, axis=2))
         precision = np.einsum("mij,j,mkj->mik", R, allowed**-2.0, R)
         wanted = origin + np.einsum("mij,pmj->pmi", R, at)
         A = np.einsum("pm,mik->pik", weight, precision)
         b = np.einsum("pm,mik,pmk->pi", weight, precision, wanted)
         centres = np.linalg.solve(A, b[..., None])[..., 0]
-    miss, _ = _misses(R, origin, centres, off, sensor.middle_m, allowed)
+    miss, _ = _misses(R, origin, centres, off, middle_m, allowed)
     return centres, np.sum(np.log1p(np.sum(miss**2, axis=2)), axis=1)
 
 
