@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="DIR",
             help=f"folder with poses.csv, profiles/ and target.yaml of a {kind}{without}",
         )
-    add_feature(parser, "--line-kind")
+    add_feature(parser)
     add_robot(parser)
     add_limits(parser, "default: from the residuals")
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> Outcome:
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}
     if len(folders) < 2:
         raise InputError("give the folders of at least two of --sphere, --step, --line")
-    parts = [_part(kind, folder, args.feature, arm) for kind, folder in folders.items()]
+    parts = [_part(kind, folder, args.line_kind, arm) for kind, folder in folders.items()]
     document: Document = hand_eye_document(solve_joint(parts, settings))
     return Outcome(document, partial(show_mount, document=document))
 

@@ -75,11 +75,15 @@ def add_radius(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--radius-mm", type=positive, metavar="R", help="of a sphere, true")
 
 
-def add_feature(parser: argparse.ArgumentParser, name: str) -> None:
-    """Offer, as option ``name``, what a line is."""
+def add_target_kind(parser: argparse.ArgumentParser) -> None:
+    """Ask for the kind of target."""
+    parser.add_argument("--target-kind", required=True, choices=KINDS, help="what the shots show")
+
+
+def add_feature(parser: argparse.ArgumentParser) -> None:
+    """Offer what a line is."""
     parser.add_argument(
-        name,
-        dest="feature",
+        "--line-kind",
         choices=FEATURES,
         default=FEATURES[0],
         help="the line: nearer to the sensor than the surfaces beside it (edge, the default), or "

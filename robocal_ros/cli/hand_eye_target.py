@@ -50,7 +50,7 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
 
     arm, settings = arm_of(args), settings_of(args)
     target = given_target(kind, args.target, radius_mm)
-    task = task_of(target, getattr(args, "feature", None), args.method == "classic")
+    task = task_of(target, getattr(args, "line_kind", None), args.method == "classic")
     shots = given_shots(args, arm)
     judges = None if args.check is None else given_shots(args, arm, args.check)
     if judges is not None:

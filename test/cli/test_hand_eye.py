@@ -57,7 +57,7 @@ def sphere(made) -> Any:
 
 
 def line_of(kind: str) -> tuple[str, list[str]]:
-    return ("line", ["--kind", "groove"]) if kind == "groove" else (kind, [])
+    return ("line", ["--line-kind", "groove"]) if kind == "groove" else (kind, [])
 
 
 class TestRecovered:
@@ -474,7 +474,7 @@ class TestVerify:
         return path
 
     def run(self, result: Path, kind: str, folder: Path, *more: object) -> list[object]:
-        return ["verify", "--result", result, "--kind", kind, *shots(folder), *more]
+        return ["verify", "--result", result, "--target-kind", kind, *shots(folder), *more]
 
     @pytest.mark.parametrize("kind", FOLDERS)
     def test_a_sphere_s_result_holds_on_every_target(self, made, result, kind):
