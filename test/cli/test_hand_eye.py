@@ -517,9 +517,13 @@ class TestVerify:
             in (found["text"])
         )
 
-    def test_only_what_was_accepted_is_exported(self, result):
+    @pytest.mark.parametrize(
+        ("accept", "code"),
+        [(False, "POSES_NOT_INFORMATIVE"), (False, "ACCEPT"), (True, "RESIDUAL_TOO_LARGE")],
+    )
+    def test_only_what_was_accepted_is_exported(self, result, accept, code):
         document = json.loads(result.read_text())
-        document["verdict"] = {"accept": False, "code": "POSES_NOT_INFORMATIVE", "reason": "few"}
+        document["verdict"] = {"accept": accept, "code": code, "reason": "few"}
         result.write_text(json.dumps(document))
         found = robocal("export", "--result", result, "--format", "urdf", status=2)
-        assert "POSES_NOT_INFORMATIVE" in found["error"]["message"]
+        assert f"accept {str(accept).lower()} and code {code}" in found["error"]["message"]
