@@ -205,7 +205,37 @@ def shifted(pairs: PosePairs, lag: int) -> PosePairs:
     return replace(pairs.take(rows - lag), T_base_flange=pairs.T_base_flange[rows])
 
 
+def mirrored(T: np.ndarray) -> np.ndarray:
+    """As told in frames whose x and y changed places: left-handed ones."""
+    order = [1, 0, 2, 3]
+    return T[:, order][:, :, order]
+
+
+def negated(T: np.ndarray, axis: int) -> np.ndarray:
+    T = T.copy()
+    T[:, axis, 3] *= -1.0
+    return T
+
+
 MISTAKES = {
+    "robot mirrored": (
+        lambda p: replace(p, T_base_flange=mirrored(p.T_base_flange)), "mirrored as a whole",
+    ),
+    "board mirrored": (
+        lambda p: replace(p, T_camera_board=mirrored(p.T_camera_board)), "mirrored as a whole",
+    ),
+    "robot x negated": (
+        lambda p: replace(p, T_base_flange=negated(p.T_base_flange, 0)),
+        "the robot's positions fit with x negated: they come from a left-handed frame",
+    ),
+    "robot z negated": (
+        lambda p: replace(p, T_base_flange=negated(p.T_base_flange, 2)),
+        "the robot's positions fit with z negated: they come from a left-handed frame",
+    ),
+    "board y negated": (
+        lambda p: replace(p, T_camera_board=negated(p.T_camera_board, 1)),
+        "the board's positions fit with y negated: they come from a left-handed frame",
+    ),
     "robot inverted": (
         lambda p: replace(p, T_base_flange=frames.invert(p.T_base_flange)), "T_flange_base",
     ),
