@@ -15,6 +15,7 @@ HAND_EYE = ("tsai", "park", "horaud", "andreff", "daniilidis")
 ROBOT_WORLD = ("shah", "li")
 CLOSED_FORMS = (*HAND_EYE, *ROBOT_WORLD)
 
+MOST_COMPARED = 100  # samples: OpenCV pairs each with each
 _LEAST_DETERMINANT = 0.5  # of what OpenCV calls a rotation
 
 
@@ -45,6 +46,17 @@ def closed_form(name: str, pairs: PosePairs) -> Placement | None:
         return None
     found = Placement(X, Z)
     return found if np.all(np.isfinite(X)) and np.all(np.isfinite(Z)) else None
+
+
+def compared(count: int) -> NDArray[np.intp]:
+    """Rows of ``count`` samples that the closed forms take: at most 100, spread evenly."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(np.intp))
+
+
+def closed_forms(pairs: PosePairs) -> dict[str, Placement | None]:
+    """Each of OpenCV's, from the rows `compared`."""
+    some = pairs.take(compared(len(pairs)))
+    return {name: closed_form(name, some) for name in CLOSED_FORMS}
 
 
 def _call(solve: Callable[..., Any], first: Array, second: Array, method: int) -> Any:
