@@ -446,6 +446,8 @@ def test_classic_leaves_each_out_in_turn() -> None:
         boards = pairs.T_boardside_cameraside @ at.X @ pairs.T_camera_board
         miss = np.linalg.norm((boards[row] - at.Z)[:3, 3])
         assert found.leave_one_out_m[row] == pytest.approx(miss, rel=1e-6)
+    _, many = measured(51, 18)
+    assert calibrate_camera(many, CameraSettings("classic")).leave_one_out_m is None
 
 
 def test_classic_names_mistakes_too() -> None:

@@ -48,15 +48,10 @@ def closed_form(name: str, pairs: PosePairs) -> Placement | None:
     return found if np.all(np.isfinite(X)) and np.all(np.isfinite(Z)) else None
 
 
-def compared(count: int) -> NDArray[np.intp]:
-    """Rows of ``count`` samples that the closed forms take: at most 100, spread evenly."""
-    return np.unique(np.linspace(0, count - 1, min(count, MOST_COMPARED)).astype(np.intp))
-
-
 def closed_forms(pairs: PosePairs) -> dict[str, Placement | None]:
-    """Each of OpenCV's, from the rows `compared`."""
-    some = pairs.take(compared(len(pairs)))
-    return {name: closed_form(name, some) for name in CLOSED_FORMS}
+    """Each of OpenCV's, from at most 100 of the samples, spread evenly."""
+    rows = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_COMPARED)).astype(int))
+    return {name: closed_form(name, pairs.take(rows)) for name in CLOSED_FORMS}
 
 
 def _call(solve: Callable[..., Any], first: Array, second: Array, method: int) -> Any:
