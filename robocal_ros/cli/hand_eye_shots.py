@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, positive
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from robocal_ros.core.hand_eye.quality import HandEyeSettings
@@ -191,6 +192,19 @@ def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table)
     return Shots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
+
+
+def require_unused(judges: "PoseTable", used: "PoseTable") -> None:
+    """Refuse judges that helped to solve.
+
+    Raises
+    ------
+    InputError
+        Naming the row.
+    """
+    for index, file in enumerate(judges.files):
+        if file in used.files:
+            judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
 
 
 def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Target | None":

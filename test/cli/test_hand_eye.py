@@ -12,6 +12,7 @@ from hand_eye_command import chi_square, pose_of, robocal, shots, target
 from hand_eye_tables import (
     CELL,
     CENTRE,
+    CHECKS,
     RADIUS_M,
     ROBOT_M,
     SHOTS,
@@ -110,6 +111,32 @@ class TestRecovered:
         assert found["working_error_mm"] < sphere["working_error_mm"]
         names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
         assert names == set(found["target"]) == {"sphere", "step", "line"}
+
+    def test_other_shots_judge_several_targets_together(self, made, tmp_path):
+        words = [word for kind in ("sphere", "step") for word in (f"--{kind}", made / kind)]
+        words += ["--line", tmp_path / "line"]
+        shutil.copytree(made / "line", tmp_path / "line")
+        found = robocal("joint", *words, "--check", "check.csv")
+        assert found["verdict"]["accept"]
+        judges = [
+            robocal(kind, *shots(made / kind), *target(made / kind), "--check", check)
+            for kind in ("sphere", "step", "line")
+            for check in [made / kind / "check.csv"]
+        ]
+        assert found["held_out"]["n"] == sum(one["held_out"]["n"] for one in judges)
+        assert found["held_out"]["rms_mm"] < 0.3  # robot 0.05 mm, profile 0.04 mm
+        some = shots_of("line")
+        T = some.T_base_flange[SHOTS : SHOTS + CHECKS].copy()
+        T[:, 2, 3] += 0.03  # as far as the edge was lowered before these were seen
+        write_part(tmp_path / "line", "moved", some, range(SHOTS, SHOTS + CHECKS), T)
+        refused = robocal("joint", *words, "--check", "moved.csv")
+        assert refused["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
+        assert "not used to solve" in refused["verdict"]["reason"]
+        assert refused["held_out"]["n"] == CHECKS
+        assert refused["T_flange_sensor"] == found["T_flange_sensor"]
+        for name, said in (("poses.csv", "other shots must judge"), ("none.csv", "none of the")):
+            failed = robocal("joint", *words, "--check", name, status=2)
+            assert said in failed["error"]["message"]
 
     def test_a_line_without_a_target_file_is_unknown_in_joint(self, made, tmp_path):
         shutil.copytree(made / "groove", tmp_path / "groove")
