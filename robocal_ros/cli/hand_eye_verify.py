@@ -51,6 +51,7 @@ def run(args: argparse.Namespace) -> Outcome:
         transform_document,
         verdict_document,
     )
+    from robocal_ros.core.hand_eye.result import by_shot
     from robocal_ros.core.hand_eye.verification import verify
     from robocal_ros.storage.hand_eye_files import read_flange_mount
 
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> Outcome:
     shots = given_shots(args, arm_of(args))
     found = verify(task, shots.data, T_flange_sensor, settings)
     errors = errors_document(summarise(found.distance_m))
-    rejected = {**shots.rejected, **found.rejected}
+    rejected = {**shots.rejected, **by_shot(found.rejected, found.samples)}
     document: Document = {
         "kind": args.target_kind,
         "T_flange_sensor": transform_document(T_flange_sensor),

@@ -21,6 +21,7 @@ from hand_eye_tables import (
     TRUE,
     hand_eye_tables,
     shots_of,
+    target_of,
     write_part,
 )
 from scipy.stats import chi2
@@ -259,6 +260,17 @@ class TestMistakes:
         assert set(found["rejected"]) == {"s3", "s8"}
         assert "fits the pose of s8" in found["rejected_because"]["s3"]
         assert chi_square(found) < FAR_OFF
+
+    def test_stairs_from_a_wrong_pose_are_rejected_as_a_shot(self, tmp_path):
+        some = shots_of("step")
+        T = some.T_base_flange[:SHOTS].copy()
+        T[4, 2, 3] += 0.002
+        write_part(tmp_path, "poses", some, range(SHOTS), T)
+        write_target(tmp_path / "target.yaml", target_of("step"))
+        found = robocal("step", *shots(tmp_path), *target(tmp_path))
+        assert found["rejected"] == ["s5"]
+        assert found["rejected_because"] == {"s5": "does not fit the others"}
+        assert not any(name.startswith("s5/") for name in found["residual_mm"]["per_sample"])
 
     def test_another_radius_is_named(self, made):
         run = self.sphere(made / "sphere", 21.0)
