@@ -5,8 +5,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.cli.arguments import ROBOT_HELP, positive
+from robocal_ros.cli.arguments import positive
 from robocal_ros.cli.hand_eye_pairs import calibrate
+from robocal_ros.cli.hand_eye_shots import add_limit, add_robot, add_robot_sigma
+from robocal_ros.cli.hand_eye_view import show_judged, show_placed
 from robocal_ros.cli.output import Document, Outcome
 
 if TYPE_CHECKING:
@@ -17,7 +19,7 @@ HELP = "place a camera from images of a chessboard, or from poses of a board or 
 
 METHODS = ("best", "classic", "tsai", "park", "horaud", "andreff", "daniilidis", "shah", "li")
 MOUNTS = ("in-hand", "to-hand")
-MOST_NAMED = 5  # samples left out for one reason
+LIMIT_MM = 2.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,21 +59,9 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
         default=METHODS[0],
         help="best; the closed form from which the search starts; or classic, a closed form alone",
     )
-    parser.add_argument("--robot", metavar="ROBOT", help=f"{ROBOT_HELP}; for tables of joints")
-    for unit, of in (("mm", "position"), ("deg", "orientation")):
-        parser.add_argument(
-            f"--robot-sigma-{unit}",
-            type=positive,
-            metavar="S",
-            help=f"noise of the flange's {of}, an axis; default: from the residuals",
-        )
-    parser.add_argument(
-        "--limit-mm",
-        type=positive,
-        default=2.0,
-        metavar="L",
-        help="largest expected error where the boards were; default 2",
-    )
+    add_robot(parser)
+    add_robot_sigma(parser, "default: from the residuals")
+    add_limit(parser, "where the boards were", LIMIT_MM)
     parser.add_argument(
         "--check",
         type=Path,
@@ -103,33 +93,14 @@ def _board(value: str) -> tuple[int, int]:
 
 
 def _show(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    verdict = document["verdict"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
-    parent = "flange" if "T_flange_sensor" in document else "base"
-    pose = document[f"T_{parent}_sensor"]
-    sigma = document["sigma"]
-    spread = sigma["xyz_mm"] if sigma else [None] * 3
-    numbers = ", ".join(
-        f"{value:.3f}" + ("" if s is None else f" ± {s:.3f}")
-        for value, s in zip(pose["xyz_mm"], spread, strict=True)
-    )
-    console.print(f"Camera in the {parent} frame, mm: {numbers}")
-    quat = " ".join(f"{value:.6f}" for value in pose["quat_xyzw"])
-    console.print(f"Orientation, quaternion x y z w: {quat}")
+    show_placed(console, document, "Camera")
     if document.get("time_offset_s") is not None:
         console.print(
             f"Time offset, to be added to the camera's stamps: {document['time_offset_s']:.4f} s "
             f"± {document['time_offset_sigma_s']:.4f}"
         )
-    if document["check"] is not None:
-        check = document["check"]
-        console.print(
-            f"Check, {check['n']} poses: mean {check['mean_mm']:.3f} mm, max {check['max_mm']:.3f}"
-        )
     _show_residuals(console, document)
+    show_judged(console, document)
 
 
 def _show_residuals(console: "Console", document: Document) -> None:
@@ -143,10 +114,3 @@ def _show_residuals(console: "Console", document: Document) -> None:
     per_sample = document["residual_mm"]["per_sample"].values()
     table.add_row(document["method"], f"{sum(per_sample) / len(per_sample):.3f}")
     console.print(table)
-    same: dict[str, list[str]] = {}
-    for name, reason in document["rejected_because"].items():
-        same.setdefault(reason, []).append(name)
-    for reason, names in same.items():
-        who = ", ".join(names[:MOST_NAMED]) + (", …" if len(names) > MOST_NAMED else "")
-        count = f"{len(names)} samples, " if len(names) > 1 else ""
-        console.print(f"Left out: {count}{who}: {reason}", soft_wrap=True, markup=False)

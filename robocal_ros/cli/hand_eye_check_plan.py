@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import positive
 from robocal_ros.cli.hand_eye_shots import (
-    KINDS,
     add_limits,
     add_robot,
     add_target,
+    add_target_kind,
     arm_of,
     given_target,
     settings_of,
@@ -44,7 +44,7 @@ ROBOT_SIGMA_MM = 0.05
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("--target-kind", required=True, choices=KINDS)
+    add_target_kind(parser)
     parser.add_argument(
         "--poses",
         required=True,

@@ -5,23 +5,27 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robocal_ros.cli.arguments import text
 from robocal_ros.cli.hand_eye_shots import (
     KINDS,
+    Shots,
     add_feature,
     add_limits,
     add_robot,
     arm_of,
     given_target,
     read_shots,
+    require_unused,
     settings_of,
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_mount
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
-    from robocal_ros.core.hand_eye.joint import Part
+    from robocal_ros.core.hand_eye.tasks import Task
     from robocal_ros.core.kinematics import SerialArm
 
 NAME = "joint"
@@ -38,9 +42,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="DIR",
             help=f"folder with poses.csv, profiles/ and target.yaml of a {kind}{without}",
         )
-    add_feature(parser, "--line-kind")
+    add_feature(parser)
     add_robot(parser)
     add_limits(parser, "default: from the residuals")
+    parser.add_argument(
+        "--check",
+        type=text,
+        metavar="NAME",
+        help="table in the folders, such as check.csv: other shots of the same targets, of one or "
+        "more, that judge the result and are not used to find it",
+    )
 
 
 def run(args: argparse.Namespace) -> Outcome:
@@ -52,13 +63,27 @@ def run(args: argparse.Namespace) -> Outcome:
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}
     if len(folders) < 2:
         raise InputError("give the folders of at least two of --sphere, --step, --line")
-    parts = [_part(kind, folder, args.feature, arm) for kind, folder in folders.items()]
-    document: Document = hand_eye_document(solve_joint(parts, settings))
+    parts, checks = [], {}
+    for kind, folder in folders.items():
+        task, shots = _task(kind, folder, args.line_kind), _shots(folder, "poses.csv", arm)
+        parts.append((task, shots.data))
+        if args.check is not None and (folder / args.check).exists():
+            judges = _shots(folder, args.check, arm)
+            if judges.table is not None and shots.table is not None:
+                require_unused(judges.table, shots.table)
+            checks[task.kind] = judges.data
+    if args.check is not None and not checks:
+        raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
+    result = solve_joint(parts, settings, checks)
+    document: Document = {"held_out": None} | hand_eye_document(result)
     return Outcome(document, partial(show_mount, document=document))
 
 
-def _part(kind: str, folder: Path, feature: str, arm: "SerialArm | None") -> "Part":
+def _task(kind: str, folder: Path, line_kind: str) -> "Task":
     file = folder / "target.yaml"
     known = kind != "line" or file.exists()
-    target = given_target(kind, file if known else None, None)
-    return task_of(target, feature), read_shots(folder / "poses.csv", folder / "profiles", arm).data
+    return task_of(given_target(kind, file if known else None, None), line_kind)
+
+
+def _shots(folder: Path, table: str, arm: "SerialArm | None") -> Shots:
+    return read_shots(folder / table, folder / "profiles", arm)

@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the options."""
     add_target_action(parser)
     add_target_file(parser, "where the line is; default: that is found too")
-    add_feature(parser, "--kind")
+    add_feature(parser)
 
 
 def run(args: argparse.Namespace) -> Outcome:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robocal_ros.cli.hand_eye_shots import arm_of, robot_sigma_of
 from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
     from robocal_ros.core.hand_eye.pose_pairs import PosePairs
     from robocal_ros.core.hand_eye.result import HandEyeResult
     from robocal_ros.core.hand_eye.streams import PoseStream
-    from robocal_ros.core.kinematics import SerialArm
     from robocal_ros.storage.hand_eye_tables import PoseTable
 
 
@@ -44,34 +44,22 @@ def calibrate(args: argparse.Namespace) -> "HandEyeResult":
 
 
 def _settings(args: argparse.Namespace) -> "CameraSettings":
-    from math import radians
-
     from robocal_ros.core.hand_eye.camera import CameraSettings
     from robocal_ros.core.hand_eye.camera_fit import GivenNoise
 
-    noise = GivenNoise(
-        robot_m=None if args.robot_sigma_mm is None else args.robot_sigma_mm * 1e-3,
-        robot_rad=None if args.robot_sigma_deg is None else radians(args.robot_sigma_deg),
-    )
-    return CameraSettings(args.method, noise, args.limit_mm * 1e-3)
+    return CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
 
 
 def _read(path: Path, args: argparse.Namespace, file_column: str | None) -> "PoseTable":
     from robocal_ros.storage.hand_eye_tables import read_pose_table
 
-    return read_pose_table(path, _arm(args), file_column)
-
-
-def _arm(args: argparse.Namespace) -> "SerialArm | None":
-    from robocal_ros.storage.robots import load_robot
-
-    return None if args.robot is None else load_robot(args.robot)
+    return read_pose_table(path, arm_of(args), file_column)
 
 
 def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
     from robocal_ros.core.hand_eye.board import Chessboard
     from robocal_ros.core.hand_eye.board_pairs import intrinsics_document
-    from robocal_ros.core.hand_eye.camera import calibrate_camera
+    from robocal_ros.core.hand_eye.camera import CheckPairs, calibrate_camera
     from robocal_ros.storage.camera_files import read_intrinsics
 
     columns, rows = args.board
@@ -80,7 +68,8 @@ def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandE
     pairs, seen = _pairs_of_images(args.poses, args, board, intrinsics)
     check = None
     if args.check is not None:
-        check = _pairs_of_images(args.check, args, board, seen.intrinsics)[0]
+        judges, shown = _pairs_of_images(args.check, args, board, seen.intrinsics)
+        check = CheckPairs(judges, shown.rejected)
     return calibrate_camera(
         pairs,
         settings,
@@ -105,7 +94,7 @@ def _pairs_of_images(
 
 
 def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
-    from robocal_ros.core.hand_eye.camera import calibrate_camera
+    from robocal_ros.core.hand_eye.camera import CheckPairs, calibrate_camera
     from robocal_ros.core.hand_eye.streams import calibrate_streams
     from robocal_ros.storage.hand_eye_tables import read_pose_table
 
@@ -122,9 +111,11 @@ def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEy
     if check is not None and not check.named:
         raise InputError("needs a column sample, as the measured poses", file=check.path, row=1)
     pairs, alone = _paired(robot, camera, args.mount)
-    judges = None if check is None else _paired(check, camera, args.mount)[0]
-    if judges is not None:
-        alone = {name: why for name, why in alone.items() if name not in judges.names}
+    judges = None
+    if check is not None:
+        held, absent = _paired(check, camera, args.mount)
+        judges = CheckPairs(held, {name: absent[name] for name in check.names if name in absent})
+        alone = {name: why for name, why in alone.items() if name not in held.names}
     return calibrate_camera(pairs, settings, check=judges, rejected=alone)
 
 

@@ -5,17 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros import __version__
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.cli.replay_parts import commanded_document, seconds
+from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
 from robocal_ros.core.documents import transform_document
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_recorded import hand_eye_session_as_recorded
-from robocal_ros.sessions.replay import replay
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 
@@ -29,10 +26,9 @@ def replay_hand_eye(
     InputError, WrongRobotError
         The bag lacks what a replay needs.
     """
-    if recording.configured is None:
-        raise InputError("the bag holds no configuration of a hand-eye node")
-    session = hand_eye_session_as_recorded(arm, history, recording.configured, __version__)
-    report = replay(session, samples, recording.commands, recording.inputs, take_hand_eye_message)
+    report, session = replay_commanded(
+        recording, arm, history, samples, hand_eye_session_as_recorded, take_hand_eye_message
+    )
     return commanded_document(report, session, recording) | {
         "calibrations": [
             {"stamp": seconds(o.command.stamp_ns), **(o.document or {})}

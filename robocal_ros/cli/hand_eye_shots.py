@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, positive
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from robocal_ros.core.hand_eye.quality import HandEyeSettings
@@ -49,14 +50,12 @@ def add_shots(parser: argparse.ArgumentParser) -> None:
         metavar="INPUT:=TOPIC",
         help="topic of an input in the bag: joint_states, profile, session_events",
     )
-    add_robot(parser)
+    add_robot(parser, "bags and tables of joints")
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
-    """Offer the robot."""
-    parser.add_argument(
-        "--robot", metavar="NAME", help=f"{ROBOT_HELP}; for bags and tables of joints"
-    )
+def add_robot(parser: argparse.ArgumentParser, needed: str = "tables of joints") -> None:
+    """Offer the robot, ``needed`` for these."""
+    parser.add_argument("--robot", metavar="NAME", help=f"{ROBOT_HELP}; for {needed}")
 
 
 def add_target(parser: argparse.ArgumentParser) -> None:
@@ -75,11 +74,15 @@ def add_radius(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--radius-mm", type=positive, metavar="R", help="of a sphere, true")
 
 
-def add_feature(parser: argparse.ArgumentParser, name: str) -> None:
-    """Offer, as option ``name``, what a line is."""
+def add_target_kind(parser: argparse.ArgumentParser) -> None:
+    """Ask for the kind of target."""
+    parser.add_argument("--target-kind", required=True, choices=KINDS, help="what the shots show")
+
+
+def add_feature(parser: argparse.ArgumentParser) -> None:
+    """Offer what a line is."""
     parser.add_argument(
-        name,
-        dest="feature",
+        "--line-kind",
         choices=FEATURES,
         default=FEATURES[0],
         help="the line: nearer to the sensor than the surfaces beside it (edge, the default), or "
@@ -89,20 +92,40 @@ def add_feature(parser: argparse.ArgumentParser, name: str) -> None:
 
 def add_limits(parser: argparse.ArgumentParser, sigma_default: str) -> None:
     """Offer the robot's scatter, and what is good enough."""
+    add_robot_sigma(parser, sigma_default)
+    add_limit(parser, "in the field of view", LIMIT_MM)
+
+
+def add_robot_sigma(parser: argparse.ArgumentParser, default: str) -> None:
+    """Offer the robot's scatter."""
     for unit, of in (("mm", "position"), ("deg", "orientation")):
         parser.add_argument(
             f"--robot-sigma-{unit}",
             type=positive,
             metavar="S",
-            help=f"noise of a reported pose's {of} in each axis; {sigma_default}",
+            help=f"noise of a reported pose's {of} in each axis; {default}",
         )
+
+
+def add_limit(parser: argparse.ArgumentParser, where: str, default_mm: float) -> None:
+    """Offer what is good enough."""
     parser.add_argument(
         "--limit-mm",
         type=positive,
-        default=LIMIT_MM,
+        default=default_mm,
         metavar="L",
-        help="largest expected error (rms) in the field of view that is accepted; default "
-        f"{LIMIT_MM:g}",
+        help=f"largest expected error (rms) {where} that is accepted; default {default_mm:g}",
+    )
+
+
+def robot_sigma_of(args: argparse.Namespace) -> tuple[float | None, float | None]:
+    """The robot's scatter, m and rad, where it is given."""
+    from math import radians
+
+    place_mm, turn_deg = args.robot_sigma_mm, args.robot_sigma_deg
+    return (
+        None if place_mm is None else place_mm * 1e-3,
+        None if turn_deg is None else radians(turn_deg),
     )
 
 
@@ -114,17 +137,11 @@ def settings_of(args: argparse.Namespace) -> "HandEyeSettings":
     InputError
         For an orientation's noise alone.
     """
-    from math import radians
-
     from robocal_ros.core.hand_eye.quality import HandEyeSettings
 
     if args.robot_sigma_mm is None and args.robot_sigma_deg is not None:
         raise InputError("--robot-sigma-deg goes with --robot-sigma-mm: give both, or the latter")
-    return HandEyeSettings(
-        robot_sigma_m=None if args.robot_sigma_mm is None else args.robot_sigma_mm * 1e-3,
-        robot_sigma_rad=None if args.robot_sigma_deg is None else radians(args.robot_sigma_deg),
-        limit_m=args.limit_mm * 1e-3,
-    )
+    return HandEyeSettings(*robot_sigma_of(args), limit_m=args.limit_mm * 1e-3)
 
 
 def arm_of(args: argparse.Namespace) -> "SerialArm | None":
@@ -175,6 +192,19 @@ def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table)
     return Shots(HandEyeData(table.names, table.T_base_flange, seen, table.mark), table)
+
+
+def require_unused(judges: "PoseTable", used: "PoseTable") -> None:
+    """Refuse judges that helped to solve.
+
+    Raises
+    ------
+    InputError
+        Naming the row.
+    """
+    for index, file in enumerate(judges.files):
+        if file in used.files:
+            judges.fail(index, f"{quoted(file)} is in --poses too: other shots must judge")
 
 
 def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Target | None":

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
+from robocal_ros.cli.hand_eye_shots import add_limit
+from robocal_ros.cli.hand_eye_view import show_judged, show_placed
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
 
@@ -20,6 +22,7 @@ NAME = "tracker"
 HELP = "place a profile sensor by a laser tracker that sees the flange, and a cube with a sphere"
 
 METHODS = ("best", "classic")
+LIMIT_MM = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,13 +69,7 @@ def _add_limits(parser: argparse.ArgumentParser) -> None:
     noise.add_argument(
         "--joint-sigma-mm", type=positive, default=0.02, metavar="S", help="default 0.02"
     )
-    parser.add_argument(
-        "--limit-mm",
-        type=positive,
-        default=0.5,
-        metavar="L",
-        help="largest error to expect at the working distance that is accepted; default 0.5",
-    )
+    add_limit(parser, "at the working distance", LIMIT_MM)
 
 
 def run(args: argparse.Namespace) -> Outcome:
@@ -131,24 +128,9 @@ def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", di
 
 
 def _show(console: "Console", document: Document) -> None:
-    from rich.text import Text
-
-    verdict, pose = document["verdict"], document["T_flange_sensor"]
-    style = "bold green" if verdict["accept"] else "bold red"
-    console.print(Text(f"{verdict['code']}: {verdict['reason']}", style=style), soft_wrap=True)
-    xyz = ", ".join(f"{value:.3f}" for value in pose["xyz_mm"])
-    console.print(f"Sensor in the flange frame, mm: {xyz}")
-    console.print(
-        "Orientation, quaternion x y z w: " + " ".join(f"{v:.6f}" for v in pose["quat_xyzw"])
-    )
-    sigma = document["sigma"]
-    if sigma is not None:
-        xyz = ", ".join(f"{value:.3f}" for value in sigma["xyz_mm"])
-        turns = ", ".join(f"{value:.4f}" for value in sigma["rot_deg"])
-        console.print(f"Standard deviations: {xyz} mm; {turns} deg")
+    show_placed(console, document, "Sensor")
     residual = document["residual_mm"]
     console.print(
         f"Profiles from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
     )
-    for name, why in document["rejected_because"].items():
-        console.print(f"Not used: {name}: {why}", soft_wrap=True)
+    show_judged(console, document)

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.hand_eye_shots import (
-    KINDS,
     add_feature,
     add_limits,
     add_shots,
     add_target,
+    add_target_kind,
     arm_of,
     given_shots,
     given_target,
@@ -36,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="JSON that sphere, step, line, joint or tracker printed",
     )
-    parser.add_argument("--kind", required=True, choices=KINDS, help="target of these shots")
+    add_target_kind(parser)
     add_shots(parser)
     add_target(parser)
-    add_feature(parser, "--line-kind")
+    add_feature(parser)
     add_limits(parser, "default 0.05 mm, 0.003 deg")
 
 
@@ -51,18 +51,19 @@ def run(args: argparse.Namespace) -> Outcome:
         transform_document,
         verdict_document,
     )
+    from robocal_ros.core.hand_eye.result import by_shot
     from robocal_ros.core.hand_eye.verification import verify
     from robocal_ros.storage.hand_eye_files import read_flange_mount
 
     settings = settings_of(args)
     T_flange_sensor = read_flange_mount(args.result)
-    task = task_of(given_target(args.kind, args.target, args.radius_mm), args.feature)
+    task = task_of(given_target(args.target_kind, args.target, args.radius_mm), args.line_kind)
     shots = given_shots(args, arm_of(args))
     found = verify(task, shots.data, T_flange_sensor, settings)
     errors = errors_document(summarise(found.distance_m))
-    rejected = {**shots.rejected, **found.rejected}
+    rejected = {**shots.rejected, **by_shot(found.rejected, found.samples)}
     document: Document = {
-        "kind": args.kind,
+        "kind": args.target_kind,
         "T_flange_sensor": transform_document(T_flange_sensor),
         "target": found.target,
         "held_out": errors | {"rejected": list(rejected), "rejected_because": rejected},

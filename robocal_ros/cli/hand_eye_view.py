@@ -8,19 +8,34 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+MOST_NAMED = 5  # samples left out for one reason
+
+
 def show_mount(console: "Console", document: Document) -> None:
-    """Print where a sensor sits, how well that is known, and which samples were left out."""
+    """Print where a line laser sits, how well that is known, and which samples were left out."""
+    show_placed(console, document, "Sensor")
+    residual = document["residual_mm"]
+    console.print(
+        f"Samples from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
+    )
+    show_judged(console, document)
+
+
+def show_placed(console: "Console", document: Document, what: str) -> None:
+    """Print the decision, where a sensor sits, and how well that is known."""
     show_verdict(console, document)
-    show_pose(console, "Sensor in the flange frame", document["T_flange_sensor"])
+    parent = "flange" if "T_flange_sensor" in document else "base"
+    show_pose(console, f"{what} in the {parent} frame", document[f"T_{parent}_sensor"])
     if document["sigma"] is not None:
         show_sigma(console, document["sigma"])
     error_mm = document["working_error_mm"]
     if error_mm is not None:
         console.print(f"Expected error in the field of view: {error_mm:.3f} mm rms")
-    residual, left_out = document["residual_mm"], document["leave_one_out_mm"]
-    console.print(
-        f"Samples from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
-    )
+
+
+def show_judged(console: "Console", document: Document) -> None:
+    """Print how far samples are from a result without them, and which were left out."""
+    left_out = document["leave_one_out_mm"]
     if left_out is not None:
         console.print(
             f"Each without itself: mean {left_out['mean']:.3f} mm, largest {left_out['max']:.3f} mm"
@@ -57,9 +72,14 @@ def show_held_out(console: "Console", held_out: Document) -> None:
 
 
 def show_rejected(console: "Console", because: Document) -> None:
-    """Print which samples were left out, and why."""
+    """Print which samples were left out, and why: those of one reason together."""
+    same: dict[str, list[str]] = {}
     for name, why in because.items():
-        console.print(f"Not used: {name}: {why}", soft_wrap=True, markup=False)
+        same.setdefault(why, []).append(name)
+    for why, names in same.items():
+        who = ", ".join(names[:MOST_NAMED]) + (", …" if len(names) > MOST_NAMED else "")
+        count = f"{len(names)} samples, " if len(names) > 1 else ""
+        console.print(f"Not used: {count}{who}: {why}", soft_wrap=True, markup=False)
 
 
 def show_sigma(console: "Console", sigma: Document) -> None:

@@ -1,11 +1,21 @@
 """What replays of all kinds tell: commands, pauses, damaged parts of the bag."""
 
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+from robocal_ros import __version__
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.streams import JointStream
 from robocal_ros.sessions.commanded import Commanded
-from robocal_ros.sessions.events import Outcome
-from robocal_ros.sessions.replay import ReplayReport
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.replay import ReplayReport, replay
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+S = TypeVar("S", bound=Commanded)
+AsRecorded = Callable[[SerialArm, CalibrationHistory, Command, str], S]
 
 
 def seconds(stamp_ns: int | None) -> float:
@@ -51,3 +61,26 @@ def commanded_document(report: ReplayReport, session: Commanded, recording: Reco
         "differs": report.differs,
         "warnings": recording.warnings,
     }
+
+
+def replay_commanded(
+    recording: Recording,
+    arm: SerialArm,
+    history: CalibrationHistory,
+    samples: Iterable[Any],
+    as_recorded: AsRecorded[S],
+    take: Callable[[S, str, Any], None],
+) -> tuple[ReplayReport, S]:
+    """Replay what a node recorded, in a session with its settings.
+
+    ``as_recorded`` makes the session; ``take`` gives it a message of an input.
+
+    Raises
+    ------
+    InputError, WrongRobotError
+        The bag lacks what a replay needs.
+    """
+    if recording.configured is None:
+        raise InputError("the bag holds no configuration of the node")
+    session = as_recorded(arm, history, recording.configured, __version__)
+    return replay(session, samples, recording.commands, recording.inputs, take), session

@@ -3,15 +3,13 @@
 from collections.abc import Iterable
 from typing import Any
 
-from robocal_ros import __version__
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.cli.replay_parts import commanded_document, seconds
+from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
 from robocal_ros.core.documents import transform_document
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.events import Outcome
-from robocal_ros.sessions.replay import ReplayReport, replay
+from robocal_ros.sessions.replay import ReplayReport
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import tool_session_as_recorded
@@ -28,10 +26,9 @@ def replay_tool(
     InputError, WrongRobotError
         The bag lacks what a replay needs.
     """
-    if recording.configured is None:
-        raise InputError("the bag holds no configuration of a tool node")
-    session = tool_session_as_recorded(arm, history, recording.configured, __version__)
-    report = replay(session, samples, recording.commands, recording.inputs, take_tool_message)
+    report, session = replay_commanded(
+        recording, arm, history, samples, tool_session_as_recorded, take_tool_message
+    )
     return _document(report, session, recording)
 
 

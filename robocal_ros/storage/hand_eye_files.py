@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.storage.made_files import read_fields
 from robocal_ros.storage.pose_fields import read_pose
@@ -46,8 +47,10 @@ def read_mount(path: Path, *, accepted: bool = False) -> Mount:
         top.fail("tells why no sensor was placed: calibrate again", "error")
     if accepted and "verdict" in top.values:
         verdict = top.below("verdict")
-        if verdict.values.get("accept") is not True:
-            top.fail(f"is {verdict.text('code')}: this place was not accepted", "verdict")
+        accept, code = verdict.values.get("accept"), verdict.text("code")
+        if accept is not True or code != Code.ACCEPT.name:
+            words = f"has accept {str(accept).lower()} and code {code}: this place was not accepted"
+            top.fail(words, "verdict")
     found = [parent for parent in FARTHEST_M if f"T_{parent}_sensor" in top.values]
     if len(found) != 1:
         top.fail("must give the sensor's place: either T_flange_sensor or T_base_sensor")

@@ -12,6 +12,7 @@ from hand_eye_command import chi_square, pose_of, robocal, shots, target
 from hand_eye_tables import (
     CELL,
     CENTRE,
+    CHECKS,
     RADIUS_M,
     ROBOT_M,
     SHOTS,
@@ -20,6 +21,7 @@ from hand_eye_tables import (
     TRUE,
     hand_eye_tables,
     shots_of,
+    target_of,
     write_part,
 )
 from scipy.stats import chi2
@@ -57,7 +59,7 @@ def sphere(made) -> Any:
 
 
 def line_of(kind: str) -> tuple[str, list[str]]:
-    return ("line", ["--kind", "groove"]) if kind == "groove" else (kind, [])
+    return ("line", ["--line-kind", "groove"]) if kind == "groove" else (kind, [])
 
 
 class TestRecovered:
@@ -110,6 +112,32 @@ class TestRecovered:
         assert found["working_error_mm"] < sphere["working_error_mm"]
         names = {name.split("/")[0] for name in found["residual_mm"]["per_sample"]}
         assert names == set(found["target"]) == {"sphere", "step", "line"}
+
+    def test_other_shots_judge_several_targets_together(self, made, tmp_path):
+        words = [word for kind in ("sphere", "step") for word in (f"--{kind}", made / kind)]
+        words += ["--line", tmp_path / "line"]
+        shutil.copytree(made / "line", tmp_path / "line")
+        found = robocal("joint", *words, "--check", "check.csv")
+        assert found["verdict"]["accept"]
+        judges = [
+            robocal(kind, *shots(made / kind), *target(made / kind), "--check", check)
+            for kind in ("sphere", "step", "line")
+            for check in [made / kind / "check.csv"]
+        ]
+        assert found["held_out"]["n"] == sum(one["held_out"]["n"] for one in judges)
+        assert found["held_out"]["rms_mm"] < 0.3  # robot 0.05 mm, profile 0.04 mm
+        some = shots_of("line")
+        T = some.T_base_flange[SHOTS : SHOTS + CHECKS].copy()
+        T[:, 2, 3] += 0.03  # as far as the edge was lowered before these were seen
+        write_part(tmp_path / "line", "moved", some, range(SHOTS, SHOTS + CHECKS), T)
+        refused = robocal("joint", *words, "--check", "moved.csv")
+        assert refused["verdict"]["code"] == "RESIDUAL_TOO_LARGE"
+        assert "not used to solve" in refused["verdict"]["reason"]
+        assert refused["held_out"]["n"] == CHECKS
+        assert refused["T_flange_sensor"] == found["T_flange_sensor"]
+        for name, said in (("poses.csv", "other shots must judge"), ("none.csv", "none of the")):
+            failed = robocal("joint", *words, "--check", name, status=2)
+            assert said in failed["error"]["message"]
 
     def test_a_line_without_a_target_file_is_unknown_in_joint(self, made, tmp_path):
         shutil.copytree(made / "groove", tmp_path / "groove")
@@ -232,6 +260,17 @@ class TestMistakes:
         assert set(found["rejected"]) == {"s3", "s8"}
         assert "fits the pose of s8" in found["rejected_because"]["s3"]
         assert chi_square(found) < FAR_OFF
+
+    def test_stairs_from_a_wrong_pose_are_rejected_as_a_shot(self, tmp_path):
+        some = shots_of("step")
+        T = some.T_base_flange[:SHOTS].copy()
+        T[4, 2, 3] += 0.002
+        write_part(tmp_path, "poses", some, range(SHOTS), T)
+        write_target(tmp_path / "target.yaml", target_of("step"))
+        found = robocal("step", *shots(tmp_path), *target(tmp_path))
+        assert found["rejected"] == ["s5"]
+        assert found["rejected_because"] == {"s5": "does not fit the others"}
+        assert not any(name.startswith("s5/") for name in found["residual_mm"]["per_sample"])
 
     def test_another_radius_is_named(self, made):
         run = self.sphere(made / "sphere", 21.0)
@@ -473,7 +512,7 @@ class TestVerify:
         return path
 
     def run(self, result: Path, kind: str, folder: Path, *more: object) -> list[object]:
-        return ["verify", "--result", result, "--kind", kind, *shots(folder), *more]
+        return ["verify", "--result", result, "--target-kind", kind, *shots(folder), *more]
 
     @pytest.mark.parametrize("kind", FOLDERS)
     def test_a_sphere_s_result_holds_on_every_target(self, made, result, kind):
@@ -516,9 +555,13 @@ class TestVerify:
             in (found["text"])
         )
 
-    def test_only_what_was_accepted_is_exported(self, result):
+    @pytest.mark.parametrize(
+        ("accept", "code"),
+        [(False, "POSES_NOT_INFORMATIVE"), (False, "ACCEPT"), (True, "RESIDUAL_TOO_LARGE")],
+    )
+    def test_only_what_was_accepted_is_exported(self, result, accept, code):
         document = json.loads(result.read_text())
-        document["verdict"] = {"accept": False, "code": "POSES_NOT_INFORMATIVE", "reason": "few"}
+        document["verdict"] = {"accept": accept, "code": code, "reason": "few"}
         result.write_text(json.dumps(document))
         found = robocal("export", "--result", result, "--format", "urdf", status=2)
-        assert "POSES_NOT_INFORMATIVE" in found["error"]["message"]
+        assert f"accept {str(accept).lower()} and code {code}" in found["error"]["message"]

@@ -151,7 +151,7 @@ class TestJudges:
         assert found["held_out"]["rms_mm"] < 0.2  # robot 0.05 mm in each axis, and the result
         result = tmp_path / "sphere.json"
         result.write_text(json.dumps(found))
-        judged = robocal("verify", "--result", result, "--kind", *from_bag("line"))
+        judged = robocal("verify", "--result", result, "--target-kind", *from_bag("line"))
         assert judged["verdict"]["accept"]
         assert {MOVED, BLIND, REMOVED} <= set(judged["held_out"]["rejected"])
 

@@ -193,7 +193,7 @@ CASES = {
     ),
     "hand-eye line": (
         "hand-eye.line.json",
-        ["hand-eye", "line", *LINE, "--kind", "edge", "--method", "classic"],
+        ["hand-eye", "line", *LINE, "--line-kind", "edge", "--method", "classic"],
         ["hand-eye", "line", *LINE, "--target", "step/target.yaml"],
         (2, "BAD_INPUT"),
     ),
@@ -211,8 +211,8 @@ CASES = {
     ),
     "hand-eye verify": (
         "hand-eye.verify.json",
-        ["hand-eye", "verify", "--result", "mount.yaml", "--kind", "sphere", *SPHERE],
-        ["hand-eye", "verify", "--result", "mount.yaml", "--kind", "sphere", *FEW_SPHERE],
+        ["hand-eye", "verify", "--result", "mount.yaml", "--target-kind", "sphere", *SPHERE],
+        ["hand-eye", "verify", "--result", "mount.yaml", "--target-kind", "sphere", *FEW_SPHERE],
         (3, "TOO_FEW_SAMPLES"),
     ),
     "hand-eye export": (

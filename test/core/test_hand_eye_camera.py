@@ -23,7 +23,7 @@ from robocal_ros.core.hand_eye.board import (
     find_corners,
     see_boards,
 )
-from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.core.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
 from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised, moved
@@ -207,7 +207,37 @@ def shifted(pairs: PosePairs, lag: int) -> PosePairs:
     return replace(pairs.take(rows - lag), T_base_flange=pairs.T_base_flange[rows])
 
 
+def mirrored(T: np.ndarray) -> np.ndarray:
+    """As told in frames whose x and y changed places: left-handed ones."""
+    order = [1, 0, 2, 3]
+    return T[:, order][:, :, order]
+
+
+def negated(T: np.ndarray, axis: int) -> np.ndarray:
+    T = T.copy()
+    T[:, axis, 3] *= -1.0
+    return T
+
+
 MISTAKES = {
+    "robot mirrored": (
+        lambda p: replace(p, T_base_flange=mirrored(p.T_base_flange)), "mirrored as a whole",
+    ),
+    "board mirrored": (
+        lambda p: replace(p, T_camera_board=mirrored(p.T_camera_board)), "mirrored as a whole",
+    ),
+    "robot x negated": (
+        lambda p: replace(p, T_base_flange=negated(p.T_base_flange, 0)),
+        "the robot's positions fit with x negated: they come from a left-handed frame",
+    ),
+    "robot z negated": (
+        lambda p: replace(p, T_base_flange=negated(p.T_base_flange, 2)),
+        "the robot's positions fit with z negated: they come from a left-handed frame",
+    ),
+    "board y negated": (
+        lambda p: replace(p, T_camera_board=negated(p.T_camera_board, 1)),
+        "the board's positions fit with y negated: they come from a left-handed frame",
+    ),
     "robot inverted": (
         lambda p: replace(p, T_base_flange=frames.invert(p.T_base_flange)), "T_flange_base",
     ),
@@ -363,13 +393,70 @@ def test_classic_is_a_closed_form_alone() -> None:
 def test_check_pairs_judge_and_are_not_used() -> None:
     _, pairs = measured(30, 19)
     some, others = pairs.take(np.arange(20)), pairs.take(np.arange(20, 30))
-    found = calibrate_camera(some, check=others)
-    assert found.more["check"]["n"] == 10
+    found = calibrate_camera(some, check=CheckPairs(others, {"x": "dark"}))
+    assert found.more["held_out"]["n"] == 10
     alone = calibrate_camera(some)
     assert np.array_equal(found.T_flange_sensor, alone.T_flange_sensor)
-    assert alone.more["check"] is None
+    assert alone.more["held_out"] is None
+    assert found.more["held_out"]["rejected_because"] == {"x": "dark"}
     expected = np.sqrt(np.sum(np.square([2e-4] * 3)) + np.sum(np.square([1e-4, 1e-4, 4e-4])))
-    assert found.more["check"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.5)
+    assert found.more["held_out"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.5)
+
+
+@pytest.mark.parametrize("method", ["best", "classic"])
+def test_check_pairs_refuse_a_board_that_moved(method: str) -> None:
+    _, pairs = measured(30, 19)
+    some, others = pairs.take(np.arange(20)), pairs.take(np.arange(20, 30))
+    T = others.T_base_flange.copy()
+    T[:, 0, 3] += 0.02  # as far as the board was moved before these were seen
+    found = calibrate_camera(some, CameraSettings(method), check=CheckPairs(others))
+    assert found.verdict.accept
+    moved_on = CheckPairs(replace(others, T_base_flange=T))
+    refused = calibrate_camera(some, CameraSettings(method), check=moved_on)
+    assert refused.verdict.code is Code.RESIDUAL_TOO_LARGE
+    assert "not used to solve are off by" in refused.verdict.reason
+    assert refused.more["held_out"]["rms_mm"] == pytest.approx(20.0, rel=0.1)
+    assert np.array_equal(refused.T_flange_sensor, found.T_flange_sensor)
+
+
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_classic_is_judged_by_its_distance_from_the_best(mount: str) -> None:
+    _, pairs = measured(12, 18, mount)
+    best = calibrate_camera(pairs)
+    found = calibrate_camera(pairs, CameraSettings("classic"))
+    board = np.concatenate([pairs.T_camera_board[:, :3, 3], np.ones((12, 1))], axis=1)
+    away = board @ (found.T_flange_sensor - best.T_flange_sensor).T
+    away_m = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+    assert found.working_error_m == pytest.approx(np.hypot(away_m, best.working_error_m))
+    assert found.verdict.accept
+    assert f"{away_m * 1e3:.3f} mm from the best estimate" in found.verdict.reason
+    limit_m = 0.5 * (found.working_error_m + best.working_error_m)
+    assert calibrate_camera(pairs, CameraSettings(limit_m=limit_m)).verdict.accept
+    refused = calibrate_camera(pairs, CameraSettings("classic", limit_m=limit_m))
+    assert refused.verdict.code is Code.POSES_NOT_INFORMATIVE
+    assert "use method best" in refused.verdict.reason
+
+
+def test_classic_leaves_each_out_in_turn() -> None:
+    _, pairs = measured(9, 18)
+    found = calibrate_camera(pairs, CameraSettings("classic"))
+    assert found.leave_one_out_m is not None
+    for row in (0, 4, 8):
+        rest = np.arange(9) != row
+        at = closed_form(found.more["start"], pairs.take(rest))
+        assert at is not None
+        boards = pairs.T_boardside_cameraside @ at.X @ pairs.T_camera_board
+        miss = np.linalg.norm((boards[row] - at.Z)[:3, 3])
+        assert found.leave_one_out_m[row] == pytest.approx(miss, rel=1e-6)
+    _, many = measured(51, 18)
+    assert calibrate_camera(many, CameraSettings("classic")).leave_one_out_m is None
+
+
+def test_classic_names_mistakes_too() -> None:
+    _, pairs = measured(15, 10)
+    wrong = replace(pairs, T_camera_board=scaled(pairs.T_camera_board, 1.2))
+    with pytest.raises(InputError, match=r"multiplied by 0\.83"):
+        calibrate_camera(wrong, CameraSettings("classic"))
 
 
 def pixels(cell: BoardCell, count: int, seed: int, noise_px: float = 0.2):

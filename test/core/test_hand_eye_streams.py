@@ -109,7 +109,7 @@ def test_check_poses_of_another_time_judge() -> None:
     )
     found = calibrate_streams(first, camera, check=second)
     expected = np.sqrt(3.0 * (4e-4**2 + 1e-4**2))
-    assert found.more["check"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.25)
+    assert found.more["held_out"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.25)
 
 
 def test_streams_of_two_runs_are_refused() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import (
     InputError,
     RankDeficientError,
@@ -18,6 +19,7 @@ from robocal_ros.core.hand_eye.tracker import solve_best, solve_tracker, spread
 from robocal_ros.core.hand_eye.tracker_classic import solve_classic
 from robocal_ros.core.hand_eye.tracker_data import Arc, TrackerData
 from robocal_ros.core.hand_eye.tracker_features import fit_caps
+from robocal_ros.core.hand_eye.tracker_quality import states_without
 from robocal_ros.core.hand_eye.tracker_scan import Scan
 from robocal_ros.core.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
 from robocal_ros.sim.laser_tracker import TrackerCell
@@ -66,6 +68,86 @@ def test_measurements_without_noise_give_the_truth(kind):
     away = error(made, classic.T_flange_sensor)
     assert np.abs(away).max() < 1e-6  # the iteration stops at 1e-6
     assert classic.covariance is None
+
+
+@cache
+def solved():
+    """Problem and estimate of `noisy`, and the closed form."""
+    made = cell("prp")
+    first = solve_classic(noisy(), made.sizes.target, made.sizes.noise)
+    return *solve_best(noisy(), made.sizes.target, made.sizes.noise, first), first
+
+
+def left_out(data: TrackerData, row: int) -> TrackerData:
+    rest = [i for i in range(len(data.profiles)) if i != row]
+    return replace(data, q=data.q[rest], profiles=[data.profiles[i] for i in rest])
+
+
+def test_leaving_a_profile_out_is_as_solving_without_it():
+    """Not the first one: the motion counts from there."""
+    made, (problem, estimate, _) = cell("prp"), solved()
+    data = noisy()
+    size = []
+    for row in (1, 12, 25, 40, 53):
+        (state,) = states_without(problem, estimate, [data.profiles[row].name])
+        assert state is not None
+        rest = left_out(data, row)
+        first = solve_classic(rest, made.sizes.target, made.sizes.noise)
+        _, again = solve_best(rest, made.sizes.target, made.sizes.noise, first)
+        here = estimate.state.T_flange_sensor
+        told, exact = (
+            frames.invert(here) @ s.T_flange_sensor for s in (state, again.state)
+        )  # how far each has moved
+        away = told[:3, 3] - exact[:3, 3]
+        size.append([np.linalg.norm(away), np.linalg.norm(exact[:3, 3])])
+    away_m, moved_m = np.sqrt(np.mean(np.square(size), axis=0))
+    assert away_m < 0.25 * moved_m  # the noise of the sensor is estimated anew
+
+
+def test_leave_one_out_is_filled_by_both_methods():
+    """The distance of a profile's own points hardly changes, and never to the better as a whole."""
+    for method in ("best", "classic"):
+        found = solve(noisy(), method)
+        assert found.leave_one_out_m is not None
+        assert found.leave_one_out_m.shape == found.residual_m.shape
+        without, within = (
+            np.sqrt(np.mean(d**2)) for d in (found.leave_one_out_m, found.residual_m)
+        )
+        assert within < without < 1.2 * within
+
+
+def test_a_profile_that_alone_tells_something_is_not_left_out():
+    """Where all others are rejected, it is all that tells where the sensor sits."""
+    problem, estimate, _ = solved()
+    profiles = [n for n in problem.rows if n in {p.name for p in noisy().profiles}]
+    mask = np.array([name == profiles[0] or name not in profiles for name in problem.rows])
+    alone = replace(estimate, rejected=~mask)
+    J = problem.linearise(estimate.state)[1][mask, 0]
+    covariance = np.linalg.pinv(J.T @ J)
+    names = [profiles[0], profiles[-1]]
+    assert states_without(problem, replace(alone, covariance=covariance), names)[0] is None
+
+
+def test_classic_is_judged_by_its_distance_from_the_best():
+    best, classic = solve(noisy()), solve(noisy(), "classic")
+    points = np.concatenate([profile.points for profile in noisy().profiles])
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    x, z = (np.ravel(g) for g in np.meshgrid(*np.stack([low, high]).T))
+    x, z = np.append(x, x.mean()), np.append(z, z.mean())
+    field = np.stack([x, 0.0 * x, z, np.ones(5)], axis=1)
+    away = field @ (classic.T_flange_sensor - best.T_flange_sensor).T
+    away_m = float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
+    expected = np.hypot(away_m, best.working_error_m)
+    assert classic.working_error_m == pytest.approx(expected, rel=0.01)
+    assert classic.verdict.accept
+    made = cell("prp")
+    limit_m = 0.5 * (classic.working_error_m + best.working_error_m)
+    for method, accept in (("best", True), ("classic", False)):
+        told, noise = made.sizes.target, made.sizes.noise
+        verdict = solve_tracker(noisy(), told, noise, method, limit_m).verdict
+        assert verdict.accept is accept
+    assert verdict.code is Code.POSES_NOT_INFORMATIVE
+    assert "use method best" in verdict.reason
 
 
 @cache

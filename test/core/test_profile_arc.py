@@ -12,7 +12,7 @@ from profile_shapes import (
     stairs,
 )
 
-from robocal_ros.core.errors import ResidualError, TooFewSamplesError
+from robocal_ros.core.errors import InputError, ResidualError, TooFewSamplesError
 from robocal_ros.core.fitting.arc import ArcFit, ArcRule, fit_arc
 
 R = 0.02
@@ -159,7 +159,8 @@ def test_an_arc_larger_than_the_sphere_is_refused():
 def test_a_radius_in_another_unit_is_named(given, word):
     rng = np.random.default_rng(9)
     points, _ = arc_profile(circle(rng, 0.9 * R), rng)
-    with pytest.raises(ResidualError, match=f"1000 times too {word}"):
+    said = f"1000 times too {word} for this arc: check its unit"
+    with pytest.raises(InputError, match=said):
         fit_arc(points, ArcRule(given))
 
 

@@ -375,7 +375,7 @@ WITHOUT = {
     ),
     "millimetres": (
         lambda stamp_ns: profile(stamp_ns, 1e3 * _seen(0)), Code.BAD_INPUT,
-        "in mm where m are expected",
+        "a thousand times too large? A table's x_mm and z_mm hold mm, a message m",
     ),
 }  # fmt: skip
 

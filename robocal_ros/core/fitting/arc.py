@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
-from robocal_ros.core.errors import ResidualError, RobocalError, TooFewSamplesError
+from robocal_ros.core.errors import (
+    InputError,
+    ResidualError,
+    RobocalError,
+    TooFewSamplesError,
+)
 from robocal_ros.core.fitting.arc_search import find_circle, linearised, step
 from robocal_ros.core.fitting.neighbours import on_curve
 from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
@@ -84,6 +89,8 @@ def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
     ResidualError
         No arc, an arc larger than the sphere, too much noise, a surface that is not round, or an
         arc too short to know its radius: the message holds the figure that failed.
+    InputError
+        The radius as given is a thousand times too small or too large for the arc that is there.
     """
     finite = np.all(np.isfinite(points), axis=1)
     rows = np.ascontiguousarray(points[finite], dtype=np.float64)
@@ -238,8 +245,8 @@ def _blame_radius(points: Array, rule: ArcRule) -> None:
             _require(fit, points, other)
         except RobocalError:
             continue
-        raise ResidualError(
+        raise InputError(
             f"the profile shows an arc of radius {fit.radius_m * 1e3:.3f} mm, the sphere's radius "
-            f"is given as {rule.radius_m * 1e3:.6g} mm: it is about 1000 times too {word}; give it "
-            "in metres"
+            f"is given as {rule.radius_m * 1e3:.6g} mm, 1000 times too {word} for this arc: check "
+            "its unit"
         )

@@ -2,23 +2,26 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict, summarise
-from robocal_ros.core.codes import Code
+from robocal_ros.core.assessment import summarise
 from robocal_ros.core.documents import errors_document, transform_document
 from robocal_ros.core.errors import InputError, ResidualError
-from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form
+from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form, closed_forms
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.camera_mistakes import mistake, require_pairs, swapped, wrong_scale
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised
 from robocal_ros.core.hand_eye.camera_quality import (
     LARGEST_RMS_M,
     distances,
+    form_error,
+    form_verdict,
+    held_out_verdict,
     left_out,
+    left_out_of_form,
     rms,
     verdict,
     working_error,
@@ -32,7 +35,6 @@ Document = dict[str, Any]
 
 METHODS = ("best", "classic", *CLOSED_FORMS)
 LARGEST_START_M = 3e-2  # median miss beyond which no search can be trusted
-MOST_COMPARED = 100  # samples for the closed forms: OpenCV pairs each with each
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,19 @@ class CameraSettings:
             raise ValueError(f"{self.method} is not one of {', '.join(METHODS)}")
 
 
+@dataclass(frozen=True, eq=False)
+class CheckPairs:
+    """Pairs that judge, and the samples left out of them with the reason."""
+
+    pairs: PosePairs
+    rejected: Mapping[str, str] = field(default_factory=dict)
+
+
 def calibrate_camera(
     pairs: PosePairs,
     settings: CameraSettings | None = None,
     *,
-    check: PosePairs | None = None,
+    check: CheckPairs | None = None,
     rejected: Mapping[str, str] | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> HandEyeResult:
@@ -68,7 +78,7 @@ def calibrate_camera(
 
     Parameters
     ----------
-    check : pairs that judge the result and are not used to find it.
+    check : what judges the result and is not used to find it.
     rejected : samples that were left out before, with the reason.
     more : further entries of the document.
 
@@ -84,10 +94,15 @@ def calibrate_camera(
     how = settings or CameraSettings()
     require_sound(pairs, rejected or {})
     fit = fit_pairs(pairs, how.noise, _start(pairs, how.method))
+    _require_no_mistake(fit)
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
-    if how.method == "classic":
-        return _classic(pairs, check, dict(rejected or {}), about)
-    return _result(fit, how, check, dict(rejected or {}), about)
+    result, state = (_classic if how.method == "classic" else _best)(fit, how)
+    result = replace(
+        result,
+        rejected={**(rejected or {}), **result.rejected},
+        more={**about, **result.more, "held_out": None},
+    )
+    return result if check is None else _judged(result, check, state)
 
 
 def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
@@ -117,12 +132,6 @@ def _start(pairs: PosePairs, method: str) -> Placement | None:
     return closed_form(method, pairs) if method in CLOSED_FORMS else None
 
 
-def closed_forms(pairs: PosePairs) -> dict[str, Placement | None]:
-    """Each of OpenCV's, from at most 100 of the samples, spread evenly."""
-    rows = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_COMPARED)).astype(int))
-    return {name: closed_form(name, pairs.take(rows)) for name in CLOSED_FORMS}
-
-
 def _forms_document(pairs: PosePairs, forms: Mapping[str, Placement | None]) -> Document:
     return {
         "closed_forms_mean_mm": {
@@ -132,14 +141,22 @@ def _forms_document(pairs: PosePairs, forms: Mapping[str, Placement | None]) -> 
     }
 
 
-def _check_document(check: PosePairs | None, state: PairState) -> Document:
-    """Errors at pairs that were not used, with the errors of the intrinsics as they were found."""
-    if check is None:
-        return {"check": None}
-    known = check.shared is not None and len(state.common) > 0
-    own = check if known else replace(check, shared=None)
-    miss = linearised(own, state if known else PairState(state.at, np.zeros(0)))[0]
-    return {"check": errors_document(summarise(miss[:, :3]))}
+def _judged(result: HandEyeResult, check: CheckPairs, state: PairState) -> HandEyeResult:
+    """A result with the errors at pairs that were not used; they may refuse it.
+
+    The errors of the intrinsics are taken as they were found.
+    """
+    pairs = check.pairs
+    known = pairs.shared is not None and len(state.common) > 0
+    own = pairs if known else replace(pairs, shared=None)
+    miss = linearised(own, state if known else PairState(state.at, np.zeros(0)))[0][:, :3]
+    held_out = errors_document(summarise(miss)) | {
+        "rejected": list(check.rejected), "rejected_because": dict(check.rejected),
+    }  # fmt: skip
+    refused = held_out_verdict(np.linalg.norm(miss, axis=1)) if result.verdict.accept else None
+    return replace(
+        result, verdict=refused or result.verdict, more={**result.more, "held_out": held_out}
+    )
 
 
 def _noise_document(fit: PairFit, known: GivenNoise) -> Document:
@@ -170,20 +187,22 @@ def _reasons(fit: PairFit) -> dict[str, str]:
     return reasons
 
 
-def _result(
-    fit: PairFit, how: CameraSettings, check: PosePairs | None, rejected: dict[str, str],
-    about: Document,
-) -> HandEyeResult:  # fmt: skip
+def _require_no_mistake(fit: PairFit) -> None:
+    used = ~fit.rejected
+    size = np.linalg.norm(fit.differences[used][:, :3], axis=1)
+    wrong = mistake(fit.pairs, fit.at) if rms(size) > LARGEST_RMS_M else ""
+    wrong = wrong or wrong_scale(fit.pairs.take(used), fit.at)
+    if wrong:
+        raise InputError(wrong)
+
+
+def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
     pairs, used = fit.pairs, ~fit.rejected
     miss = fit.differences[used]
     size = np.linalg.norm(miss[:, :3], axis=1)
-    wrong = mistake(pairs, fit.at) if rms(size) > LARGEST_RMS_M else ""
-    wrong = wrong or wrong_scale(pairs.take(used), fit.at)
-    if wrong:
-        raise InputError(wrong)
     kept = pairs.take(used)
     error = working_error(fit)
-    return HandEyeResult(
+    result = HandEyeResult(
         kind="camera",
         method="best",
         T_flange_sensor=fit.at.X,
@@ -192,22 +211,19 @@ def _result(
         residual_m=size,
         residual_rad=np.asarray(np.linalg.norm(miss[:, 3:], axis=1)),
         leave_one_out_m=left_out(fit),
-        rejected=rejected | _reasons(fit),
+        rejected=_reasons(fit),
         target=_target_document(pairs, fit.at),
         working_error_m=error,
         verdict=verdict(fit, size, error, how.limit_m),
-        more=about
-        | {"start": how.method}
-        | _forms_document(kept, closed_forms(kept))
-        | _check_document(check, fit.estimate.state),
-        parent="flange" if pairs.mount == "in-hand" else "base",
+        more={"start": how.method} | _forms_document(kept, closed_forms(kept)),
+        parent=_parent(pairs),
     )
+    return result, fit.estimate.state
 
 
-def _classic(
-    used: PosePairs, check: PosePairs | None, rejected: dict[str, str], about: Document
-) -> HandEyeResult:
-    """The closed form that fits all samples best."""
+def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
+    """The closed form that fits all samples best; the most likely placement judges it."""
+    used = fit.pairs
     forms = closed_forms(used)
     found = {name: at for name, at in forms.items() if at is not None}
     if not found:
@@ -216,8 +232,8 @@ def _classic(
     at = found[name]
     miss = differences(predicted(used, at), used)
     size = np.linalg.norm(miss[:, :3], axis=1)
-    words = f"{name} fits {len(used)} samples within {rms(size) * 1e3:.3f} mm rms"
-    return HandEyeResult(
+    away_m, error_m = form_error(at, fit)
+    result = HandEyeResult(
         kind="camera",
         method="classic",
         T_flange_sensor=at.X,
@@ -225,15 +241,18 @@ def _classic(
         samples=used.names,
         residual_m=size,
         residual_rad=np.asarray(np.linalg.norm(miss[:, 3:], axis=1)),
-        rejected=rejected,
+        leave_one_out_m=left_out_of_form(name, used, at),
         target=_target_document(used, at),
-        verdict=Verdict(Code.ACCEPT, words),
-        more=about
-        | {"start": name}
-        | _forms_document(used, forms)
-        | _check_document(check, PairState(at, np.zeros(0))),
-        parent="flange" if used.mount == "in-hand" else "base",
+        working_error_m=error_m,
+        verdict=form_verdict(name, size, away_m, error_m, how.limit_m),
+        more={"start": name} | _forms_document(used, forms),
+        parent=_parent(used),
     )
+    return result, PairState(at, np.zeros(0))
+
+
+def _parent(pairs: PosePairs) -> Literal["flange", "base"]:
+    return "flange" if pairs.mount == "in-hand" else "base"
 
 
 def _target_document(pairs: PosePairs, at: Placement) -> Document:

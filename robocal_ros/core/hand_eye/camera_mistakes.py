@@ -142,6 +142,7 @@ def mistake(pairs: PosePairs, at: Placement) -> str:
         "the board's poses fit when they are inverted: are they T_board_camera?": replace(
             pairs, T_camera_board=frames.invert(board)
         ),
+        **_right_handed(pairs),
     }
     for lag in range(1, MOST_SHIFTED + 1):
         if len(pairs) - lag > FEWEST_PAIRS + 2:
@@ -155,6 +156,26 @@ def mistake(pairs: PosePairs, at: Placement) -> str:
     if scores[best] < CLEARLY_BETTER * now:
         return best
     return scale
+
+
+def _right_handed(pairs: PosePairs) -> dict[str, PosePairs]:
+    """Pairs with a mirror undone, each by its words.
+
+    Which axis a whole mirror turns round is a choice of frames; and to mirror the robot's poses
+    undoes a mirror of the board's as well.
+    """
+    flip = np.diag([1.0, -1.0, 1.0, 1.0])
+    remedy = "they come from a left-handed frame: turn one axis round"
+    mirrored = replace(pairs, T_base_flange=flip @ pairs.T_base_flange @ flip)
+    found = {f"the robot's poses, or the board's, fit when mirrored as a whole: {remedy}": mirrored}
+    for axis, name in enumerate("xyz"):
+        robot, board = pairs.T_base_flange.copy(), pairs.T_camera_board.copy()
+        robot[:, axis, 3] *= -1.0
+        board[:, axis, 3] *= -1.0
+        words = f"positions fit with {name} negated: {remedy}"
+        found[f"the robot's {words}"] = replace(pairs, T_base_flange=robot)
+        found[f"the board's {words}"] = replace(pairs, T_camera_board=board)
+    return found
 
 
 def _shifted(pairs: PosePairs, lag: int) -> PosePairs:

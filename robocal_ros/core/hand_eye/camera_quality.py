@@ -6,13 +6,16 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
+from robocal_ros.core.hand_eye.camera_closed_forms import closed_form
 from robocal_ros.core.hand_eye.camera_fit import PairFit
 from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
+from robocal_ros.core.hand_eye.quality import HandEyeSettings, apart, judge_classic
 
 Array = NDArray[np.float64]
 
 MOST_REJECTED = 1.0 / 3.0
 LARGEST_RMS_M = 5e-3
+MOST_LEFT_OUT = 50
 LEAST_REST = 1e-6  # what the others say about a sample, where they say anything
 
 
@@ -38,6 +41,23 @@ def left_out(fit: PairFit) -> Array | None:
     whitened = np.linalg.solve(root, fit.differences[used][..., None])
     alone = root @ np.linalg.solve(rest, whitened)
     return np.asarray(np.linalg.norm(alone[:, :3, 0], axis=1))
+
+
+def left_out_of_form(name: str, pairs: PosePairs, at: Placement) -> Array | None:
+    """How far each sample (n,) lies from a closed form without it, m, solved again each time.
+
+    ``at``: the form's answer with all. None of more than 50 samples (OpenCV pairs each with each,
+    every time), and where the form fails without one of them.
+    """
+    if len(pairs) > MOST_LEFT_OUT:
+        return None
+    rows, found = np.arange(len(pairs)), distances(pairs, at)
+    for row in rows:
+        without = closed_form(name, pairs.take(rows != row))
+        if without is None:
+            return None
+        found[row] = distances(pairs.take(np.array([row])), without)[0]
+    return found
 
 
 def working_error(fit: PairFit) -> float:
@@ -74,6 +94,38 @@ def verdict(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdic
             "further about two axes",
         )
     return Verdict(Code.ACCEPT, words)
+
+
+def form_error(at: Placement, fit: PairFit) -> tuple[float, float]:
+    """How far a closed form is from the most likely placement, rms where the boards were, m.
+
+    And its error to expect there: the same with the error of that placement.
+    """
+    away = apart(at.X, fit.at.X, fit.pairs.T_camera_board[:, :3, 3])
+    return away, float(np.hypot(away, working_error(fit)))
+
+
+def form_verdict(name: str, size: Array, away_m: float, error_m: float, limit_m: float) -> Verdict:
+    """Whether a closed form may be used; ``size`` (n,) of its residuals, m."""
+    words = f"{name} fits {len(size)} samples within {rms(size) * 1e3:.3f} mm rms"
+    if rms(size) > LARGEST_RMS_M:
+        return Verdict(
+            Code.RESIDUAL_TOO_LARGE,
+            f"{words} (allowed {LARGEST_RMS_M * 1e3:.0f} mm): use method best",
+        )
+    judged = judge_classic(away_m, error_m, HandEyeSettings(limit_m=limit_m))
+    return Verdict(judged.code, f"{words}; {judged.reason}")
+
+
+def held_out_verdict(size: Array) -> Verdict | None:
+    """Refuse where samples (n,) that were not used are too far off, m; else None."""
+    if rms(size) <= LARGEST_RMS_M:
+        return None
+    return Verdict(
+        Code.RESIDUAL_TOO_LARGE,
+        f"samples that were not used to solve are off by {rms(size) * 1e3:.2f} mm rms (allowed "
+        f"{LARGEST_RMS_M * 1e3:.0f} mm)",
+    )
 
 
 def rms(size: Array) -> float:

@@ -1,6 +1,6 @@
 """One mount from several targets at once: what one leaves open, another shows."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +10,23 @@ from robocal_ros.core.hand_eye.diagnosis import look
 from robocal_ros.core.hand_eye.mount_fit import fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
-from robocal_ros.core.hand_eye.result import HandEyeResult
+from robocal_ros.core.hand_eye.result import HandEyeResult, TargetKind
 from robocal_ros.core.hand_eye.solve import result_of
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task
+from robocal_ros.core.hand_eye.verification import HeldOut, held_out, judged
 
 Part = tuple[Task, HandEyeData]
 
 
-def solve_joint(parts: Sequence[Part], settings: HandEyeSettings) -> HandEyeResult:
+def solve_joint(
+    parts: Sequence[Part],
+    settings: HandEyeSettings,
+    checks: Mapping[TargetKind, HandEyeData] | None = None,
+) -> HandEyeResult:
     """Calibrate with all shots of several targets; names of samples begin with their target's kind.
 
-    At least one target must suffice for a first pose of the sensor.
+    At least one target must suffice for a first pose of the sensor. ``checks``: by kind, other
+    shots of targets, which have not moved; they judge the result.
 
     Raises
     ------
@@ -42,7 +48,32 @@ def solve_joint(parts: Sequence[Part], settings: HandEyeSettings) -> HandEyeResu
     require_seen(
         fit, float(np.abs(np.concatenate([v.sightings.value[:, 1] for v in views])).mean())
     )
-    return result_of([task for task, _ in parts], fit, reads, _data(parts), settings)
+    tasks = [task for task, _ in parts]
+    result = result_of(tasks, fit, reads, _data(parts), settings)
+    if not checks:
+        return result
+    shots = sum(len(data.names) for data in checks.values())
+    return judged(result, _held_out(tasks, fit.state, checks), shots, settings)
+
+
+def _held_out(
+    tasks: Sequence[Task], state: MountState, checks: Mapping[TargetKind, HandEyeData]
+) -> HeldOut:
+    """How far all other shots are off."""
+    found = {
+        task.kind: held_out(task, checks[task.kind], state.T_flange_sensor, place)
+        for task, place in zip(tasks, state.places, strict=True)
+        if task.kind in checks
+    }
+    return HeldOut(
+        tuple(f"{kind}/{name}" for kind, one in found.items() for name in one.samples),
+        np.concatenate([one.distance_m for one in found.values()]),
+        {
+            f"{kind}/{name}": why
+            for kind, one in found.items()
+            for name, why in one.rejected.items()
+        },
+    )
 
 
 def _read(parts: Sequence[Part]) -> list[Read]:

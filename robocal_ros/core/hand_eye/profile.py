@@ -48,14 +48,11 @@ def profile_of(points: ArrayLike, name: str) -> Profile:
             "and that the target is in range"
         )
     extent = float(np.ptp(rows, axis=0).max())
-    if extent < NARROWEST_M:
+    if not NARROWEST_M <= extent <= WIDEST_M:
+        small = extent < NARROWEST_M
+        width = f"{extent * 1e3:.4g} mm" if small else f"{extent:.4g} m"
         raise InputError(
-            f"profile {name} is {extent * 1e3:.4g} mm wide: is it a thousand times too small, in m "
-            "where mm are expected?"
-        )
-    if extent > WIDEST_M:
-        raise InputError(
-            f"profile {name} is {extent:.4g} m wide: is it a thousand times too large, in mm where "
-            "m are expected?"
+            f"profile {name} comes out {width} wide: is it a thousand times too "
+            f"{'small' if small else 'large'}? A table's x_mm and z_mm hold mm, a message m"
         )
     return Profile(rows, name)

@@ -1,6 +1,7 @@
 """The outcome of a hand-eye calibration, whatever the target."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -106,9 +107,10 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     ``covariance`` (6, 6), SI, and ``sigma``: of the sensor's origin, and of its turn about that
     origin, both along the axes of the parent frame, to first order: where turns are uncertain the
     origin moves on an arc. ``covariance_at_pivot``, sensor axes, holds there too: of the
-    `increment` about ``pivot_mm``, a point of the sensor frame.
+    `increment` about ``pivot_mm``, a point of the sensor frame. A shot whose
+    corners were all rejected is named once.
     """
-    covariance = parent_covariance(result)
+    covariance, rejected = parent_covariance(result), by_shot(result.rejected, result.samples)
     return {
         "kind": result.kind,
         "method": result.method,
@@ -126,12 +128,30 @@ def hand_eye_document(result: HandEyeResult) -> Document:
         "working_error_mm": None
         if result.working_error_m is None
         else result.working_error_m * 1e3,
-        "rejected": list(result.rejected),
-        "rejected_because": dict(result.rejected),
+        "rejected": list(rejected),
+        "rejected_because": rejected,
         "unobservable": list(result.unobservable),
         **result.more,
         "verdict": verdict_document(result.verdict),
     }
+
+
+def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, str]:
+    """Reasons by name; a shot that has no corner among the samples used stands there once."""
+    used = {_shots_alone(name) for name in samples}
+    found: dict[str, list[str]] = {}
+    for name, why in rejected.items():
+        shot = _shots_alone(name)
+        if shot in used:
+            found[name] = [why]
+        else:
+            found.setdefault(shot, []).append(_shots_alone(why))
+    return {name: max(reasons, key=reasons.count) for name, reasons in found.items()}
+
+
+def _shots_alone(words: str) -> str:
+    """Names of corners in words as those of their shots."""
+    return re.sub(r"/corner \d+\b", "", words)
 
 
 def _sigma_document(covariance: Array | None) -> Document | None:

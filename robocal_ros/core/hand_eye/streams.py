@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera, require_sound
+from robocal_ros.core.hand_eye.camera import (
+    CameraSettings,
+    CheckPairs,
+    calibrate_camera,
+    require_sound,
+)
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.pose_pairs import Mount, PosePairs, Shared, differences, predicted
 from robocal_ros.core.hand_eye.result import HandEyeResult
@@ -243,7 +248,7 @@ def calibrate_streams(
     found = pair_streams(robot, camera, mount, how.noise)
     judges = None
     if check is not None:  # the common error is the offset, which is in the times already
-        judges = pairs_at(check, camera, found.offset_s, mount)[0]
+        judges = CheckPairs(pairs_at(check, camera, found.offset_s, mount)[0])
     return calibrate_camera(
         found.pairs,
         how,

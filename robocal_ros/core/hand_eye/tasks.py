@@ -7,7 +7,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import RobocalError, TooFewSamplesError
+from robocal_ros.core.errors import InputError, RobocalError, TooFewSamplesError
 from robocal_ros.core.fitting.arc import ArcRule, fit_arc
 from robocal_ros.core.fitting.edge import EdgeRule, fit_edge
 from robocal_ros.core.hand_eye.edge_start import least_distances, line_starts
@@ -136,6 +136,8 @@ class SphereTask:
         for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
             try:
                 arc = fit_arc(seen(profile), rule)
+            except InputError:
+                raise  # a radius in another unit is no profile's fault
             except RobocalError as error:
                 rejected[name] = str(error)
                 continue

@@ -14,13 +14,25 @@ from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.estimation import Estimate, solve
+from robocal_ros.core.hand_eye.quality import (
+    HandEyeSettings,
+    apart,
+    field_points,
+    judge_classic,
+)
 from robocal_ros.core.hand_eye.result import HandEyeResult, Method, point_covariance
-from robocal_ros.core.hand_eye.tracker_classic import Classic, solve_classic
+from robocal_ros.core.hand_eye.tracker_classic import Classic, each_without, solve_classic
 from robocal_ros.core.hand_eye.tracker_cube import Cube
 from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.core.hand_eye.tracker_features import Lines, fit_caps, fit_lines
 from robocal_ros.core.hand_eye.tracker_problem import TrackerProblem, sphere_in
-from robocal_ros.core.hand_eye.tracker_scan import Scan
+from robocal_ros.core.hand_eye.tracker_quality import (
+    FACES,
+    misfit,
+    profile_distances,
+    states_without,
+    verdict_of,
+)
 from robocal_ros.core.hand_eye.tracker_skew import AxisPair
 from robocal_ros.core.hand_eye.tracker_state import SENSOR, TrackerState
 
@@ -29,8 +41,6 @@ Array = NDArray[np.float64]
 LIMIT_M = 5e-4  # of the error to expect at the working distance
 SMALLEST_NOISE_M = 1e-7  # no sensor sees less; keeps data without noise solvable
 ROUNDS = 2  # the sphere is linear only near its place
-LARGEST_SCALE = 3.0  # of residuals over the noise that was told
-FACES = ("face_1", "face_2")
 
 
 def solve_tracker(
@@ -52,30 +62,88 @@ def solve_tracker(
         Saying what the measurements lack.
     """
     classic = solve_classic(data, target, noise)
-    if method == "classic":
-        verdict = Verdict(
-            Code.ACCEPT,
-            f"tracker and sensor agree about the target within {classic.mismatch_m * 1e3:.3f} mm; "
-            "the classic method tells no uncertainty",
-        )
-        return _result(data, target, classic, _state(classic), "classic", verdict)
     problem, estimate = solve_best(data, target, noise, classic)
+    best = _best(data, target, classic, problem, estimate, limit_m)
+    if method == "classic":
+        return _classic(data, target, classic, best, limit_m)
+    return best
+
+
+def _best(
+    data: TrackerData,
+    target: TrackerTarget,
+    classic: Classic,
+    problem: TrackerProblem,
+    estimate: Estimate[TrackerState],
+    limit_m: float,
+) -> HandEyeResult:
     covariance = estimate.covariance[SENSOR, SENSOR]
-    found = _result(data, target, classic, estimate.state, "best", Verdict(Code.NONE, ""))
+    found = _result(data, target, classic, estimate.state, "best")
     rejected = {**found.rejected, **_rejected(problem, estimate)}
-    found = replace(found, covariance=covariance, rejected=rejected)
+    states = states_without(problem, estimate, [profile.name for profile in data.profiles])
+    found = replace(
+        found,
+        covariance=covariance,
+        rejected=rejected,
+        leave_one_out_m=_left_out(data, target, classic, states),
+    )
     z = float(np.median(np.concatenate([p.points[:, 1] for p in data.profiles])))
     spread = point_covariance(found, np.array([[0.0, 0.0, z]]))
     working_m = float(np.sqrt(np.trace(spread[0])))
     angle, gap_m = estimate.state.mismatch.tolist()
     more = {
         **found.more,
-        "residual_over_noise": _misfit(estimate),
+        "residual_over_noise": misfit(estimate),
         "widened_by": estimate.scale,
         "axes_off_nominal": {"angle_deg": float(np.degrees(angle)), "gap_mm": gap_m * 1e3},
     }
-    verdict = _verdict(estimate, working_m, limit_m)
+    verdict = verdict_of(estimate, working_m, limit_m)
     return replace(found, working_error_m=working_m, verdict=verdict, more=more)
+
+
+def _classic(
+    data: TrackerData,
+    target: TrackerTarget,
+    classic: Classic,
+    best: HandEyeResult,
+    limit_m: float,
+) -> HandEyeResult:
+    """The closed form; its error is its distance from the best estimate, with that one's own."""
+    away_m = apart(
+        classic.T_flange_sensor,
+        best.T_flange_sensor,
+        field_points([profile.points for profile in data.profiles]),
+    )
+    error_m = float(np.hypot(away_m, best.working_error_m or 0.0))
+    states = [
+        None if T is None else replace(_state(classic), T_flange_sensor=T)
+        for T in each_without(classic, target, len(data.profiles))
+    ]
+    return replace(
+        _result(data, target, classic, _state(classic), "classic"),
+        leave_one_out_m=_left_out(data, target, classic, states),
+        working_error_m=error_m,
+        verdict=best.verdict
+        if best.verdict.code is Code.RESIDUAL_TOO_LARGE
+        else judge_classic(away_m, error_m, HandEyeSettings(limit_m=limit_m)),
+    )
+
+
+def _left_out(
+    data: TrackerData,
+    target: TrackerTarget,
+    classic: Classic,
+    states: Sequence[TrackerState | None],
+) -> Array | None:
+    """Rms distance (n,), m, of each profile's points from the target as found without it.
+
+    None where a profile alone determines something.
+    """
+    known = [state for state in states if state is not None]
+    if len(known) < len(states):
+        return None
+    distance_m, seen = profile_distances(data, target, classic.parts, known)
+    return distance_m[seen]
 
 
 def _state(classic: Classic) -> TrackerState:
@@ -115,12 +183,6 @@ def _with_noise(lines: Lines, noise_m: float) -> Lines:
     return replace(lines, z_sigma=lines.z_sigma * noise_m, slope_sigma=lines.slope_sigma * noise_m)
 
 
-def _misfit(estimate: Estimate[TrackerState]) -> float:
-    """Root mean square of the whitened residuals in use, unknowns counted: about 1."""
-    used = estimate.residual[~estimate.rejected]
-    return float(np.sqrt(np.sum(used**2) / max(used.size - len(estimate.names), 1)))
-
-
 def _rejected(problem: TrackerProblem, estimate: Estimate[TrackerState]) -> dict[str, str]:
     worst: dict[str, float] = {}
     for index in np.flatnonzero(estimate.rejected):
@@ -131,37 +193,16 @@ def _rejected(problem: TrackerProblem, estimate: Estimate[TrackerState]) -> dict
     }
 
 
-def _verdict(estimate: Estimate[TrackerState], working_m: float, limit_m: float) -> Verdict:
-    misfit = _misfit(estimate)
-    what = (
-        f"{working_m * 1e3:.3f} mm rms to expect at the working distance (allowed "
-        f"{limit_m * 1e3:.3f}), residuals {misfit:.2f} times the noise"
-    )
-    if not estimate.converged:
-        return Verdict(Code.POSES_NOT_INFORMATIVE, f"{estimate.creeping}; {what}")
-    if misfit > LARGEST_SCALE:
-        return Verdict(
-            Code.RESIDUAL_TOO_LARGE,
-            f"{what}: check the robot file, the noise that was given, and that tracker, base and "
-            "target stood still",
-        )
-    if working_m > limit_m:
-        return Verdict(
-            Code.POSES_NOT_INFORMATIVE,
-            f"{what}: measure longer arcs, and more points spread wider over the faces",
-        )
-    return Verdict(Code.ACCEPT, what)
-
-
 def _result(
     data: TrackerData,
     target: TrackerTarget,
     classic: Classic,
     state: TrackerState,
     method: Method,
-    verdict: Verdict,
 ) -> HandEyeResult:
-    residual_m, seen = _profile_residuals(data, target, classic.parts, state)
+    """What both methods tell, not judged yet."""
+    states = [state] * len(data.profiles)
+    residual_m, seen = profile_distances(data, target, classic.parts, states)
     names = np.array([profile.name for profile in data.profiles])
     cube = Cube(state.normals, state.offsets, state.centre)
     return HandEyeResult(
@@ -171,7 +212,7 @@ def _result(
         covariance=None,
         samples=tuple(names[seen].tolist()),
         residual_m=residual_m[seen],
-        verdict=verdict,
+        verdict=Verdict(Code.NONE, ""),
         rejected=dict.fromkeys(names[~seen].tolist(), "shows neither the faces nor the sphere"),
         target={
             "center_tracker_mm": (state.centre * 1e3).tolist(),
@@ -183,26 +224,6 @@ def _result(
             "mismatch_mm": classic.mismatch_m * 1e3,
         },
     )
-
-
-def _profile_residuals(
-    data: TrackerData, target: TrackerTarget, parts: Sequence[Scan], state: TrackerState
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Rms distance (m,) of each profile's points from the target, and which profiles show it."""
-    P = state.sensor_poses(data.motion)
-    total, count = np.zeros(len(P)), np.zeros(len(P))
-    for index, scan in enumerate(parts):
-        T = P[scan.profile]
-        x, z = scan.points[:, :1], scan.points[:, 1:]
-        points = T[:, :3, 0] * x + T[:, :3, 2] * z + T[:, :3, 3]
-        if index < len(FACES):
-            off = points @ state.normals[index] - state.offsets[index]
-        else:
-            off = np.linalg.norm(points - state.centre, axis=1) - target.sphere_radius_m
-        total += np.bincount(scan.profile, off**2, len(P))
-        count += np.bincount(scan.profile, minlength=len(P))
-    seen = count > 0
-    return np.sqrt(total / np.maximum(count, 1)), seen
 
 
 @dataclass(frozen=True, eq=False)

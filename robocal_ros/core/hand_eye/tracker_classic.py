@@ -108,6 +108,20 @@ def solve_classic(data: TrackerData, target: TrackerTarget, noise: TrackerNoise)
     )
 
 
+def each_without(classic: Classic, target: TrackerTarget, profiles: int) -> list[Array | None]:
+    """T_flange_sensor without each of the profiles, solved again; None where that fails."""
+    search = _Search(classic.tracked, classic.T_tracker_flange, target)
+    found: list[Array | None] = []
+    for profile in range(profiles):
+        first, second, ball = (part.part(part.profile != profile) for part in classic.parts)
+        try:
+            match = search.refined((first, second, ball), classic.T_flange_sensor)
+        except RobocalError:
+            match = None
+        found.append(None if match is None else match.T_flange_sensor)
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _Search:
     tracked: Cube

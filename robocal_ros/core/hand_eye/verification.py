@@ -1,14 +1,15 @@
 """A mount judged on data that were not used to find it: the same target, or another one."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.assessment import Verdict, summarise
 from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import errors_document
 from robocal_ros.core.estimation import solve
 from robocal_ros.core.hand_eye.mount_fit import distances, without
 from robocal_ros.core.hand_eye.mount_problem import (
@@ -18,8 +19,9 @@ from robocal_ros.core.hand_eye.mount_problem import (
     PoseNoise,
     View,
 )
-from robocal_ros.core.hand_eye.quality import HandEyeSettings
+from robocal_ros.core.hand_eye.quality import HandEyeSettings, judge_residuals
 from robocal_ros.core.hand_eye.restricted_noise import FIRST_NOISE
+from robocal_ros.core.hand_eye.result import HandEyeResult
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Task
 
 Array = NDArray[np.float64]
@@ -70,6 +72,30 @@ def held_out(task: Task, data: HandEyeData, T_flange_sensor: Array, place: Array
     read = task.read(data, T_flange_sensor)
     state = MountState(T_flange_sensor, (place,))
     return HeldOut(read.view.sightings.names, distances((read.view,), state), read.rejected)
+
+
+def judged(
+    result: HandEyeResult,
+    seen: HeldOut,
+    shots: int,
+    settings: HandEyeSettings,
+    left_out: Mapping[str, str] | None = None,
+) -> HandEyeResult:
+    """A result with what ``shots`` that were not used say of it; they may refuse it.
+
+    ``left_out``: what was no shot from the first, with the reason.
+    """
+    rejected = {**(left_out or {}), **seen.rejected}
+    document = errors_document(summarise(seen.distance_m)) | {
+        "rejected": list(rejected),
+        "rejected_because": rejected,
+    }
+    refused = judge_residuals(seen.distance_m, shots, len(seen.rejected), settings)
+    verdict = result.verdict
+    if refused is not None and verdict.accept:
+        words = f"shots that were not used to solve: {refused.reason}"
+        verdict = Verdict(refused.code, words)
+    return replace(result, verdict=verdict, more={**result.more, "held_out": document})
 
 
 def verify(
