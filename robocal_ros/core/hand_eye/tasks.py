@@ -133,17 +133,19 @@ class SphereTask:
         rule = ArcRule(self.target.radius_m)
         found: dict[str, tuple[int, Array, Array]] = {}
         rejected, points = {}, {}
+        unit: InputError | None = None
         for i, (name, profile) in enumerate(zip(data.names, data.profiles, strict=True)):
             try:
                 arc = fit_arc(seen(profile), rule)
-            except InputError:
-                raise  # a radius in another unit is no profile's fault
             except RobocalError as error:
+                unit = error if isinstance(error, InputError) else unit
                 rejected[name] = str(error)
                 continue
             points[name] = seen(profile)[arc.used]
             found[name] = i, np.array([*arc.centre, arc.radius_m]), arc.covariance
         fewest = self.fewest if T_flange_sensor is None else 1
+        if unit is not None and not found:
+            raise unit  # no profile's fault: the radius is in another unit
         usable(found, rejected, fewest, "the sphere")
         view = View(SphereModel(self.target.radius_m), _gathered(data, found))
         return Read(view, rejected, points)
