@@ -32,15 +32,16 @@ help:  ## this list
 demo: setup  ## a simulated shift through the live nodes, with a report in out/
 	$(ROS) python bags/demo.py
 
-# The core beside the rest, on two cores; then the nodes, which are timed, alone.
+# Two halves beside each other, on two cores; then the nodes, which are timed, alone.
+HALF := test/core test/sessions test/sim test/report
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
 	failed=0
-	$(ROS) python -m pytest test/core >out/core_tests.txt 2>&1 & core=$$!
-	$(ROS) python -m pytest --ignore=test/core --ignore=test/nodes || failed=1
-	wait $$core || failed=1
-	cat out/core_tests.txt
+	$(ROS) python -m pytest $(HALF) >out/half_of_tests.txt 2>&1 & half=$$!
+	$(ROS) python -m pytest $(HALF:%=--ignore=%) --ignore=test/nodes || failed=1
+	wait $$half || failed=1
+	cat out/half_of_tests.txt
 	$(ROS) python -m pytest test/nodes || failed=1
 	exit $$failed
 
