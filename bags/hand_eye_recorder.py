@@ -14,7 +14,7 @@ from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_recorded import configuration
-from robocal_ros.sessions.hand_eye_shots import PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.storage.bags import BagMessage, BagReader, BagWriter
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -22,7 +22,7 @@ from robocal_ros.storage.robots import load_robot
 
 EVENTS = "/hand_eye_node/session_events"
 SERIAL, BY = "SIM-UR10-1", "cell controller"
-TOPICS = {kind: f"/{kind}" for kind in (JOINTS, PROFILE, TARGET_POSE)}
+TOPICS = {kind: f"/{kind}" for kind in (JOINTS, PROFILE, TARGET_POSE, IMAGE)}
 KINDS = {topic: kind for kind, topic in TOPICS.items()}
 
 Asked = tuple[int, Command]
