@@ -466,8 +466,7 @@ def test_it_starts_within_the_time_promised(graph):
         begin = time.monotonic()
         process = graph.start("thermal_node")  # no parameter at all
         graph.spin_until(client.service_is_ready, "the service is there")
-        future = client.call_async(ListCalibrations.Request())
-        graph.spin_until(future.done, "it answers")
+        future = _answered(graph, client)
         took.append(time.monotonic() - begin)
         assert future.result().success
         process.stop()
@@ -477,3 +476,14 @@ def test_it_starts_within_the_time_promised(graph):
 
 
 BUSY = 2.0  # other work on the machine
+
+
+def _answered(graph, client):
+    """Ask until it answers: an answer is lost that is sent before both sides know each other."""
+    for _ in range(5):
+        future = client.call_async(ListCalibrations.Request())
+        late = time.monotonic() + 1.0
+        graph.spin_until(lambda f=future, t=late: f.done() or time.monotonic() > t, "a second")
+        if future.done():
+            return future
+    pytest.fail("asked five times, and no answer came")
