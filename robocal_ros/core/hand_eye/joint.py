@@ -12,6 +12,7 @@ from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.result import HandEyeResult, TargetKind
 from robocal_ros.core.hand_eye.solve import result_of
+from robocal_ros.core.hand_eye.sphere_radius import require_radius
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task
 from robocal_ros.core.hand_eye.verification import HeldOut, held_out, judged
 

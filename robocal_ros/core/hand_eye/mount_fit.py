@@ -146,6 +146,8 @@ def _settle(
         change = np.log([noise.sigma_m / before.sigma_m, noise.aim_m / before.aim_m])
         if away < SETTLED and np.max(np.abs(change)) < SETTLED:
             break
+    else:
+        estimate = replace(estimate, converged=False)
     return estimate, estimate.rejected[problem.sample], noise
 
 
