@@ -46,6 +46,7 @@ def solve_joint(
         task.placed(view, X.T_flange_sensor) for (task, _), view in zip(parts, views, strict=True)
     ]
     fit = fit_mount(views, MountState(X.T_flange_sensor, tuple(places)), settings.noise())
+    require_radius(fit)
     require_seen(
         fit, float(np.abs(np.concatenate([v.sightings.value[:, 1] for v in views])).mean())
     )
