@@ -276,6 +276,16 @@ def test_targets_together_beat_each_alone():
     assert {name.partition("/")[0] for name in both.samples} == {"sphere", "line"}
 
 
+@pytest.mark.parametrize("share", [0.98, 1.02, 1.2])
+def test_targets_together_find_a_wrong_radius(share):
+    rng = np.random.default_rng(5)
+    ball = data_of(sphere_shots(CELL, CENTRE, RADIUS_M, 12, rng))
+    edge = data_of(edge_shots(CELL, T_BASE_USER, 12, rng))
+    parts = [(SphereTask(SphereTarget(share * RADIUS_M)), ball), (LineTask(None, EdgeRule()), edge)]
+    with pytest.raises(RobocalError, match="radius"):
+        solve_joint(parts, SETTINGS)
+
+
 class TestVerify:
     def test_the_true_mount_passes_on_another_target(self, result):
         edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))

@@ -5,10 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.hand_eye.diagnosis import look
+from robocal_ros.core.errors import (
+    InputError,
+    RankDeficientError,
+    RobocalError,
+    TooFewSamplesError,
+)
+from robocal_ros.core.hand_eye.diagnosis import read_and_look
 from robocal_ros.core.hand_eye.mount_fit import fit_mount, require_seen
-from robocal_ros.core.hand_eye.mount_problem import MountState, View
+from robocal_ros.core.hand_eye.mount_problem import MountState
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.result import HandEyeResult, TargetKind
 from robocal_ros.core.hand_eye.solve import result_of
@@ -33,14 +38,17 @@ def solve_joint(
     ------
     InputError
         Fewer than two targets, or two of one kind.
-    RobocalError
+    ResidualError
+        One target's samples contradict each other; the mistake is named as in `solve_task`.
+    TooFewSamplesError, RankDeficientError
         When no target gives a first pose, the first one's reason; as `solve_task` otherwise.
     """
     kinds = [task.kind for task, _ in parts]
     if len(kinds) < 2 or len(set(kinds)) < len(kinds):
         raise InputError(f"several targets of different kinds are needed, not: {', '.join(kinds)}")
-    reads = _read(parts)
-    X = _first(parts, reads, settings)
+    alone = [_alone(*part) for part in parts]
+    X = _first(alone, settings)
+    reads = _named(parts, [read for read, _ in alone])
     views = tuple(read.view for read in reads)
     places = [
         task.placed(view, X.T_flange_sensor) for (task, _), view in zip(parts, views, strict=True)
@@ -78,39 +86,46 @@ def _held_out(
     )
 
 
-def _read(parts: Sequence[Part]) -> list[Read]:
-    """Features of all parts; poses of each are numbered after those of the one before."""
-    reads, first = [], 0
-    for task, data in parts:
-        read = task.read(data)
+def _alone(task: Task, data: HandEyeData) -> tuple[Read, MountState | RobocalError]:
+    """Features of one target, and where they lead alone, or why nowhere: others may show more."""
+    try:
+        return read_and_look(task, data)
+    except (TooFewSamplesError, RankDeficientError) as error:
+        return task.read(data), error
+
+
+def _first(
+    alone: Sequence[tuple[Read, MountState | RobocalError]], settings: HandEyeSettings
+) -> MountState:
+    """The pose of the sensor from the target that shows it best alone."""
+    failures = [near for _, near in alone if isinstance(near, RobocalError)]
+    fits = []
+    for read, near in alone:
+        if isinstance(near, MountState):
+            try:
+                fits.append(fit_mount((read.view,), near, settings.noise()))
+            except (TooFewSamplesError, RankDeficientError) as error:
+                failures.append(error)
+    if not fits:
+        raise failures[0]
+    return min(fits, key=lambda fit: float(np.trace(fit.covariance[:3, :3]))).state
+
+
+def _named(parts: Sequence[Part], reads: Sequence[Read]) -> list[Read]:
+    """Samples called after their target; poses of all are numbered through."""
+    named, first = [], 0
+    for (task, data), read in zip(parts, reads, strict=True):
         s = read.view.sightings
-        named = replace(
-            s, names=tuple(f"{task.kind}/{name}" for name in s.names), pose=s.pose + first
-        )
-        reads.append(
+        names = tuple(f"{task.kind}/{name}" for name in s.names)
+        named.append(
             Read(
-                View(read.view.model, named),
+                replace(read.view, sightings=replace(s, names=names, pose=s.pose + first)),
                 {f"{task.kind}/{name}": why for name, why in read.rejected.items()},
                 {f"{task.kind}/{name}": points for name, points in read.points.items()},
             )
         )
         first += len(data.names)
-    return reads
-
-
-def _first(parts: Sequence[Part], reads: Sequence[Read], settings: HandEyeSettings) -> MountState:
-    """The pose of the sensor from the target that shows it best alone."""
-    failure: RobocalError | None = None
-    fits = []
-    for (task, _), read in zip(parts, reads, strict=True):
-        try:
-            near = look(task, read.view)
-            fits.append(fit_mount((read.view,), near, settings.noise()))
-        except RobocalError as error:
-            failure = failure or error
-    if not fits:
-        raise failure or InputError("no target gives a first pose of the sensor")
-    return min(fits, key=lambda fit: float(np.trace(fit.covariance[:3, :3]))).state
+    return named
 
 
 def _data(parts: Sequence[Part]) -> HandEyeData:
