@@ -20,6 +20,7 @@ from bench.hand_eye_bound import (
 )
 from robocal_ros.core import frames
 from robocal_ros.core.fitting.edge import EdgeRule
+from robocal_ros.core.hand_eye.diagnosis import look
 from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import (
     MountProblem,
@@ -30,7 +31,6 @@ from robocal_ros.core.hand_eye.mount_problem import (
 )
 from robocal_ros.core.hand_eye.result import increment
 from robocal_ros.core.hand_eye.sightings import Index, Sightings, TargetModel
-from robocal_ros.core.hand_eye.solve import look
 from robocal_ros.core.hand_eye.step_task import StepTask
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
