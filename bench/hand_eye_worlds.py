@@ -140,7 +140,7 @@ class World:
 
     def _view(self, T_base_flange: Array, value: Array) -> View:
         names = tuple(f"{self.task.kind} {i + 1}" for i in range(len(self.pose)))
-        sightings = Sightings(names, self.pose, T_base_flange, value, self.covariance)
+        sightings = Sightings(names, self.pose, self.pose, T_base_flange, value, self.covariance)
         return View(self.model, sightings)
 
 

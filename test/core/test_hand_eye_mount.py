@@ -80,7 +80,7 @@ def sightings(rng, T_base_sensor, value, pose, size):
     error = frames.transform(frames.exp_rotation(off[:, 3:]), off[:, :3])
     T = T_base_sensor @ frames.invert(X) @ error
     names = tuple(f"p{i}/{k}" for k, i in enumerate(pose))
-    return Sightings(names, pose, T, noisy, np.tile(C, (len(pose), 1, 1)))
+    return Sightings(names, pose, pose, T, noisy, np.tile(C, (len(pose), 1, 1)))
 
 
 VIEWS = {"sphere": sphere_view, "line": line_view, "step": step_view}

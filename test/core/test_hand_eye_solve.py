@@ -39,6 +39,7 @@ from robocal_ros.core.hand_eye.verification import held_out, verify
 from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot
 from robocal_ros.sim.hand_eye_sets import edge_shots, groove_shots, sphere_shots, step_shots
 from robocal_ros.sim.profile_sensor import ProfileSensor
+from robocal_ros.sim.profile_targets import ball_on_table
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor
@@ -83,6 +84,24 @@ class TestSphere:
                 errors.append(np.linalg.norm(away[:3, 3]))
         rms = {method: np.sqrt(np.mean(np.square(errors))) for method, errors in off.items()}
         assert rms["classic"] > 2.0 * rms["best"]
+
+    def test_shots_from_one_pose_are_not_measurements_of_their_own(self):
+        """What the robot errs by, most of the error here, is the same in all of them."""
+        rng = np.random.default_rng(7)
+        shots = sphere_shots(CELL, CENTRE, RADIUS_M, 8, rng)
+        again, scene = np.repeat(np.arange(8), 5), ball_on_table(CENTRE, RADIUS_M)
+        profiles = [
+            CELL.sensor.shoot(shots.true_T_base_flange[i] @ TRUE, scene, rng) for i in again
+        ]
+        jitter = frames.transform(np.eye(3), 1e-5 * rng.standard_normal((len(again), 3)))
+        T_base_flange = shots.T_base_flange[again] @ jitter  # readings at standstill
+        marks = [""] * len(again)
+        many = solve(data_of(replace(
+            shots, T_base_flange=T_base_flange, profiles=profiles, marks=marks
+        )))  # fmt: skip
+        assert chi_square(many, TRUE) < FAR_OFF
+        once = solve(data_of(shots))
+        assert many.working_error_m > 0.5 * once.working_error_m
 
     def test_left_out_samples_are_off_more_than_those_used(self, result):
         assert np.all(result.leave_one_out_m > 0.99 * result.residual_m)

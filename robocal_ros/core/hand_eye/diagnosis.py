@@ -59,7 +59,7 @@ def read_and_look(task: Task, data: HandEyeData) -> tuple[Read, MountState]:
 def _shown(view: View, data: HandEyeData) -> bool:
     """Whether most of the profiles show the target where it must be."""
     usable = sum(isinstance(profile, Profile) for profile in data.profiles)
-    return len(np.unique(view.sightings.pose)) > SHOWN * usable
+    return len(np.unique(view.sightings.shot)) > SHOWN * usable
 
 
 def look(task: Task, view: View) -> MountState:

@@ -112,14 +112,19 @@ def _first(
 
 
 def _named(parts: Sequence[Part], reads: Sequence[Read]) -> list[Read]:
-    """Samples called after their target; poses of all are numbered through."""
+    """Samples called after their target; shots of all are numbered through."""
     named, first = [], 0
     for (task, data), read in zip(parts, reads, strict=True):
         s = read.view.sightings
-        names = tuple(f"{task.kind}/{name}" for name in s.names)
+        s = replace(
+            s,
+            names=tuple(f"{task.kind}/{name}" for name in s.names),
+            shot=s.shot + first,
+            pose=s.pose + first,
+        )
         named.append(
             Read(
-                replace(read.view, sightings=replace(s, names=names, pose=s.pose + first)),
+                replace(read.view, sightings=s),
                 {f"{task.kind}/{name}": why for name, why in read.rejected.items()},
                 {f"{task.kind}/{name}": points for name, points in read.points.items()},
             )

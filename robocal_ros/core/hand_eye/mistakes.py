@@ -94,15 +94,15 @@ def explain(suspects: Iterable[tuple[str, Callable[[], float]]], as_given_m: flo
 def swapped(fit: MountFit, lost: View, place: Array, shots: Sequence[str]) -> dict[str, str]:
     """Which rejected sightings fit the pose of another rejected shot: names and reasons.
 
-    ``lost`` holds the rejected sightings; ``shots``: the name of each pose.
+    ``lost`` holds the rejected sightings; ``shots``: the name of each.
     """
     limit = FITS * float(np.sqrt(np.mean(fit.distances() ** 2)))
     s = lost.sightings
     found: dict[str, str] = {}
-    for pose in np.unique(s.pose):
-        rows = np.flatnonzero(s.pose == pose)
-        for other in np.unique(s.pose[s.pose != pose]):
-            T = s.T_base_flange[[np.flatnonzero(s.pose == other)[0]]] @ fit.state.T_flange_sensor
+    for shot in np.unique(s.shot):
+        rows = np.flatnonzero(s.shot == shot)
+        for other in np.unique(s.shot[s.shot != shot]):
+            T = s.T_base_flange[[np.flatnonzero(s.shot == other)[0]]] @ fit.state.T_flange_sensor
             own = lost.take(rows)
             far = own.model.distance(np.repeat(T, len(rows), axis=0), place, own.sightings.value)
             if np.median(far) < limit:

@@ -11,7 +11,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.look_point import OFF_EQUATOR, looked_at
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
-from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
+from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel, same_pose
 from robocal_ros.core.hand_eye.step_task import StepTask, require_marks
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import StepTarget
@@ -55,7 +55,8 @@ def _expected(model: TargetModel, seen: Seen, T_base_flange: Array, covariance: 
     """A view in which everything is seen as predicted."""
     m = len(T_base_flange)
     names = tuple(f"pose {i + 1}" for i in range(m))
-    return View(model, Sightings(names, np.arange(m), T_base_flange, seen.value, covariance))
+    pose = same_pose(T_base_flange)
+    return View(model, Sightings(names, np.arange(m), pose, T_base_flange, seen.value, covariance))
 
 
 def _out_of_range(x: Array, z: Array, depth: Array, sensor: SensorRange) -> dict[int, str]:
@@ -186,19 +187,16 @@ class PlannedStep:
         """All corners of the mark on which each pose lays the light."""
         marks = self.lit(T_base_flange @ T_flange_sensor)
         corners = [self.target.corners[mark] for mark in marks]
-        pose = np.repeat(np.arange(len(corners)), [len(each) for each in corners])
+        shot = np.repeat(np.arange(len(corners)), [len(each) for each in corners])
+        T = T_base_flange[shot]
         model = StepTask(self.target).model(np.concatenate(corners))
-        seen = model.see((T_base_flange @ T_flange_sensor)[pose], place)
+        seen = model.see(T @ T_flange_sensor, place)
         step = self.sensor.width_m / self.sensor.points
         sigma = np.array([0.5 * step, self.sensor.noise_m / np.sqrt(EDGE_POINTS), 0.0])
         spread = np.diag(sigma**2 + self.target.sigma_m**2)
-        names = tuple(f"pose {i + 1}" for i in pose)
-        return View(
-            model,
-            Sightings(
-                names, pose, T_base_flange[pose], seen.value, np.tile(spread, (len(pose), 1, 1))
-            ),
-        )
+        names = tuple(f"pose {i + 1}" for i in shot)
+        pose, covariance = same_pose(T_base_flange)[shot], np.tile(spread, (len(shot), 1, 1))
+        return View(model, Sightings(names, shot, pose, T, seen.value, covariance))
 
     def lit(self, T_base_sensor: Array) -> tuple[str, ...]:
         """The mark that is nearest to the laser plane of each sensor pose (m, 4, 4)."""
@@ -218,8 +216,8 @@ class PlannedStep:
         x, z, _ = view.sightings.value.T
         found: dict[int, str] = {}
         out = _out_of_range(x, z, np.zeros_like(z), self.sensor)
-        for pose in np.unique(view.sightings.pose):
-            rows = np.flatnonzero(view.sightings.pose == pose)
+        for pose in np.unique(view.sightings.shot):
+            rows = np.flatnonzero(view.sightings.shot == pose)
             if sum(int(row) not in out for row in rows) < 2:
                 found[int(pose)] = next(out[int(row)] for row in rows if int(row) in out)
         return found

@@ -116,7 +116,7 @@ def check_plan(
     state = MountState(T_flange_sensor, (place,))
     whole = target.view(T_base_flange, T_flange_sensor, place)
     unseen = target.unseen(whole)
-    rows = ~np.isin(whole.sightings.pose, list(unseen))
+    rows = ~np.isin(whole.sightings.shot, list(unseen))
     seen = len(T_base_flange) - len(unseen)
     shown = _shown(whole.take(rows), state, noise, sensor)
     field = sensor.field_points - sensor.pivot

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+SAME = 2e-4  # m, and rad: readings of a robot at rest differ by less, poses on purpose by more
 COMPONENTS = 3  # of every sighting; a model with fewer leaves the last ones empty
 
 
@@ -24,12 +25,15 @@ class Sightings:
     Attributes
     ----------
     names : of the features, for reports.
-    pose : (m,) index of the pose that each was seen from; those with one index share its error.
+    shot : (m,) index of the shot that each was seen in.
+    pose : (m,) index of the pose that it was taken from, as of `same_pose`: those with one index
+        share its error.
     T_base_flange : (m, 4, 4) reported pose of each.
     value : (m, 3), m; covariance : (m, 3, 3). Empty components have value 0 and variance 1.
     """
 
     names: tuple[str, ...]
+    shot: Index
     pose: Index
     T_base_flange: Array
     value: Array
@@ -40,11 +44,22 @@ class Sightings:
         index = np.arange(len(self.names))[rows]
         return Sightings(
             tuple(self.names[i] for i in index),
+            self.shot[index],
             self.pose[index],
             self.T_base_flange[index],
             self.value[index],
             self.covariance[index],
         )
+
+
+def same_pose(T_base_flange: Array) -> Index:
+    """Of poses (m, 4, 4) the index (m,) of the first that is the same to `SAME`.
+
+    What errs in a pose is common to all that is seen from it, however often: only what the sensor
+    itself errs by is drawn anew.
+    """
+    apart = T_base_flange[:, None, :3] - T_base_flange[None, :, :3]
+    return np.asarray(np.argmax(np.all(np.abs(apart) < SAME, axis=(2, 3)), axis=1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,7 +131,7 @@ def result_of(
         working_error_m=error_m,
         pivot=pivot,
         place=fit.state.places[0] if alone else None,
-        verdict=judge(fit, shots, shots - _poses(fit.views), error_m, settings),
+        verdict=judge(fit, shots, shots - _shots(fit.views), error_m, settings),
         more=more,
     )
 
@@ -141,8 +141,8 @@ def field_of(data: HandEyeData) -> Array:
     return field_points([p.points for p in data.profiles if isinstance(p, Profile)])
 
 
-def _poses(views: tuple[View, ...]) -> int:
-    return len(np.unique(np.concatenate([view.sightings.pose for view in views])))
+def _shots(views: tuple[View, ...]) -> int:
+    return len(np.unique(np.concatenate([view.sightings.shot for view in views])))
 
 
 def _classic(
@@ -159,7 +159,7 @@ def _classic(
     own_m = expected_error_m(best.covariance[:6, :6], field - pivot)
     apart_m = apart(state.T_flange_sensor, best.state.T_flange_sensor, field)
     error_m = float(np.hypot(apart_m, own_m))
-    refused = judge_residuals(residual, shots, shots - _poses(views), settings)
+    refused = judge_residuals(residual, shots, shots - _shots(views), settings)
     return HandEyeResult(
         kind=task.kind,
         method="classic",

@@ -17,7 +17,7 @@ from robocal_ros.core.hand_eye.edge_start import closed_corners, robust_corners
 from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.sightings import Sightings
+from robocal_ros.core.hand_eye.sightings import Sightings, same_pose
 from robocal_ros.core.hand_eye.target_models import CornerModel
 from robocal_ros.core.hand_eye.targets import StepTarget
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task, seen, usable
@@ -168,22 +168,23 @@ class _Reader:
 
     def view(self, matches: Mapping[str, Match]) -> View:
         """The matched corners as sightings."""
-        names, poses, values, covariances, corners = [], [], [], [], []
+        names, shots, values, covariances, corners = [], [], [], [], []
         for name, match in matches.items():
             fit = self._fits[name]
             for row, k in zip(match.rows, match.corners, strict=True):
                 names.append(f"{name}/corner {k + 1}")
-                poses.append(self._data.names.index(name))
+                shots.append(self._data.names.index(name))
                 values.append([*fit.points[row], 0.0])
                 spread = self._task.target.sigma_m**2 * np.eye(3)
                 spread[:2, :2] += fit.covariance[row]
                 covariances.append(spread)
                 corners.append(self._corners[name][k])
-        pose = np.array(poses, dtype=np.int64)
+        shot, T_base_flange = np.array(shots, dtype=np.int64), self._data.T_base_flange
         sightings = Sightings(
             tuple(names),
-            pose,
-            self._data.T_base_flange[pose],
+            shot,
+            same_pose(T_base_flange)[shot],
+            T_base_flange[shot],
             np.array(values).reshape(-1, 3),
             np.array(covariances).reshape(-1, 3, 3),
         )

@@ -15,7 +15,7 @@ from robocal_ros.core.hand_eye.mount_fit import MountFit
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.result import TargetKind
-from robocal_ros.core.hand_eye.sightings import Sightings, TargetModel
+from robocal_ros.core.hand_eye.sightings import Sightings, TargetModel, same_pose
 from robocal_ros.core.hand_eye.sphere_start import agreed_centre, classic_sphere, sphere_starts
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
@@ -276,15 +276,17 @@ def seen(profile: Profile | RobocalError) -> Array:
 def with_poses(view: View, model: TargetModel, T_base_flange: Array) -> View:
     """A view of a target from other poses (m, 4, 4)."""
     s = view.sightings
-    return View(model, replace(s, T_base_flange=T_base_flange[s.pose]))
+    pose = same_pose(T_base_flange)[s.shot]
+    return View(model, replace(s, pose=pose, T_base_flange=T_base_flange[s.shot]))
 
 
 def _gathered(data: HandEyeData, found: Mapping[str, tuple[int, Array, Array]]) -> Sightings:
-    poses = np.array([i for i, _, _ in found.values()], dtype=np.int64)
+    shot = np.array([i for i, _, _ in found.values()], dtype=np.int64)
     return Sightings(
         tuple(found),
-        poses,
-        data.T_base_flange[poses],
+        shot,
+        same_pose(data.T_base_flange)[shot],
+        data.T_base_flange[shot],
         np.array([value for _, value, _ in found.values()]),
         np.array([covariance for _, _, covariance in found.values()]),
     )
