@@ -157,7 +157,7 @@ def test_noise_of_poses_is_found_from_the_profiles():
 
 
 def test_covariance_counts_that_few_poses_tell_their_noise_badly():
-    """With n numbers to spare the errors are Student's t: wider by n / (n - 2), here by 2 / 7."""
+    """With n numbers to spare the mean of the noise's square is n / (n - 3) of the likeliest."""
     view, place = sphere_view(np.random.default_rng(10), 6)
     exact = replace(view.sightings, covariance=np.tile(1e-18 * np.eye(3), (6, 1, 1)))
     fit = fit_mount((View(view.model, exact),), MountState(X, (place,)))
@@ -166,7 +166,7 @@ def test_covariance_counts_that_few_poses_tell_their_noise_badly():
     rows = jacobian.reshape(-1, jacobian.shape[2])
     likeliest = np.linalg.inv(rows.T @ rows)
     wider = np.diag(fit.covariance) / np.diag(likeliest)
-    assert np.allclose(wider, 9.0 / 7.0, rtol=0.02)
+    assert np.allclose(wider, 9.0 / 6.0, rtol=0.02)
 
 
 def test_slope_of_the_noise_is_the_numeric_one():

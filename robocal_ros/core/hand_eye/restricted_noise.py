@@ -108,8 +108,10 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
     """Covariance (k, k) of the unknowns, averaged over what the noise may be.
 
     Few poses tell their own noise badly, and the covariance for the likeliest one is too small: for
-    n numbers to spare by n / (n - 2). By the law of total variance, with a flat prior of the
-    noise's logarithm, summed over a grid around the problem's own noise, which is the likeliest.
+    n numbers to spare the mean of the noise's square is wider by n / (n - 3). By the law of total
+    variance, summed over a grid around the problem's own noise, which is the likeliest. The prior
+    is flat in the noise (Gelman 2006, Bayesian Analysis 1:515), not in its logarithm: that would
+    believe in noises near zero wherever what features err by hides them, and tell too little.
     """
     keep = np.ones(len(problem.poses), dtype=np.bool_)
     likely = RestrictedLikelihood(problem, state, keep, given)
@@ -123,8 +125,9 @@ def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoi
         width.append(np.sqrt(2.0 / max(bend, 2.0 / WIDEST**2)))
     total, weights = np.zeros_like(normal), 0.0
     for nodes in product(NODES, repeat=len(best)):
-        cost, normal, step = likely.at(best + np.array(width) * nodes)
-        weight = float(np.exp(0.5 * (least - cost)))
+        away = np.array(width) * nodes
+        cost, normal, step = likely.at(best + away)
+        weight = float(np.exp(0.5 * (least - cost) + away.sum()))
         total += weight * (np.linalg.inv(normal) + np.outer(step, step))
         weights += weight
     return np.asarray(total / weights)
