@@ -23,6 +23,7 @@ from robocal_ros.sessions.hand_eye_standstills import (
     captured_marks,
     first_of_each,
 )
+from robocal_ros.sessions.hand_eye_thermal import flange_poses
 from robocal_ros.sessions.replay import topic_kind
 from robocal_ros.storage.bags import BagReader
 from robocal_ros.storage.hand_eye_bags import DATA_SET, read_data_set
@@ -63,9 +64,10 @@ def _saved(path: Path, arm: SerialArm) -> HandEyeData:
         raise InputError(f"holds shots of a {data.kind}, not profiles", file=str(path))
     samples = data.chosen([])
     names = tuple(str(sample.handle) for sample in samples)
+    q = np.array([sample.q for sample in samples])
     return HandEyeData(
         names,
-        arm.fk(np.array([sample.q for sample in samples])),
+        flange_poses(q, [sample.thermal for sample in samples], arm),
         [Profile(sample.values, name) for name, sample in zip(names, samples, strict=True)],
         _marks([sample.mark for sample in samples]),
     )

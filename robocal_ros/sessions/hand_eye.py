@@ -8,12 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import (
-    ConflictError,
-    InputError,
-    LimitError,
-    RobocalError,
-)
+from robocal_ros.core.errors import ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import hand_eye_kind
 from robocal_ros.core.samples import JointSample
@@ -36,6 +31,7 @@ from robocal_ros.sessions.hand_eye_in_force import HandEyeInForce
 from robocal_ros.sessions.hand_eye_results import HandEyeResults
 from robocal_ros.sessions.hand_eye_shots import IMAGE, Shot, ShotLog
 from robocal_ros.sessions.hand_eye_solving import require_known
+from robocal_ros.sessions.hand_eye_thermal import PoseModels
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
 
@@ -59,13 +55,14 @@ class HandEyeSession(Commanded):
         self.config = config
         self.current = HandEyeInForce(history, nominal, config.sensor_frame)
         super().__init__(nominal, history, hand_eye_kind(config.sensor_frame), self.current)
-        self._results = HandEyeResults(nominal, history, config, software, self.current)
+        self._results = HandEyeResults(nominal, history, config, software)
         self._shots = ShotLog()
         self._handle = 0
         self._why: RobocalError | None = None  # why the latest shot was of no use
         self._seen_ns = 0  # shots before it were looked at
         self._leap_ns = 0  # longest step of the joints' stamps since the capture
         self._found: Command | None = None
+        self._models = PoseModels(self.current.thermal)
         self.data: DataSet | None = None
 
     # ---- samples --------------------------------------------------------------------------------
@@ -82,12 +79,21 @@ class HandEyeSession(Commanded):
             if sample.stamp_ns <= 0:
                 raise InputError(f"{sample.topic} has no time stamp")
             self._shots.add(sample, self.config.sensor_frame, self.newest_joints_ns)
+            self._tell_early(sample)
             self.received[sample.topic] += 1
             newest = self.newest_ns.get(sample.topic, 0)
             self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
         else:
             self._add_joints(sample)
         self._look()
+
+    def _tell_early(self, shot: Shot) -> None:
+        """A shot that comes after a capture was asked for, and is stamped before, tells why."""
+        waiting = self.data is not None and self.data.topic == shot.topic and self.data.waiting
+        if waiting and shot.stamp_ns < waiting.from_ns:
+            early_s = (waiting.from_ns - shot.stamp_ns) * 1e-9
+            words = f"{shot.topic} is stamped {early_s:.3f} s before the call"
+            self._why = InputError(f"{words}: is the sensor's clock behind?")
 
     def _add_joints(self, sample: JointSample) -> None:
         before_ns = self.newest_joints_ns or sample.stamp_ns
@@ -223,9 +229,11 @@ class HandEyeSession(Commanded):
         if mean is None:
             raise InputError(f"the joint readings about {at_ns} ns are not complete")
         handle, mark = capture.handle, capture.mark
+        command = self._models.bound(command, self.current.thermal)
+        thermal = self._models.of(command, self.current.thermal)
         try:
             values = seen_corners(data.target, shot) if data.topic == IMAGE else shot.read()
-            words = data.put(HandEyeSample(handle, mark, at_ns, mean, values))
+            words = data.put(HandEyeSample(handle, mark, at_ns, mean, values, thermal))
         except InputError as error:
             capture.code, capture.reason = error.code, str(error)
             return Outcome(command, error.code, f"capture {handle}: {error}")
@@ -264,7 +272,7 @@ class HandEyeSession(Commanded):
         return outcome
 
     def document(self) -> dict[str, Any]:
-        """The open data set for a file, with the model that its flange poses come from now.
+        """The open data set for a file, with the models that its flange poses come from.
 
         Raises
         ------
@@ -273,17 +281,7 @@ class HandEyeSession(Commanded):
         """
         if self.data is None or not self.data.samples:
             raise ConflictError("nothing was captured yet: there is nothing to save")
-        thermal = {"revision": self.current.thermal.revision, "hash": self.current.arm.model_hash}
-        return self.data.document() | {"thermal": thermal}
-
-    def _other_model(self, saved: Mapping[str, Any] | None) -> str:
-        """Tells when flange poses are no longer those with which a data set was saved."""
-        if saved is None or saved["hash"] == self.current.arm.model_hash:
-            return ""
-        return (
-            f"; its flange poses come from thermal revision {self.current.thermal.revision} now, "
-            f"when it was saved they came from revision {saved['revision']}"
-        )
+        return self.data.document()
 
     def _load(self, command: Command, wall_ns: int) -> Outcome:
         arguments = command.arguments
@@ -293,5 +291,8 @@ class HandEyeSession(Commanded):
         self._handle = max(self._handle, *data.samples, 0)
         count = len(data.samples)
         words = f"{count} samples of a {data.kind} loaded from {arguments.get('path', 'a file')}"
-        words += self._other_model(arguments["set"].get("thermal"))
+        taken = data.thermal_revisions()
+        if taken != [self.current.thermal.revision]:
+            told = ", ".join(map(str, taken))
+            words += f"; their flange poses are those of thermal revision {told}"
         return Outcome(command, Code.ACCEPT, words, samples=count)

@@ -13,6 +13,7 @@ from robocal_ros.core.hand_eye.profile import profile_of
 from robocal_ros.core.hand_eye.target_documents import target_of
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.sessions.hand_eye_thermal import PoseModel, models_used, pose_model_of
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -42,6 +43,7 @@ class HandEyeSample:
     stamp_ns : of the shot.
     q : (n,) mean of the joint readings at standstill, rad (prismatic: m).
     values : see `hand_eye_shots.Shot`; of an image see `hand_eye_images.seen_corners`.
+    thermal : what was in force then, so that a set of a cold robot stays one.
     """
 
     handle: int
@@ -49,6 +51,7 @@ class HandEyeSample:
     stamp_ns: int
     q: Array
     values: Array
+    thermal: PoseModel
 
 
 @dataclass(eq=False)
@@ -162,18 +165,28 @@ class DataSet:
         wanted = set(handles) or set(self.samples)
         return [self.samples[handle] for handle in sorted(wanted)]
 
+    def thermal_revisions(self) -> list[int]:
+        """Of the models that flange poses come from."""
+        return sorted({sample.thermal.revision for sample in self.samples.values()})
+
     def document(self) -> Document:
-        """Plain values; `data_set_of` reads them back to the last bit."""
+        """Plain values; `data_set_of` reads them back to the last bit.
+
+        ``thermal`` of a sample: index of its model among ``thermal_models``.
+        """
+        models = models_used(sample.thermal for sample in self.samples.values())
         return {
             "target": self.target,
             "method": self.method,
             "mount": self.mount,
             "feature": self.feature,
+            "thermal_models": [model.document() for model in models],
             "samples": [
                 {
                     "handle": sample.handle,
                     "mark": sample.mark,
                     "stamp_ns": sample.stamp_ns,
+                    "thermal": models.index(sample.thermal),
                     "q": sample.q.tolist(),
                     "values": sample.values.tolist(),
                 }
@@ -207,8 +220,9 @@ def data_set_of(document: Mapping[str, Any], arm: SerialArm) -> DataSet:
         target_of(found.target)
         rows = document["samples"]
         _require_few(rows)
+        models = [pose_model_of(one, arm) for one in document["thermal_models"]]
         for row in rows:
-            sample = _sample_of(row, found.topic, arm)
+            sample = _sample_of(row, found.topic, arm, models)
             if sample.handle in found.samples:
                 raise InputError(f"the data set has two samples of handle {sample.handle}")
             found.require_mark(sample.mark)
@@ -229,7 +243,9 @@ def _require_few(rows: Sequence[Document]) -> None:
         )
 
 
-def _sample_of(row: Document, topic: str, arm: SerialArm) -> HandEyeSample:
+def _sample_of(
+    row: Document, topic: str, arm: SerialArm, models: Sequence[PoseModel]
+) -> HandEyeSample:
     """One sample of a document, checked as one that is captured."""
     handle, at_ns = row["handle"], row["stamp_ns"]
     if type(handle) is not int or not 1 <= handle <= MOST_HANDLE:
@@ -246,4 +262,7 @@ def _sample_of(row: Document, topic: str, arm: SerialArm) -> HandEyeSample:
         values = values.reshape(-1, 2)
     elif values.shape != (1, 7) or abs(float(np.linalg.norm(values[0, 3:])) - 1.0) > UNIT:
         raise InputError(f"sample {handle} of the data set is no pose: {values.tolist()}")
-    return HandEyeSample(handle, str(row["mark"]), at_ns, q, values)
+    thermal = row["thermal"]
+    if type(thermal) is not int or not 0 <= thermal < len(models):
+        raise InputError(f"sample {handle} of the data set is of thermal model {thermal}: no such")
+    return HandEyeSample(handle, str(row["mark"]), at_ns, q, values, models[thermal])

@@ -1,13 +1,11 @@
 """From captured samples to a calibration in the history."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.documents import arm_of
 from robocal_ros.core.errors import RankDeficientError, ResidualError
 from robocal_ros.core.hand_eye.result import HandEyeResult, hand_eye_document
 from robocal_ros.core.kinematics import SerialArm
@@ -15,11 +13,9 @@ from robocal_ros.core.proposals import Proposal, hand_eye_kind
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_data import DataSet, HandEyeSample
-from robocal_ros.sessions.hand_eye_in_force import HandEyeInForce
 from robocal_ros.sessions.hand_eye_solving import solved
+from robocal_ros.sessions.hand_eye_thermal import flange_poses
 from robocal_ros.sessions.history import History
-
-MODEL = "model"
 
 
 class HandEyeResults:
@@ -27,7 +23,6 @@ class HandEyeResults:
 
     Parameters
     ----------
-    current : what is in force, followed by the session.
     software : version that made the calibrations.
     """
 
@@ -37,11 +32,9 @@ class HandEyeResults:
         history: History,
         config: HandEyeConfig,
         software: str,
-        current: HandEyeInForce,
     ) -> None:
         self._nominal, self._history, self._config = nominal, history, config
-        self._software, self._current = software, current
-        self._began_with = current.thermal.revision
+        self._software = software
 
     def calibrate(self, data: DataSet, command: Command, wall_ns: int) -> Outcome:
         """Solve for the samples that the command names, and propose the result.
@@ -51,14 +44,11 @@ class HandEyeResults:
         RobocalError
             When they cannot answer, or the history refuses.
         """
-        command = self._with_model(command)
         arguments = command.arguments
         samples = data.chosen([int(handle) for handle in arguments.get("handles", ())])
         method = str(arguments.get("method") or data.method)
         q = np.array([sample.q for sample in samples]).reshape(-1, self._nominal.n)
-        model = arguments.get(MODEL, self._current.thermal.model)
-        arm = self._nominal if model is None else arm_of(model, self._nominal)
-        T_base_flange = arm.fk(q)  # one model for all, whenever they were captured
+        T_base_flange = flange_poses(q, [sample.thermal for sample in samples], self._nominal)
         try:
             result = solved(data, samples, T_base_flange, method, self._config)
         except RankDeficientError as error:
@@ -67,21 +57,12 @@ class HandEyeResults:
         except np.linalg.LinAlgError as error:
             raise ResidualError(f"no pose of the sensor explains the samples: {error}") from error
         document = hand_eye_document(result)
+        revisions = sorted({sample.thermal.revision for sample in samples})
         inputs = _inputs(data, samples, T_base_flange)
-        kept = self._keep(inputs, result, document, command, wall_ns)
+        kept = self._keep(inputs, result, document, command, wall_ns, revisions)
         verdict = result.verdict
         used = len({name.partition("/")[0] for name in result.samples})  # a step names corners
         return Outcome(command, verdict.code, verdict.reason, document, kept, samples=used)
-
-    def _with_model(self, command: Command) -> Command:
-        """The command with the thermal model, where another one than at the beginning is in force.
-
-        So a replay, which knows that of the beginning, takes the same flange poses.
-        """
-        thermal = self._current.thermal
-        if MODEL in command.arguments or thermal.revision == self._began_with:
-            return command
-        return replace(command, arguments={**command.arguments, MODEL: thermal.model})
 
     def _keep(
         self,
@@ -90,6 +71,7 @@ class HandEyeResults:
         document: dict[str, Any],
         command: Command,
         wall_ns: int,
+        revisions: list[int],
     ) -> int:
         kind = hand_eye_kind(self._config.sensor_frame)
         left_out = result.leave_one_out_m
@@ -109,7 +91,7 @@ class HandEyeResults:
                 if left_out is None
                 else float(np.sqrt(np.mean(left_out**2))) * 1e3,
                 document=document,
-                model=self._model(result),
+                model=self._model(result) | {"thermal_revisions": revisions},
                 inputs=inputs,
             )
         )
@@ -123,7 +105,6 @@ class HandEyeResults:
             "child": config.sensor_frame,
             "T_parent_sensor": result.T_flange_sensor.tolist(),
             "covariance": None if result.covariance is None else result.covariance.tolist(),
-            "thermal_revision": self._current.thermal.revision,
         }
 
 

@@ -114,15 +114,18 @@ class ShotLog:
         Raises
         ------
         InputError
-            When it is of another frame, or stamped on another clock than the joints.
+            When it is of another frame, or stamped on another clock than the joints, or there are
+        no joints yet whose clock it could be held against.
         """
         if shot.frame != frame:
             raise InputError(
                 f"{shot.topic} in frame '{shot.frame}', the sensor's frame is '{frame}': set "
                 "sensor_frame, or connect the right sensor"
             )
+        if not joints_ns:
+            raise InputError(f"{shot.topic} came before any joint states")
         away_ns = shot.stamp_ns - joints_ns
-        if joints_ns and not -BEHIND_NS <= away_ns <= AHEAD_NS:
+        if not -BEHIND_NS <= away_ns <= AHEAD_NS:
             raise InputError(
                 f"{shot.topic} at {shot.stamp_ns} ns is {away_ns * 1e-9:+.1f} s from the joint "
                 "states: stamp both on one clock"

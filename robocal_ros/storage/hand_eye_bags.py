@@ -56,7 +56,8 @@ def write_data_set(
     if not path.parent.is_dir():
         raise InputError(f"cannot be written: no folder {path.parent}", file=str(path))
     samples = sorted(document["samples"], key=lambda row: (row["stamp_ns"], row["handle"]))
-    rows = [{name: row[name] for name in ("handle", "mark", "stamp_ns")} for row in samples]
+    apart = ("q", "values")  # messages of their own
+    rows = [{name: row[name] for name in row if name not in apart} for row in samples]
     made_with = {"robot": arm.name, "model_hash": arm.model_hash, "sensor_frame": frame}
     text = json.dumps({**document, **made_with, "samples": rows}, allow_nan=False)
     draft = path.with_name(f".{path.name}.{os.getpid()}")

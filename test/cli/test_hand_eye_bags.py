@@ -192,9 +192,13 @@ class TestSaved:
 
     def test_of_a_camera(self, tmp_path):
         path = tmp_path / "camera.mcap"
-        seen = {"handle": 3, "mark": "", "stamp_ns": 10**18, "q": [0.0] * 6}
+        seen = {"handle": 3, "mark": "", "stamp_ns": 10**18, "thermal": 0, "q": [0.0] * 6}
         target = {"target": {"kind": "camera"}, "method": "best", "mount": "in-hand"}
-        shots = {"feature": "edge", "samples": [seen | {"values": [[0, 0, 1, 0, 0, 0, 1]]}]}
+        models = {"thermal_models": [{"revision": 0, "model": None}]}
+        shots = models | {
+            "feature": "edge",
+            "samples": [seen | {"values": [[0, 0, 1, 0, 0, 0, 1]]}],
+        }
         write_data_set(path, target | shots, "target_pose", "camera", UR10)
         refused = robocal(*from_bag("sphere", path), status=2)["error"]
         assert "holds shots of a camera" in refused["message"]

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import islice
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -170,7 +171,11 @@ class Driver:
         """Start, and capture the sphere from each pose."""
         self.robot.rest(0.1)
         assert self.ask(events.START, **SPHERE).done
-        for q, shot in sphere_shots_of(count):
+        self.capture_sphere(0, count)
+
+    def capture_sphere(self, first: int, last: int) -> None:
+        """Capture it from more poses."""
+        for q, shot in islice(sphere_shots_of(last), first, None):
             self.robot.move(q)
             self.robot.rest(0.1)
             assert self.ask(events.CAPTURE).done

@@ -227,7 +227,7 @@ def test_images_take_bounded_memory(monkeypatch):
     monkeypatch.setattr(hand_eye_shots, "MOST_BYTES", 3 * PLAIN.nbytes)
     log = hand_eye_shots.ShotLog()
     for at_ns in range(1, 9):
-        log.add(shot_of("image", namespace(image(at_ns, PLAIN).fields)), FRAME, 0)
+        log.add(shot_of("image", namespace(image(at_ns, PLAIN).fields)), FRAME, 1)
     assert [shot.stamp_ns for shot in log.since("image", 0)] == [6, 7, 8]
 
 
