@@ -7,8 +7,10 @@ import pytest
 from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_target
 
 from robocal_ros.core import frames
+from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import fit_mount
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
+from robocal_ros.core.hand_eye.quality import HandEyeSettings, judge
 from robocal_ros.core.hand_eye.restricted_noise import RestrictedLikelihood
 from robocal_ros.core.hand_eye.result import increment
 from robocal_ros.core.hand_eye.sightings import Sightings
@@ -187,6 +189,24 @@ def test_one_wrong_profile_is_named_and_left_out():
     wrong = View(view.model, replace(view.sightings, value=value))
     fit = fit_mount((wrong,), MountState(X, (place,)))
     assert list(fit.rejected) == [view.sightings.names[4]]
+
+
+@pytest.mark.parametrize(
+    ("name", "code"),
+    [
+        ("sphere/p{}", Code.RESIDUAL_TOO_LARGE),
+        ("day 1/p{}", Code.RESIDUAL_TOO_LARGE),
+        ("p{}/corner 2", Code.RESIDUAL_TOO_LARGE),
+        ("step/p1/corner {}", Code.ACCEPT),  # a single shot may be wrong as a whole
+    ],
+)
+def test_misfits_of_many_shots_are_refused_however_these_are_named(name, code):
+    view, place = sphere_view(np.random.default_rng(12), 15)
+    fit = fit_mount((view,), MountState(X, (place,)), NOISE)
+    assert not fit.rejected
+    misfit = {name.format(i): "does not fit the others" for i in range(5)}  # more than 4 of 20
+    found = judge(replace(fit, rejected=misfit), 20, 5, 0.0, HandEyeSettings(POSE_M))
+    assert found.code is code
 
 
 def test_one_wrong_corner_is_left_out_and_the_others_of_its_profile_stay():

@@ -11,6 +11,7 @@ from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import MountFit, noise_numbers
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, PoseNoise
+from robocal_ros.core.hand_eye.result import shots_of
 
 Array = NDArray[np.float64]
 
@@ -147,9 +148,8 @@ def _inconsistent(fit: MountFit) -> Verdict | None:
         )
         words += " moved, does the robot repeat, are the poses those of the profiles?"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
-    misfits = {name.partition("/")[0] for name in fit.rejected}
     wrong = len(fit.rejected)
-    if wrong > MOST_MISFITS * (wrong + len(fit.names)) and len(misfits) > 1:
+    if wrong > MOST_MISFITS * (wrong + len(fit.names)) and len(shots_of(fit.rejected)) > 1:
         words = f"{wrong} of {wrong + len(fit.names)} features do not fit the others: see the "
         return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}rejected ones")
     return None

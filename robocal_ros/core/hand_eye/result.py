@@ -1,7 +1,7 @@
 """The outcome of a hand-eye calibration, whatever the target."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -138,7 +138,7 @@ def hand_eye_document(result: HandEyeResult) -> Document:
 
 def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, str]:
     """Reasons by name; a shot that has no corner among the samples used stands there once."""
-    used = {_shots_alone(name) for name in samples}
+    used = shots_of(samples)
     found: dict[str, list[str]] = {}
     for name, why in rejected.items():
         shot = _shots_alone(name)
@@ -147,6 +147,11 @@ def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, 
         else:
             found.setdefault(shot, []).append(_shots_alone(why))
     return {name: max(reasons, key=reasons.count) for name, reasons in found.items()}
+
+
+def shots_of(names: Iterable[str]) -> set[str]:
+    """Names of the shots that samples are named after: several corners may be of one."""
+    return {_shots_alone(name) for name in names}
 
 
 def _shots_alone(words: str) -> str:
