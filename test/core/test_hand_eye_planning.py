@@ -23,9 +23,9 @@ from robocal_ros.core.hand_eye.planning import SensorRange, check_plan
 from robocal_ros.core.hand_eye.quality import HandEyeSettings, expected_error_m
 from robocal_ros.core.hand_eye.result import at_origin
 from robocal_ros.core.hand_eye.solve import solve_sphere
-from robocal_ros.core.hand_eye.targets import SphereTarget
+from robocal_ros.core.hand_eye.targets import SphereTarget, Staircase, StepTarget
 from robocal_ros.sim.hand_eye_cell import Shots
-from robocal_ros.sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
+from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
 from robocal_ros.sim.profile_targets import ball_on_table
 
 SENSOR = SensorRange(width_m=0.09)
@@ -101,6 +101,19 @@ def test_proposed_poses_mend_a_poor_plan(kind):
         target = replace(target, marks=None)  # what is proposed may lie on any mark
     mended = judged(target, every, 3e-4)
     assert mended.working_error_m < 3e-4
+
+
+def test_marks_with_one_corner_each():
+    """Only the first step is known: a pose that sees its corner sees all there is."""
+    stairs = TrueStairs(T_BASE_USER, steps=2)
+    drawn = Staircase(1, stairs.length_m, stairs.height_m, stairs.depth_m)
+    target = StepTarget(T_BASE_USER, drawn.marked_corners(), drawn.edge_user)
+    poses = step_shots(CELL, stairs, 6, np.random.default_rng(2)).true_T_base_flange
+    poses[1, :3, 3] += [0.0, 0.0, 0.1]
+    plan = judged(PlannedStep(target, SENSOR, ("near", "far")), poses, 1e-4)
+    assert list(plan.unseen) == [1]
+    assert len(plan.proposed) >= 1
+    assert plan.proposed_error_m < plan.working_error_m
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -214,23 +214,24 @@ class PlannedStep:
         return known[:1] if self.marks is None else known
 
     def unseen(self, view: View) -> dict[int, str]:
-        """Poses that see less than two corners."""
+        """Poses that see less than two corners, or not the only one of a mark."""
         x, z, _ = view.sightings.value.T
         found: dict[int, str] = {}
         out = _out_of_range(x, z, np.zeros_like(z), self.sensor)
         for pose in np.unique(view.sightings.pose):
             rows = np.flatnonzero(view.sightings.pose == pose)
-            if sum(int(row) not in out for row in rows) < 2:
+            if sum(int(row) not in out for row in rows) < min(2, len(rows)):
                 found[int(pose)] = next(out[int(row)] for row in rows if int(row) in out)
         return found
 
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
         """Light through the marks: tilted about their line, and within the plane of the light."""
         every = [self.target.corners[mark] for mark in self._known()]
-        along = place[:3, :3] @ (every[0][-1] - every[0][0])
-        along /= np.linalg.norm(along)
         mean = frames.nearest_rotation(T_base_sensor[:, :3, :3].mean(axis=0))
-        x = along * np.sign(along @ mean[:, 0])
+        x = mean[:, 0]
+        if len(every[0]) > 1:  # a corner alone lies on no line
+            along = place[:3, :3] @ (every[0][-1] - every[0][0])
+            x = along / np.linalg.norm(along) * np.sign(along @ x)
         y = mean[:, 1] - x * (x @ mean[:, 1])
         y /= np.linalg.norm(y)
         level = np.column_stack([x, y, np.cross(x, y)])
