@@ -1,6 +1,6 @@
 """Planned poses: judged before the robot moves, and mended."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -131,6 +131,30 @@ def test_too_few_poses():
     plan = judged(BALL, sphere_poses(4))
     assert plan.verdict.code is Code.TOO_FEW_SAMPLES
     assert len(plan.proposed) >= 1
+
+
+@dataclass(frozen=True)
+class FewPlaces(PlannedSphere):
+    """A sphere for which there are few other places, the first of them without a view of it."""
+
+    good: int = 0
+
+    def candidates(self, T_base_sensor, place):
+        return super().candidates(T_base_sensor, place)[: 1 + self.good] + BLIND[: 1 + self.good]
+
+
+BLIND = np.zeros((13, 4, 4))
+BLIND[0, 2, 3] = 1.0  # m above all the others
+
+
+@pytest.mark.parametrize("good", [0, 3])
+def test_only_poses_that_show_something_are_proposed_and_each_once(good):
+    target = FewPlaces(RADIUS_M, SENSOR, tuple(CENTRE), good=good)
+    plan = judged(target, sphere_poses(4), 1e-9)
+    assert len(plan.proposed) == good
+    assert (plan.proposed_error_m is None) == (good == 0)
+    if good:
+        assert not target.unseen(target.view(plan.proposed, CELL.T_flange_sensor, CENTRE))
 
 
 def test_a_pose_that_does_not_see_the_target_is_told():

@@ -86,7 +86,8 @@ class PlanReport:
         words.
     sigma : (6,) expected, sensor axes: m, rad; working_error_m: rms at the working distance.
     unseen : poses (by index) that do not see the target, with the reason.
-    proposed : (n, 4, 4) flange poses to add, best first; proposed_error_m: with all of them.
+    proposed : (n, 4, 4) flange poses to add, best first; proposed_error_m: with all of them, None
+        where there is none.
     """
 
     rank: int
@@ -218,7 +219,7 @@ def _propose(
     state: MountState,
     known: tuple[Array, PoseNoise, SensorRange, float],
     seen: int,
-) -> tuple[Array, float]:
+) -> tuple[Array, float | None]:
     """Add, one by one, the candidate that lowers the expected error most, until they will do."""
     information, noise, sensor, limit_m = known
     X, place = state.T_flange_sensor, state.places[0]
@@ -232,7 +233,7 @@ def _propose(
     chosen: list[int] = []
     error = np.inf
     wanted = target.fewest + SPARE_POSES - seen
-    while len(chosen) < MOST_PROPOSED and (error > limit_m or len(chosen) < wanted):
+    while np.any(gain) and len(chosen) < MOST_PROPOSED and (error > limit_m or len(chosen) < wanted):
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
         errors = _errors(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
@@ -240,7 +241,7 @@ def _propose(
         total = total + gain[best]
         gain[best] = 0.0  # once: the same pose again shows the same error again
         chosen.append(best)
-    return candidates[chosen] @ frames.invert(X), error
+    return candidates[chosen] @ frames.invert(X), error if chosen else None
 
 
 def _errors(covariance: Array, points: Array) -> Array:
