@@ -233,7 +233,9 @@ def _propose(
     chosen: list[int] = []
     error = np.inf
     wanted = target.fewest + SPARE_POSES - seen
-    while np.any(gain) and len(chosen) < MOST_PROPOSED and (error > limit_m or len(chosen) < wanted):
+    while np.any(gain) and len(chosen) < MOST_PROPOSED:
+        if error <= limit_m and len(chosen) >= wanted:
+            break
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
         errors = _errors(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
