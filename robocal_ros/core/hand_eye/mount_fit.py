@@ -31,6 +31,9 @@ POSE_NUMBERS = 6
 CALM_M = 1e-4  # and rad at 1 m: the noise of a good robot, to tell poses from noise
 LEAST_AIM = 1  # so that four poses suffice to tell how well the eye aims
 SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
+UNSETTLED = (
+    f"the mount and the noise of the poses had not settled after {ROUNDS} rounds: measure more often"
+)
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 
 
@@ -44,6 +47,7 @@ class MountFit:
     state, covariance : (k, k) of the problem's unknowns; scale: how far the misfit widened it.
     noise : of reported poses, given or found.
     rejected : names of sightings not used, with the reason.
+    creeping : why this is no solution, in words; empty where it is one.
     """
 
     views: tuple[View, ...]
@@ -96,10 +100,10 @@ def fit_mount(
     found = FIRST_NOISE if noise is None else replace(noise, aim_m=FIRST_NOISE.aim_m)
     poses = np.concatenate([view.sightings.pose for view in views])
     if len(np.unique(poses)) < len(poses):  # one sighting of a profile may be wrong, not all of it
-        estimate, wrong, found = _settle(views, state, found, noise, together=False)
+        estimate, wrong, found, _ = _settle(views, state, found, noise, together=False)
         state = estimate.state
         views = without(views, wrong, rejected)
-    estimate, wrong, found = _settle(views, state, found, noise, together=True)
+    estimate, wrong, found, settled = _settle(views, state, found, noise, together=True)
     views = without(views, wrong, rejected)
     last = MountProblem(views, found, estimate.state)
     return MountFit(
@@ -109,7 +113,7 @@ def fit_mount(
         estimate.scale,
         found,
         rejected,
-        estimate.creeping,
+        estimate.creeping or ("" if settled else UNSETTLED),
     )
 
 
@@ -133,8 +137,11 @@ def _settle(
     noise: PoseNoise,
     given: PoseNoise | None,
     together: bool,
-) -> tuple[Estimate[MountState], NDArray[np.bool_], PoseNoise]:
-    """Solve, take weights and noise anew, until both stay: which sightings (m,) are wrong, too."""
+) -> tuple[Estimate[MountState], NDArray[np.bool_], PoseNoise, bool]:
+    """Solve, take weights and noise anew, until both stay; whether they do is told last.
+
+    Which sightings (m,) are wrong, too.
+    """
     for _ in range(ROUNDS):
         problem = MountProblem(views, noise, state, together)
         estimate = _solved(
@@ -142,13 +149,12 @@ def _settle(
         )
         away = _away(problem.pivot, state, estimate)
         state, before = estimate.state, noise
-        noise = restricted_noise(problem, state, ~estimate.rejected, given)
+        noise, sure = restricted_noise(problem, state, ~estimate.rejected, given)
         change = np.log([noise.sigma_m / before.sigma_m, noise.aim_m / before.aim_m])
-        if away < SETTLED and np.max(np.abs(change)) < SETTLED:
+        settled = sure and away < SETTLED and bool(np.max(np.abs(change)) < SETTLED)
+        if settled:
             break
-    else:
-        estimate = replace(estimate, converged=False)
-    return estimate, estimate.rejected[problem.sample], noise
+    return estimate, estimate.rejected[problem.sample], noise, settled
 
 
 def _away(pivot: Array, before: MountState, estimate: Estimate[MountState]) -> float:
