@@ -62,6 +62,18 @@ class Estimate(Generic[S]):
             "the poses hardly show"
         )
 
+    def settled(self) -> S:
+        """The state.
+
+        Raises
+        ------
+        RankDeficientError
+            Where it still crept.
+        """
+        if self.creeping:
+            raise RankDeficientError(self.creeping)
+        return self.state
+
 
 def solve(
     problem: Problem[S],

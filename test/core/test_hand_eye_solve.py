@@ -316,6 +316,12 @@ class TestVerify:
         seen = verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
         assert seen.verdict.accept
 
+    def test_a_place_that_was_not_reached_blames_no_mount(self, result, monkeypatch):
+        monkeypatch.setattr("robocal_ros.core.descent.MOST_ITERATIONS", 1)
+        edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
+        with pytest.raises(RankDeficientError, match="still crept"):
+            verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
+
     def test_a_knocked_sensor_does_not(self, result):
         knocked = result.T_flange_sensor @ frames.transform(
             frames.exp_rotation([0.0, 0.05, 0.0]), [2e-3, 0.0, 0.0]

@@ -147,8 +147,14 @@ def _held(
 
 
 def least_distances(view: View, near: MountState) -> MountState:
-    """Classic: the sum of squared distances from the line, every feature alike."""
+    """Classic: the sum of squared distances from the line, every feature alike.
+
+    Raises
+    ------
+    RankDeficientError
+        When the poses leave a direction open.
+    """
     plain = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
     alike = View(view.model, replace(view.sightings, covariance=plain))
     problem = MountProblem((alike,), PoseNoise(0.0, 0.0), near)
-    return solve(problem, near, robust=False, sizes=problem.sizes).state
+    return solve(problem, near, robust=False, sizes=problem.sizes).settled()

@@ -271,7 +271,7 @@ def solved_again(fit: MountFit) -> Callable[[tuple[View, ...]], MountState]:
         part = MountProblem(views, fit.noise, fit.state)
         return solve(
             part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
-        ).state
+        ).settled()
 
     return again
 
