@@ -1,5 +1,6 @@
 """A straight piece of a profile, and the corner where two of them meet."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FEWEST_POINTS = 6
-_ROUNDS = 12
+_FREE_ROUNDS = 12  # in which a point that was left out may come back
 _WORST = 0.5  # share of points beside a line that is still one
 
 
@@ -78,7 +79,7 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
         along = (cloud - start.middle) @ direction
         scatter = start.noise_m * np.sqrt(1.0 + along**2 / start.spread_m2)
     near = np.abs(residual) <= factor * scatter
-    for _ in range(_ROUNDS):
+    for attempt in itertools.count():
         if np.sum(near) < max(FEWEST_POINTS, _WORST * count):
             return None
         middle = cloud[near].mean(axis=0)
@@ -91,15 +92,18 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
         noise = float(np.sqrt(np.sum(residual[near] ** 2) / (np.sum(near) - 2))) + SMALLEST_M
         # A point in use pulled the line to itself, any other did not.
         expected = 1.0 + np.where(near, -1.0, 1.0) * np.minimum(leverage, 0.5)
-        before, near = near, on_curve((residual / (factor * noise)) ** 2 / expected)
-        if np.array_equal(before, near):
+        update = on_curve((residual / (factor * noise)) ** 2 / expected)
+        if attempt >= _FREE_ROUNDS:  # a point at the limit must not come and go for ever
+            update = update & near
+        if np.array_equal(update, near):
             break
+        near = update
     return Flank(
-        rows=rows[before],
+        rows=rows[near],
         middle=middle,
         direction=direction,
-        start_m=float(np.min(along[before])),
-        end_m=float(np.max(along[before])),
+        start_m=float(np.min(along[near])),
+        end_m=float(np.max(along[near])),
         noise_m=noise,
         spread_m2=spread,
     )
