@@ -1,9 +1,9 @@
 """The feature of a straight-line target, an edge or a groove, from one profile.
 
 *Classic*, as published for the line target: the extremum of the second derivative of the profile,
-refined below the sample spacing by a parabola. *Best*: near that extremum the two surfaces are
-fitted by robust lines, and the feature is where they meet; where a surface falls away and its
-neighbour is not seen, it is where the surface ends.
+refined below the sample spacing by a parabola. *Best*: the straight surfaces are fitted by robust
+lines, and the feature is where the two of the sharpest turn meet; where a surface falls away and
+its neighbour is not seen, it is where the surface ends.
 """
 
 from dataclasses import dataclass
@@ -37,12 +37,12 @@ class EdgeRule(SurfaceRule):
 
     Attributes
     ----------
-    kind : "edge" is an outer edge, nearer to the sensor than the surfaces beside it: z over x has
-        its largest second derivative there. Where there is none, it is the end of a surface
-        beyond which a farther one is seen. "groove" is an inner edge, the bottom of a groove or
-        the foot of a step, farther from the sensor than the surfaces beside it: the smallest
-        (most negative) second derivative.
-    classic : the published form instead of the best one.
+    kind : "edge" is an outer edge, nearer to the sensor than the surfaces beside it; where the best
+        form finds none, it is the end of a surface beyond which a farther one is seen. "groove" is
+        an inner edge, the bottom of a groove or the foot of a step, farther from the sensor than
+        the surfaces beside it.
+    classic : the published form instead of the best one: the largest second derivative of z over x
+        for an edge, the smallest (most negative) for a groove.
     """
 
     kind: Kind = "edge"
