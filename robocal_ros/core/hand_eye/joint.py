@@ -55,9 +55,7 @@ def solve_joint(
     ]
     fit = fit_mount(views, MountState(X.T_flange_sensor, tuple(places)), settings.noise())
     require_radius(fit)
-    require_seen(
-        fit, float(np.abs(np.concatenate([v.sightings.value[:, 1] for v in views])).mean())
-    )
+    require_seen(fit)
     tasks = [task for task, _ in parts]
     result = result_of(tasks, fit, reads, _data(parts), settings)
     if not checks:

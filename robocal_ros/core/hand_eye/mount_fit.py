@@ -215,10 +215,10 @@ def refuse_open(words: list[str]) -> RankDeficientError:
     return RankDeficientError(f"not determined: {joined(words)}", words)
 
 
-def require_seen(fit: MountFit, reach_m: float) -> None:
+def require_seen(fit: MountFit) -> None:
     """Refuse a direction that the poses, even of a good robot, show no better than `OPEN_M`.
 
-    ``reach_m``: distance at which turns count.
+    Turns count at the distance at which the targets were seen.
 
     Raises
     ------
@@ -232,7 +232,8 @@ def require_seen(fit: MountFit, reach_m: float) -> None:
     J = problem.linearise(fit.state)[1].reshape(-1, len(problem.names))
     prior = problem.prior()
     covariance = np.asarray(np.linalg.pinv(J.T @ J + (0.0 if prior is None else prior)))
-    words = open_directions(at_origin(covariance[:6, :6], problem.pivot), reach_m, T)
+    reach_m = np.abs(np.concatenate([view.sightings.value[:, 1] for view in fit.views])).mean()
+    words = open_directions(at_origin(covariance[:6, :6], problem.pivot), float(reach_m), T)
     if words:
         raise refuse_open(words)
 

@@ -82,7 +82,7 @@ def solve_task(
     read, near = read_and_look(task, data)
     fit = fit_mount((read.view,), near, settings.noise())
     require_radius(fit)
-    require_seen(fit, float(np.abs(read.view.sightings.value[:, 1]).mean()))
+    require_seen(fit)
     if method == "classic":
         return _classic(task, read, fit, data, settings)
     return result_of([task], fit, [read], data, settings)
