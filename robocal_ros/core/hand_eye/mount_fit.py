@@ -230,8 +230,7 @@ def require_seen(fit: MountFit) -> None:
     calm = replace(calm, sigma_rad=min(calm.sigma_rad, CALM_M))
     problem = MountProblem(fit.views, calm, fit.state)
     J = problem.linearise(fit.state)[1].reshape(-1, len(problem.names))
-    prior = problem.prior()
-    covariance = np.asarray(np.linalg.pinv(J.T @ J + (0.0 if prior is None else prior)))
+    covariance = np.asarray(np.linalg.pinv(J.T @ J + problem.prior()))
     reach_m = np.abs(np.concatenate([view.sightings.value[:, 1] for view in fit.views])).mean()
     words = open_directions(at_origin(covariance[:6, :6], problem.pivot), float(reach_m), T)
     if words:

@@ -162,8 +162,9 @@ def _shown(view: View, state: MountState, noise: PoseNoise, sensor: SensorRange)
     k = 6 + len(view.model.names)
     if not view.sightings.names:
         return _Shown(0, np.zeros((k, k)), None, ["no pose sees the target"])
-    J = _samples(view, state, noise, sensor)[1].reshape(-1, k)
-    information = J.T @ J + _prior(view)
+    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
+    J = problem.linearise(state)[1].reshape(-1, k)
+    information = J.T @ J + problem.prior()
     covariance = np.asarray(np.linalg.inv(information + _vague(k)))
     size = np.ones(k)
     size[3:6] = sensor.middle_m
@@ -177,22 +178,6 @@ def _vague(unknowns: int) -> Array:
     """Information (k, k) of a guess, which makes of an open direction a large error."""
     of_target = np.full(unknowns - 6, 1.0)
     return np.diag(np.concatenate([np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0, of_target]))
-
-
-def _samples(
-    view: View, state: MountState, noise: PoseNoise, sensor: SensorRange
-) -> tuple[NDArray[np.int64], Array]:
-    """Poses (g,) that have sightings, and the whitened Jacobian (g, c, k) of each."""
-    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
-    return problem.poses, problem.linearise(state)[1]
-
-
-def _prior(view: View) -> Array:
-    """Information (k, k) about the target beforehand."""
-    k = len(view.model.names)
-    prior = np.zeros((6 + k, 6 + k))
-    prior[6:, 6:] = view.model.prior
-    return prior
 
 
 def _verdict(
@@ -225,9 +210,10 @@ def _propose(
     X, place = state.T_flange_sensor, state.places[0]
     candidates = target.candidates(T_base_flange @ X, place)
     view = target.view(candidates @ frames.invert(X), X, place)
-    poses, J = _samples(view, state, noise, sensor)
+    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
+    J = problem.linearise(state)[1]
     gain = np.zeros((len(candidates), *information.shape))
-    gain[poses] = np.swapaxes(J, 1, 2) @ J
+    gain[problem.poses] = np.swapaxes(J, 1, 2) @ J
     gain[list(target.unseen(view))] = 0.0
     total = information + _vague(len(information))
     chosen: list[int] = []

@@ -37,8 +37,7 @@ class RestrictedLikelihood:
         self.unknown += ["aim_m"] if np.any(G[..., 6:]) else []
         self._own, self._noise = C, problem.noise
         self._all = np.concatenate([r[..., None], J, G], axis=2)
-        prior, k = problem.prior(), J.shape[2]
-        self._known = np.zeros((k, k)) if prior is None else prior
+        self._known = problem.prior()
         self._pull = self._known @ problem.deviation(state)
 
     @property

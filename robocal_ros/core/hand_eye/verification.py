@@ -148,11 +148,10 @@ def fit_place(
     if not view.model.names:
         return view, start
     problem = MountProblem((view,), noise, start)
-    prior = view.model.prior
     estimate = solve(
         _PlaceProblem(problem),
         start,
-        prior_information=prior if np.any(prior) else None,
+        prior_information=view.model.prior,
         sizes=problem.sizes,
     )
     kept = without((view,), estimate.rejected[problem.sample], rejected)
