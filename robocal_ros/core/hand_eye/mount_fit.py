@@ -1,12 +1,12 @@
 """Maximum likelihood of a mount: robust, with the robot's own error found where none is given."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import RankDeficientError, RobocalError
+from robocal_ros.core.errors import RankDeficientError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.hand_eye.mount_problem import (
     MountProblem,
@@ -32,7 +32,7 @@ CALM_M = 1e-4  # and rad at 1 m: the noise of a good robot, to tell poses from n
 LEAST_AIM = 1  # so that four poses suffice to tell how well the eye aims
 SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
 UNSETTLED = (
-    f"the mount and the noise of the poses had not settled after {ROUNDS} rounds: measure more often"
+    f"mount and noise of the poses had not settled after {ROUNDS} rounds: measure more often"
 )
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 
@@ -72,6 +72,11 @@ def distances(views: tuple[View, ...], state: MountState) -> Array:
     """Distance of each sighting from its target, m."""
     pairs = zip(views, state.places, strict=True)
     return np.concatenate([_distance(view, state, place) for view, place in pairs])
+
+
+def misfit(views: tuple[View, ...], state: MountState) -> float:
+    """Median distance of sightings from their target, m."""
+    return float(np.median(distances(views, state)))
 
 
 def _distance(view: View, state: MountState, place: Array) -> Array:
@@ -124,8 +129,8 @@ def first_look(views: tuple[View, ...], start: MountState) -> MountState:
     """
     state = start
     for _ in range(LOOKS):
-        off = float(np.median(distances(views, state)))
-        noise = PoseNoise(max(off, FIRST_NOISE.sigma_m), FIRST_NOISE.sigma_rad, FIRST_NOISE.aim_m)
+        off = max(misfit(views, state), FIRST_NOISE.sigma_m)
+        noise = PoseNoise(off, FIRST_NOISE.sigma_rad, FIRST_NOISE.aim_m)
         problem = MountProblem(views, noise, state, together=False)
         state = _solved(problem, state).state
     return state
@@ -262,36 +267,3 @@ def without(
         }
         kept.append(view.take(~out))
     return tuple(kept)
-
-
-def solved_again(fit: MountFit) -> Callable[[tuple[View, ...]], MountState]:
-    """How the mount is found from part of the views of a fit: nothing is rejected any more."""
-
-    def again(views: tuple[View, ...]) -> MountState:
-        part = MountProblem(views, fit.noise, fit.state)
-        return solve(
-            part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
-        ).settled()
-
-    return again
-
-
-def leave_one_out(
-    views: tuple[View, ...], solved: Callable[[tuple[View, ...]], MountState]
-) -> Array | None:
-    """Distance of each sighting from what is ``solved`` without its pose, m.
-
-    None where the rest does not suffice.
-    """
-    sample = np.concatenate([view.sightings.pose for view in views])
-    own = np.zeros(len(sample))
-    for pose in np.unique(sample):
-        out = sample == pose
-        rest = without(views, out, {})
-        if any(len(view.sightings.names) == 0 for view in rest):
-            return None  # a target that only this pose saw
-        try:
-            own[out] = distances(views, solved(rest))[out]
-        except RobocalError:
-            return None
-    return own

@@ -8,15 +8,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.fitting.edge import EdgeRule
 from robocal_ros.core.hand_eye.diagnosis import read_and_look
+from robocal_ros.core.hand_eye.leave_one_out import leave_one_out, solved_again
 from robocal_ros.core.hand_eye.mistakes import swapped
-from robocal_ros.core.hand_eye.mount_fit import (
-    MountFit,
-    distances,
-    fit_mount,
-    leave_one_out,
-    require_seen,
-    solved_again,
-)
+from robocal_ros.core.hand_eye.mount_fit import MountFit, distances, fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import View, pivot_of
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.quality import (
