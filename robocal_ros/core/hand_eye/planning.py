@@ -17,12 +17,12 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import OPEN_M, open_directions
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
 from robocal_ros.core.hand_eye.naming import joined
-from robocal_ros.core.hand_eye.quality import expected_error_m
+from robocal_ros.core.hand_eye.quality import expected_error_m, expected_errors_m
 from robocal_ros.core.hand_eye.result import at_origin
 
 Array = NDArray[np.float64]
 
-VAGUE_M, VAGUE_RAD = 1.0, 1.0  # what is known of a mount without any measurement
+VAGUE = 1.0  # m, rad: what is known without any measurement; an open direction has a large error
 MOST_PROPOSED = 12
 SPARE_POSES = 2  # beyond the fewest, so that one may be lost
 
@@ -165,19 +165,13 @@ def _shown(view: View, state: MountState, noise: PoseNoise, sensor: SensorRange)
     problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
     J = problem.linearise(state)[1].reshape(-1, k)
     information = J.T @ J + problem.prior()
-    covariance = np.asarray(np.linalg.inv(information + _vague(k)))
+    covariance = np.asarray(np.linalg.inv(information + VAGUE**-2 * np.eye(k)))
     size = np.ones(k)
     size[3:6] = sensor.middle_m
     rank = int(np.sum(np.linalg.eigvalsh(covariance * np.outer(size, size)) < OPEN_M**2))
     at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
     words = open_directions(at_sensor, sensor.middle_m, view.sightings.T_base_flange)
     return _Shown(rank, information, None if words else covariance, words)
-
-
-def _vague(unknowns: int) -> Array:
-    """Information (k, k) of a guess, which makes of an open direction a large error."""
-    of_target = np.full(unknowns - 6, 1.0)
-    return np.diag(np.concatenate([np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0, of_target]))
 
 
 def _verdict(
@@ -215,7 +209,7 @@ def _propose(
     gain = np.zeros((len(candidates), *information.shape))
     gain[problem.poses] = np.swapaxes(J, 1, 2) @ J
     gain[list(target.unseen(view))] = 0.0
-    total = information + _vague(len(information))
+    total = information + VAGUE**-2 * np.eye(len(information))
     chosen: list[int] = []
     error = np.inf
     wanted = target.fewest + SPARE_POSES - seen
@@ -223,17 +217,10 @@ def _propose(
         if error <= limit_m and len(chosen) >= wanted:
             break
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
-        errors = _errors(covariance, sensor.field_points - sensor.pivot)
+        errors = expected_errors_m(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
         error = float(errors[best])
         total = total + gain[best]
         gain[best] = 0.0  # once: the same pose again shows the same error again
         chosen.append(best)
     return candidates[chosen] @ frames.invert(X), error if chosen else None
-
-
-def _errors(covariance: Array, points: Array) -> Array:
-    """`expected_error_m` for many covariances (n, 6, 6)."""
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
-    spread = np.einsum("pij,njk,pik->np", J, covariance, J)
-    return np.asarray(np.sqrt(spread.mean(axis=1)))

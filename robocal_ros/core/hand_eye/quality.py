@@ -6,12 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import MountFit, noise_numbers
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, PoseNoise
-from robocal_ros.core.hand_eye.result import shots_of
+from robocal_ros.core.hand_eye.result import point_jacobian, shots_of
 
 Array = NDArray[np.float64]
 
@@ -63,9 +62,14 @@ def field_points(profiles: Sequence[Array]) -> Array:
 
 def expected_error_m(covariance: Array, points: Array) -> float:
     """Root mean square error of points (n, 3), counted from the pivot of a covariance (6, 6)."""
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
-    spread = J @ covariance @ np.swapaxes(J, 1, 2)
-    return float(np.sqrt(np.trace(spread, axis1=1, axis2=2).mean()))
+    return float(expected_errors_m(covariance, points))
+
+
+def expected_errors_m(covariance: Array, points: Array) -> Array:
+    """`expected_error_m` (...) for many covariances (..., 6, 6)."""
+    J = point_jacobian(points)
+    spread = J @ covariance[..., None, :, :] @ np.swapaxes(J, 1, 2)
+    return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1).mean(axis=-1)))
 
 
 def apart(T_one: Array, T_other: Array, points: Array) -> float:

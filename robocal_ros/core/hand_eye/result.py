@@ -78,6 +78,13 @@ def at_origin(covariance: Array, pivot: Array) -> Array:
     return np.asarray(move @ covariance @ move.T)
 
 
+def point_jacobian(points: Array) -> Array:
+    """How points (n, 3), counted from the pivot, move with an increment: (n, 3, 6)."""
+    return np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], axis=2
+    )
+
+
 def point_covariance(result: HandEyeResult, points: Array) -> Array:
     """Covariance (n, 3, 3), m^2, sensor axes, of sensor points (n, 3) once they are in the flange.
 
@@ -88,8 +95,7 @@ def point_covariance(result: HandEyeResult, points: Array) -> Array:
     """
     if result.covariance is None:
         raise ValueError("a method without a covariance")
-    away = points - result.pivot
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(away)], 2)
+    J = point_jacobian(points - result.pivot)
     return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
 
 
