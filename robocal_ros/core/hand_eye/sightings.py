@@ -47,6 +47,11 @@ class Sightings:
         )
 
 
+def in_plane(value: Array) -> Array:
+    """Points (..., 3) of the laser plane, sensor frame, from features (..., 3) that begin x, z."""
+    return np.stack([value[..., 0], np.zeros(value.shape[:-1]), value[..., 1]], axis=-1)
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """What a model predicts for m sightings.

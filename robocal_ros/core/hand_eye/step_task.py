@@ -203,14 +203,9 @@ def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
         raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
 
 
-def _corner_model(view: View) -> CornerModel:
-    if not isinstance(view.model, CornerModel):
-        raise ValueError("a view of corners is needed")
-    return view.model
-
-
 def _in_flange(view: View) -> Array:
     """Marks (m, 3) of a view in the flange frame of their pose."""
-    model = _corner_model(view)
-    T = frames.invert(view.sightings.T_base_flange) @ model.T_base_user
-    return np.asarray(np.einsum("mij,mj->mi", T[:, :3, :3], model.corner_user) + T[:, :3, 3])
+    if not isinstance(view.model, CornerModel):
+        raise ValueError("a view of corners is needed")
+    T = frames.invert(view.sightings.T_base_flange) @ view.model.T_base_user
+    return frames.apply(T, view.model.corner_user)
