@@ -22,12 +22,11 @@ from robocal_ros.core.errors import (
 )
 from robocal_ros.core.fitting.arc_search import find_circle, linearised, step
 from robocal_ros.core.fitting.neighbours import on_curve
-from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
+from robocal_ros.core.fitting.profile_noise import FEWEST_POINTS, MAD, SMALLEST_M, local_noise
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEWEST_POINTS = 20
 _NEAR = 3.5  # standard deviations of a point near a start
 _NEAR_M = 2e-5
 _FREE_ROUNDS = 25  # in which a point that was left out may come back
