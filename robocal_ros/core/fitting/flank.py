@@ -70,14 +70,7 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
     if count < FEWEST_POINTS:
         return None
     factor = chi2_quantile(1.0 - FALSE_REJECTION / count, 1.0) ** 0.5
-    if start is None:
-        direction, residual = _first_line(cloud)
-        scatter = np.full(count, MAD * _median(np.abs(residual)) + SMALLEST_M)
-    else:
-        direction = start.direction
-        residual = (cloud - start.middle) @ start.normal
-        along = (cloud - start.middle) @ direction
-        scatter = start.noise_m * np.sqrt(1.0 + along**2 / start.spread_m2)
+    direction, residual, scatter = _first_line(cloud) if start is None else _beside(start, cloud)
     near = np.abs(residual) <= factor * scatter
     for attempt in itertools.count():
         if np.sum(near) < max(FEWEST_POINTS, _WORST * count):
@@ -109,13 +102,22 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
     )
 
 
-def _first_line(cloud: Array) -> tuple[Array, Array]:
-    """Direction (2,) of points (n, 2) ascending in x, and their distances (n,) from the line."""
+def _beside(flank: Flank, cloud: Array) -> tuple[Array, Array, Array]:
+    """Direction (2,) of a straight piece, distances (n,) of points from it and their scatter."""
+    away = cloud - flank.middle
+    scatter = flank.noise_m * np.sqrt(1.0 + (away @ flank.direction) ** 2 / flank.spread_m2)
+    return flank.direction, away @ flank.normal, scatter
+
+
+def _first_line(cloud: Array) -> tuple[Array, Array, Array]:
+    """The same for points (n, 2) ascending in x of which nothing is known."""
     half = len(cloud) // 2
     step = cloud[half:] - cloud[: len(cloud) - half]
     angle = _median(np.arctan2(step[:, 1], step[:, 0]))
     residual = cloud @ np.array([-np.sin(angle), np.cos(angle)])
-    return np.array([np.cos(angle), np.sin(angle)]), residual - _median(residual)
+    residual -= _median(residual)
+    scatter = np.full(len(cloud), MAD * _median(np.abs(residual)) + SMALLEST_M)
+    return np.array([np.cos(angle), np.sin(angle)]), residual, scatter
 
 
 def _median(values: Array) -> float:
