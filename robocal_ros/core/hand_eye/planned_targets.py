@@ -12,6 +12,7 @@ from robocal_ros.core.hand_eye.look_point import OFF_EQUATOR, looked_at
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel
+from robocal_ros.core.hand_eye.sphere_start import FEWEST_PROFILES
 from robocal_ros.core.hand_eye.step_task import StepTask, require_marks
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import StepTarget
@@ -76,7 +77,7 @@ class PlannedSphere:
     radius_m: float
     sensor: SensorRange
     centre: tuple[float, float, float] | None = None
-    fewest: int = 5
+    fewest: int = field(default=FEWEST_PROFILES, init=False)
 
     def place(self, T_base_sensor: Array) -> Array:
         """Its centre."""
