@@ -21,8 +21,28 @@ SHOWN = 0.5  # of the profiles
 WRONG_M = 2e-3  # the same, from which something is wrong, whatever it is
 
 
-def read_and_look(task: Task, data: HandEyeData) -> tuple[Read, MountState]:
-    """Features of the profiles, and a state near the solution.
+def features(task: Task, data: HandEyeData) -> Read:
+    """Features of the profiles.
+
+    Raises
+    ------
+    ResidualError
+        When poses must tell which feature is which, and do not: with the mistake that explains it.
+    RobocalError
+        When too little is seen.
+    """
+    try:
+        return task.read(data)
+    except InputError:
+        raise
+    except RobocalError as error:
+        if task.read_by_poses:
+            _name_mistake(task, data, None, np.inf, error)
+        raise
+
+
+def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
+    """A state near the solution.
 
     Raises
     ------
@@ -31,14 +51,6 @@ def read_and_look(task: Task, data: HandEyeData) -> tuple[Read, MountState]:
     RobocalError
         When too little is seen, or the poses leave a direction open.
     """
-    try:
-        read = task.read(data)
-    except InputError:
-        raise
-    except RobocalError as error:
-        if task.read_by_poses:
-            _name_mistake(task, data, None, np.inf, error)
-        raise
     try:
         near = look(task, read.view)
     except RobocalError as error:
@@ -53,7 +65,7 @@ def read_and_look(task: Task, data: HandEyeData) -> tuple[Read, MountState]:
             f"{off} or do not show the target where it must be, and no common mistake explains it: "
             "has the target moved, are poses and profiles of the same run, is it the right target?"
         )
-    return read, near
+    return near
 
 
 def _shown(view: View, data: HandEyeData) -> bool:

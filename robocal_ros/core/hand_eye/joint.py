@@ -11,7 +11,7 @@ from robocal_ros.core.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.core.hand_eye.diagnosis import read_and_look
+from robocal_ros.core.hand_eye.diagnosis import features, looked
 from robocal_ros.core.hand_eye.mount_fit import fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import MountState
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
@@ -86,10 +86,11 @@ def _held_out(
 
 def _alone(task: Task, data: HandEyeData) -> tuple[Read, MountState | RobocalError]:
     """Features of one target, and where they lead alone, or why nowhere: others may show more."""
+    read = features(task, data)
     try:
-        return read_and_look(task, data)
+        return read, looked(task, data, read)
     except (TooFewSamplesError, RankDeficientError) as error:
-        return task.read(data), error
+        return read, error
 
 
 def _first(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.diagnosis import read_and_look
+from robocal_ros.core.hand_eye.diagnosis import features, looked
 from robocal_ros.core.hand_eye.leave_one_out import leave_one_out, solved_again
 from robocal_ros.core.hand_eye.mistakes import swapped
 from robocal_ros.core.hand_eye.mount_fit import MountFit, distances, fit_mount, require_seen
@@ -73,8 +73,8 @@ def solve_task(
     InputError
         A mark that the target does not have.
     """
-    read, near = read_and_look(task, data)
-    fit = fit_mount((read.view,), near, settings.noise())
+    read = features(task, data)
+    fit = fit_mount((read.view,), looked(task, data, read), settings.noise())
     require_radius(fit)
     require_seen(fit)
     if method == "classic":
