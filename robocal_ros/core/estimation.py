@@ -62,6 +62,18 @@ class Estimate(Generic[S]):
             "the poses hardly show"
         )
 
+    def settled(self) -> S:
+        """The state.
+
+        Raises
+        ------
+        RankDeficientError
+            Where it still crept.
+        """
+        if self.creeping:
+            raise RankDeficientError(self.creeping)
+        return self.state
+
 
 def solve(
     problem: Problem[S],
@@ -77,7 +89,7 @@ def solve(
 
     Parameters
     ----------
-    prior_information : (k, k) inverse covariance of the prior, or None for a flat one.
+    prior_information : (k, k) inverse covariance of the prior, or None (zeros) for a flat one.
     noise_known : whether residuals are in units of their true sigma; otherwise a common scale
         is estimated with them.
     robust : whether to look for outliers.
@@ -98,10 +110,10 @@ def solve(
     residual, jacobian = _linearised(problem, start)
     m, c, k = jacobian.shape
     counts = np.full(m, c, dtype=np.int64) if sizes is None else sizes
-    flat = prior_information is None
+    prior = np.zeros((k, k)) if prior_information is None else prior_information
+    flat = not np.any(prior)
     if flat:
         _require_enough(jacobian, int(np.sum(counts)), problem.names)
-    prior = np.zeros((k, k)) if prior_information is None else prior_information
     unscaled = 0 if noise_known else problem.scale_components
     descent = Descent(problem, prior, unscaled, counts, freedom)
     run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)

@@ -39,6 +39,11 @@ def invert(T: Array) -> Array:
     return transform(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
 
+def apply(T: Array, points: Array) -> Array:
+    """Points (..., 3), each by its own transform (..., 4, 4)."""
+    return np.asarray(np.einsum("...ij,...j->...i", T[..., :3, :3], points) + T[..., :3, 3])
+
+
 def quat_xyzw(T: Array) -> Array:
     """Unit quaternions (..., 4), w >= 0, of transforms (..., 4, 4) or rotations (..., 3, 3)."""
     from scipy.spatial.transform import Rotation

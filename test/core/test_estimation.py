@@ -214,7 +214,10 @@ class Runaway:
 
 
 def test_what_has_not_converged_says_so():
-    assert not solve(Runaway(), 0.0, robust=False).converged
+    found = solve(Runaway(), 0.0, robust=False)
+    assert not found.converged
+    with pytest.raises(RankDeficientError, match="still crept"):
+        found.settled()
 
 
 # ---- Observability ----------------------------------------------------------------------------

@@ -36,10 +36,16 @@ from robocal_ros.core.hand_eye.solve import solve_line, solve_sphere, solve_step
 from robocal_ros.core.hand_eye.targets import SphereTarget
 from robocal_ros.core.hand_eye.tasks import HandEyeData, LineTask, SphereTask
 from robocal_ros.core.hand_eye.verification import held_out, verify
-from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot
-from robocal_ros.sim.hand_eye_sets import edge_shots, groove_shots, sphere_shots, step_shots
+from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.sim.hand_eye_sets import (
+    edge_block,
+    edge_shots,
+    groove_shots,
+    sphere_shots,
+    step_shots,
+)
 from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.profile_targets import ball_on_table
+from robocal_ros.sim.profile_targets import Scene, ball_on_table
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor
@@ -271,15 +277,32 @@ class TestLine:
         sigma = np.sqrt(np.trace(point_covariance(found, np.array([[0.0, 0.0, 0.2]]))[0]))
         assert np.linalg.norm(across) < 4.0 * sigma + 1e-4  # and what the robot repeats to
 
-    def test_rotation_about_the_line_alone_is_refused(self):
-        cell = replace(CELL, roll_rad=0.0)
-        shots = edge_shots(cell, T_BASE_USER, 20, np.random.default_rng(4))
-        R = shots.T_base_flange[:, :3, :3] @ TRUE[:3, :3]
-        straight = np.abs(R[:, :, 1] @ T_BASE_USER[:3, 0])
-        assert straight.min() < 0.99  # tilted: the set is sound
-        data = data_of(edge_shots(replace(cell, tilt_rad=0.0), T_BASE_USER, 20,
-                                  np.random.default_rng(4)))  # fmt: skip
-        with pytest.raises(RankDeficientError, match="turn the flange"):
+    @pytest.mark.parametrize(
+        ("most_deg", "words"),
+        [
+            (0.0, "turn the flange about two axes"),
+            (
+                25.0,
+                "translation along the laser plane's normal.*tilt the flange about another axis",
+            ),
+        ],
+    )
+    def test_no_rotation_but_about_the_line_is_refused(self, most_deg, words):
+        rng = np.random.default_rng(4)
+        cell = replace(CELL, tilt_rad=0.0, roll_rad=0.0)
+        straight = edge_shots(cell, T_BASE_USER, 20, rng).true_T_base_flange
+        about = np.radians(most_deg) * rng.uniform(-1.0, 1.0, (20, 1)) * [1.0, 0.0, 0.0]
+        turn = T_BASE_USER @ frames.transform(frames.exp_rotation(about), np.zeros(3))
+        stands = [CELL.robot.stand(T, rng) for T in turn @ frames.invert(T_BASE_USER) @ straight]
+        scene = Scene((edge_block(T_BASE_USER),))
+        profiles = [CELL.sensor.shoot(s.true_T_base_flange @ TRUE, scene, rng) for s in stands]
+        reported = np.array([stand.T_base_flange for stand in stands])
+        turns = frames.log_rotation(reported[:, :3, :3] @ reported[0, :3, :3].T)
+        assert np.allclose(np.cross(turns, T_BASE_USER[:3, 0]), 0.0, atol=1e-9)
+        extent_deg = np.degrees(np.ptp(turns @ T_BASE_USER[:3, 0]))
+        assert most_deg <= extent_deg <= 2.0 * most_deg + 1e-6
+        data = data_of(Shots(reported, reported, profiles, [""] * 20, None))
+        with pytest.raises(RankDeficientError, match=words):
             solve_line(data, LINE, "best", SETTINGS, EdgeRule())
 
 
@@ -310,6 +333,12 @@ class TestVerify:
         edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
         seen = verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
         assert seen.verdict.accept
+
+    def test_a_place_that_was_not_reached_blames_no_mount(self, result, monkeypatch):
+        monkeypatch.setattr("robocal_ros.core.descent.MOST_ITERATIONS", 1)
+        edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
+        with pytest.raises(RankDeficientError, match="still crept"):
+            verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)
 
     def test_a_knocked_sensor_does_not(self, result):
         knocked = result.T_flange_sensor @ frames.transform(

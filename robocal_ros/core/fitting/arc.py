@@ -8,6 +8,7 @@ Source of the use: methods of the fixed sphere, where y = +-sqrt(R^2 - r^2).
 """
 
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +22,14 @@ from robocal_ros.core.errors import (
 )
 from robocal_ros.core.fitting.arc_search import find_circle, linearised, step
 from robocal_ros.core.fitting.neighbours import on_curve
-from robocal_ros.core.fitting.profile_noise import MAD, SMALLEST_M, local_noise
+from robocal_ros.core.fitting.profile_noise import FEWEST_POINTS, MAD, SMALLEST_M, local_noise
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEWEST_POINTS = 20
 _NEAR = 3.5  # standard deviations of a point near a start
 _NEAR_M = 2e-5
-_ROUNDS = 25
+_FREE_ROUNDS = 25  # in which a point that was left out may come back
 _GRANTED = 1.5  # of the largest noise allowed, lest the table becomes part of a noisy arc
 _ISOTROPIC = 5.0  # points' worth of belief that noise does not depend on the slope
 _STEEPEST = 0.05  # smallest share of variances of both directions
@@ -122,7 +122,7 @@ def _fitted(points: Array, rule: ArcRule) -> ArcFit:
     residual = linearised(circle, points)[1]
     used = on_curve((residual / limit) ** 2) & (points[:, 1] < circle[1])
     ab = np.full(2, (limit / _NEAR) ** 2)
-    for _ in range(_ROUNDS):
+    for attempt in count():
         _require_points(used, len(points))
         circle, covariance = _improved(circle, points[used], ab)
         J, residual = linearised(circle, points)
@@ -130,10 +130,12 @@ def _fitted(points: Array, rule: ArcRule) -> ArcFit:
         parts = _parts(circle, points)
         ab = _variances(parts[used], residual[used], pull[used] / (parts[used] @ ab))
         excess = _excess(residual, parts @ ab, np.where(used, -pull, pull), rule.noise_m)
-        before, used = used, on_curve(excess) & (points[:, 1] < circle[1])
-        if np.array_equal(before, used):
+        update = on_curve(excess) & (points[:, 1] < circle[1])
+        if attempt >= _FREE_ROUNDS:  # a point at the limit must not come and go for ever
+            update = update & used
+        if np.array_equal(update, used):
             break
-    _require_points(used, len(points))
+        used = update
     circle, covariance = _improved(circle, points[used], ab)
     noise = float(np.sqrt(np.mean(_parts(circle, points[used]) @ ab)))
     return ArcFit(circle[:2], float(circle[2]), covariance, noise, used)

@@ -8,7 +8,8 @@ random.
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+
+from robocal_ros.core.fitting.profile_noise import smoothed
 
 Array = NDArray[np.float64]
 
@@ -16,7 +17,6 @@ SMALLEST_SHARE, LARGEST_SHARE = 0.2, 1.5  # radius of a circle, of the sphere's
 _FLAT_SHARE = 4.0  # what was thought a circle grows beyond this where it is a piece of a plane
 _WIDTHS = (0.12, 0.2, 0.33, 0.55, 0.8)  # between the points of a triple, of the sphere's radius
 _PLACES, _JUDGES = 128, 320
-_SMOOTHED = 5  # columns
 _BEST = 4
 _REACHES = (2.0, 1.4, 1.0)  # limits, one after the other
 _RIDGE = 1e-12  # keeps a flat piece solvable; where steps end it does not matter
@@ -69,9 +69,8 @@ def linearised(circle: Array, points: Array) -> tuple[Array, Array]:
 
 def _triples(points: Array, radius: float) -> Array:
     """Triples (t, 3, 2), left to right, of the smoothed profile."""
-    ordered = points[np.argsort(points[:, 0], kind="stable")]
-    x = ordered[:, 0]
-    smooth = np.column_stack([x, median_filter(ordered[:, 1], _SMOOTHED, mode="nearest")])
+    smooth = smoothed(points[np.argsort(points[:, 0], kind="stable")])
+    x = smooth[:, 0]
     middle = np.linspace(0, len(x) - 1, min(_PLACES, len(x))).round().astype(np.int64)
     reach = radius * np.array(_WIDTHS)[:, None]
     last = len(x) - 1

@@ -1,9 +1,9 @@
 """The feature of a straight-line target, an edge or a groove, from one profile.
 
 *Classic*, as published for the line target: the extremum of the second derivative of the profile,
-refined below the sample spacing by a parabola. *Best*: near that extremum the two surfaces are
-fitted by robust lines, and the feature is where they meet; where a surface falls away and its
-neighbour is not seen, it is where the surface ends.
+refined below the sample spacing by a parabola. *Best*: the straight surfaces are fitted by robust
+lines, and the feature is where the two of the sharpest turn meet; where a surface falls away and
+its neighbour is not seen, it is where the surface ends.
 """
 
 from dataclasses import dataclass
@@ -11,22 +11,19 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from robocal_ros.core.errors import ResidualError, TooFewSamplesError
 from robocal_ros.core.fitting.polyline import places
-from robocal_ros.core.fitting.profile_noise import local_noise
+from robocal_ros.core.fitting.profile_noise import SMOOTHED, ordered, smoothed
 from robocal_ros.core.fitting.surfaces import SurfaceRule, Surfaces, surfaces
 
 Array = NDArray[np.float64]
 
 Kind = Literal["edge", "groove"]
 
-FEWEST_POINTS = 20
 _WINDOW = 21  # columns of the smoothing
 _DEGREE = 3
-_SMOOTHED = 5  # columns
 _WIDEST = 5.0  # columns without a return beyond the end of a surface
 _RIVAL = 0.8  # share of the sharpest turn at which another one could be meant as well
 
@@ -37,12 +34,12 @@ class EdgeRule(SurfaceRule):
 
     Attributes
     ----------
-    kind : "edge" is an outer edge, nearer to the sensor than the surfaces beside it: z over x has
-        its largest second derivative there. Where there is none, it is the end of a surface
-        beyond which a farther one is seen. "groove" is an inner edge, the bottom of a groove or
-        the foot of a step, farther from the sensor than the surfaces beside it: the smallest
-        (most negative) second derivative.
-    classic : the published form instead of the best one.
+    kind : "edge" is an outer edge, nearer to the sensor than the surfaces beside it; where the best
+        form finds none, it is the end of a surface beyond which a farther one is seen. "groove" is
+        an inner edge, the bottom of a groove or the foot of a step, farther from the sensor than
+        the surfaces beside it.
+    classic : the published form instead of the best one: the largest second derivative of z over x
+        for an edge, the smallest (most negative) for a groove.
     """
 
     kind: Kind = "edge"
@@ -75,14 +72,7 @@ def fit_edge(points: Array, rule: EdgeRule) -> EdgeFit:
     ResidualError
         No such feature, or several that could be meant: the message says where.
     """
-    rows = points[np.all(np.isfinite(points), axis=1)]
-    if len(rows) < FEWEST_POINTS:
-        raise TooFewSamplesError(
-            f"{len(rows)} points give no {rule.kind}: at least {FEWEST_POINTS} are needed; check "
-            "the exposure and that the target is in range"
-        )
-    profile = rows[np.argsort(rows[:, 0], kind="stable")]
-    noise = local_noise(profile[:, 1])
+    profile, noise = ordered(points, rule.kind)
     return _classic(profile, noise, rule.kind) if rule.classic else _best(profile, noise, rule)
 
 
@@ -143,7 +133,7 @@ def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
             "exposure and that the target is in range"
         )
     grid, spacing = np.linspace(x[0], x[-1], len(x), retstep=True)
-    height = median_filter(np.interp(grid, x, profile[first, 1]), _SMOOTHED, mode="nearest")
+    height = smoothed(np.column_stack([grid, np.interp(grid, x, profile[first, 1])]))[:, 1]
     curvature = savgol_filter(height, _WINDOW, _DEGREE, deriv=2, delta=spacing)
     curvature *= 1.0 if kind == "edge" else -1.0
     inner = slice(_WINDOW // 2 + 1, -_WINDOW // 2 - 1)
@@ -160,7 +150,7 @@ def _classic(profile: Array, noise: float, kind: Kind) -> EdgeFit:
     difference = np.pad(kernel, (2, 0)) - np.pad(kernel, (0, 2))
     sigma = spacing * noise * float(np.linalg.norm(difference)) / (2.0 * abs(bend))
     at = float(grid[top] + shift * spacing)
-    near = height[top - _SMOOTHED : top + _SMOOTHED + 1]
+    near = height[top - SMOOTHED : top + SMOOTHED + 1]
     x_variance = sigma**2 + spacing**2 / 12.0
     steepness = float(np.mean((np.diff(near) / spacing) ** 2))
     return EdgeFit(

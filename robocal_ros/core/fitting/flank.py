@@ -1,5 +1,6 @@
 """A straight piece of a profile, and the corner where two of them meet."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FEWEST_POINTS = 6
-_ROUNDS = 12
+_FREE_ROUNDS = 12  # in which a point that was left out may come back
 _WORST = 0.5  # share of points beside a line that is still one
 
 
@@ -69,16 +70,9 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
     if count < FEWEST_POINTS:
         return None
     factor = chi2_quantile(1.0 - FALSE_REJECTION / count, 1.0) ** 0.5
-    if start is None:
-        direction, residual = _first_line(cloud)
-        scatter = np.full(count, MAD * _median(np.abs(residual)) + SMALLEST_M)
-    else:
-        direction = start.direction
-        residual = (cloud - start.middle) @ start.normal
-        along = (cloud - start.middle) @ direction
-        scatter = start.noise_m * np.sqrt(1.0 + along**2 / start.spread_m2)
+    direction, residual, scatter = _first_line(cloud) if start is None else _beside(start, cloud)
     near = np.abs(residual) <= factor * scatter
-    for _ in range(_ROUNDS):
+    for attempt in itertools.count():
         if np.sum(near) < max(FEWEST_POINTS, _WORST * count):
             return None
         middle = cloud[near].mean(axis=0)
@@ -91,27 +85,39 @@ def fit_flank(points: Array, rows: NDArray[np.int64], start: Flank | None = None
         noise = float(np.sqrt(np.sum(residual[near] ** 2) / (np.sum(near) - 2))) + SMALLEST_M
         # A point in use pulled the line to itself, any other did not.
         expected = 1.0 + np.where(near, -1.0, 1.0) * np.minimum(leverage, 0.5)
-        before, near = near, on_curve((residual / (factor * noise)) ** 2 / expected)
-        if np.array_equal(before, near):
+        update = on_curve((residual / (factor * noise)) ** 2 / expected)
+        if attempt >= _FREE_ROUNDS:  # a point at the limit must not come and go for ever
+            update = update & near
+        if np.array_equal(update, near):
             break
+        near = update
     return Flank(
-        rows=rows[before],
+        rows=rows[near],
         middle=middle,
         direction=direction,
-        start_m=float(np.min(along[before])),
-        end_m=float(np.max(along[before])),
+        start_m=float(np.min(along[near])),
+        end_m=float(np.max(along[near])),
         noise_m=noise,
         spread_m2=spread,
     )
 
 
-def _first_line(cloud: Array) -> tuple[Array, Array]:
-    """Direction (2,) of points (n, 2) ascending in x, and their distances (n,) from the line."""
+def _beside(flank: Flank, cloud: Array) -> tuple[Array, Array, Array]:
+    """Direction (2,) of a straight piece, distances (n,) of points from it and their scatter."""
+    away = cloud - flank.middle
+    scatter = flank.noise_m * np.sqrt(1.0 + (away @ flank.direction) ** 2 / flank.spread_m2)
+    return flank.direction, away @ flank.normal, scatter
+
+
+def _first_line(cloud: Array) -> tuple[Array, Array, Array]:
+    """The same for points (n, 2) ascending in x of which nothing is known."""
     half = len(cloud) // 2
     step = cloud[half:] - cloud[: len(cloud) - half]
     angle = _median(np.arctan2(step[:, 1], step[:, 0]))
     residual = cloud @ np.array([-np.sin(angle), np.cos(angle)])
-    return np.array([np.cos(angle), np.sin(angle)]), residual - _median(residual)
+    residual -= _median(residual)
+    scatter = np.full(len(cloud), MAD * _median(np.abs(residual)) + SMALLEST_M)
+    return np.array([np.cos(angle), np.sin(angle)]), residual, scatter
 
 
 def _median(values: Array) -> float:

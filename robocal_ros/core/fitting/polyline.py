@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import ResidualError, TooFewSamplesError
-from robocal_ros.core.fitting.profile_noise import local_noise
+from robocal_ros.core.errors import ResidualError
+from robocal_ros.core.fitting.profile_noise import ordered
 from robocal_ros.core.fitting.surfaces import SurfaceRule, off_chord, split, surfaces
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-
-FEWEST_POINTS = 20
 
 
 @dataclass(frozen=True)
@@ -74,14 +72,8 @@ def fit_corners(points: Array, rule: CornerRule) -> CornerFit:
         where surfaces end without one.
     """
     rows = points[np.all(np.isfinite(points), axis=1)]
-    if len(rows) < FEWEST_POINTS:
-        raise TooFewSamplesError(
-            f"{len(rows)} points give no corners: at least {FEWEST_POINTS} are needed; check the "
-            "exposure and that the target is in range"
-        )
+    profile, noise = ordered(rows, "corners")
     backwards = rows[-1, 0] < rows[0, 0]
-    profile = rows[np.argsort(rows[:, 0], kind="stable")]
-    noise = local_noise(profile[:, 1])
     found = (_classic if rule.classic else _best)(profile, noise, rule)
     if backwards:
         found = CornerFit(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import ResidualError, TooFewSamplesError
+from robocal_ros.core.fitting.profile_noise import MAD
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,6 @@ _REACH = 1.5  # radii between the points of a triple
 _NEAR_M = 3e-4  # a start is judged by the points so near to it
 _ROUNDS = 12
 _REJECT = 3.5  # standard deviations
-_MAD = 1.4826  # standard deviation of a normal by its median absolute deviation
 _CLOSE_M = 1e-8
 
 
@@ -170,7 +170,7 @@ def _refine(cloud: Array, centre: Array, rule: SphereRule) -> tuple[Array, NDArr
         if np.array_equal(before, near) and float(np.linalg.norm(step)) < _CLOSE_M:
             break
         # Its own scatter, about the median: a wrong radius shifts all of them.
-        spread = _MAD * float(np.median(np.abs(miss[near] - np.median(miss[near]))))
+        spread = MAD * float(np.median(np.abs(miss[near] - np.median(miss[near]))))
         limit = min(limit, _REJECT * spread + abs(float(np.median(miss[near]))) + _CLOSE_M)
     return centre, near
 

@@ -9,16 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from robocal_ros.core.fitting.flank import Flank, angle_between, fit_flank, intersection
+from robocal_ros.core.fitting.profile_noise import smoothed
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _SPLIT = 8.0  # standard deviations of a point
 _SPLIT_COLUMNS = 3.0  # a corner lies between two columns
-_SMOOTHED = 5  # columns
 _OVERLAP = 5.0  # columns by which pieces may pass their corner
 _GAP = 5.0  # columns
 _ON_LINE = 0.8  # share of the points of two pieces that are one
@@ -100,9 +99,7 @@ def off_chord(noise: float, spacing: float) -> float:
 
 def split(profile: Array, threshold: float) -> Rows:
     """Rows (v,) at which a profile (n, 2), ascending in x, is split; its ends are among them."""
-    smooth = np.column_stack(
-        [profile[:, 0], median_filter(profile[:, 1], _SMOOTHED, mode="nearest")]
-    )
+    smooth = smoothed(profile)
     vertices = [0, len(smooth) - 1]
     pieces = [(0, len(smooth) - 1)]
     while pieces:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError, RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.hand_eye.mistakes import explain, undone
-from robocal_ros.core.hand_eye.mount_fit import distances, first_look
+from robocal_ros.core.hand_eye.mount_fit import first_look, misfit
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.tasks import HandEyeData, Read, Task
@@ -21,8 +21,28 @@ SHOWN = 0.5  # of the profiles
 WRONG_M = 2e-3  # the same, from which something is wrong, whatever it is
 
 
-def read_and_look(task: Task, data: HandEyeData) -> tuple[Read, MountState]:
-    """Features of the profiles, and a state near the solution.
+def features(task: Task, data: HandEyeData) -> Read:
+    """Features of the profiles.
+
+    Raises
+    ------
+    ResidualError
+        When poses must tell which feature is which, and do not: with the mistake that explains it.
+    RobocalError
+        When too little is seen.
+    """
+    try:
+        return task.read(data)
+    except InputError:
+        raise
+    except RobocalError as error:
+        if task.read_by_poses:
+            _name_mistake(task, data, None, np.inf, error)
+        raise
+
+
+def looked(task: Task, data: HandEyeData, read: Read) -> MountState:
+    """A state near the solution.
 
     Raises
     ------
@@ -32,28 +52,20 @@ def read_and_look(task: Task, data: HandEyeData) -> tuple[Read, MountState]:
         When too little is seen, or the poses leave a direction open.
     """
     try:
-        read = task.read(data)
-    except InputError:
-        raise
-    except RobocalError as error:
-        if task.read_by_poses:
-            _name_mistake(task, data, None, np.inf, error)
-        raise
-    try:
         near = look(task, read.view)
     except RobocalError as error:
         _name_mistake(task, data, read, np.inf, error)
         raise
-    as_given = misfit(read.view, near) if _shown(read.view, data) else np.inf
+    as_given = misfit((read.view,), near) if _shown(read.view, data) else np.inf
     if as_given > DOUBTFUL_M:
         _name_mistake(task, data, read, as_given, None)
     if as_given > WRONG_M:
-        off = f"samples are off by {misfit(read.view, near) * 1e3:.3g} mm"
+        off = f"samples are off by {misfit((read.view,), near) * 1e3:.3g} mm"
         raise ResidualError(
             f"{off} or do not show the target where it must be, and no common mistake explains it: "
             "has the target moved, are poses and profiles of the same run, is it the right target?"
         )
-    return read, near
+    return near
 
 
 def _shown(view: View, data: HandEyeData) -> bool:
@@ -81,12 +93,7 @@ def look(task: Task, view: View) -> MountState:
                 break  # it lies in the poses, not in the start
     if not states:
         raise failure or RobocalError("no start was found")
-    return min(states, key=lambda state: misfit(view, state))
-
-
-def misfit(view: View, state: MountState) -> float:
-    """Median distance of sightings from their target, m."""
-    return float(np.median(distances((view,), state)))
+    return min(states, key=lambda state: misfit((view,), state))
 
 
 def _name_mistake(
@@ -98,9 +105,9 @@ def _name_mistake(
         if not _shown(view, data):
             return np.inf
         first = task.starts(view)[0]
-        if (off := misfit(view, first)) > as_given:  # not worth following
+        if (off := misfit((view,), first)) > as_given:  # not worth following
             return off
-        return misfit(view, first_look((view,), first))
+        return misfit((view,), first_look((view,), first))
 
     def with_poses(T_base_flange: Array) -> float:
         other = replace(data, T_base_flange=T_base_flange)

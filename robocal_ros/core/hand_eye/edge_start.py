@@ -9,7 +9,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
 from robocal_ros.core.estimation import solve
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
-from robocal_ros.core.hand_eye.sightings import Sightings
+from robocal_ros.core.hand_eye.sightings import Sightings, in_plane
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def robust_corners(value: Array, p_flange: Array) -> Array:
 
 def _closed(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Closed forms X (..., 4, 4) of corners (..., m, 3), and whether these show them at all."""
-    own = np.stack([value[..., 0], np.zeros(value.shape[:-1]), value[..., 1]], axis=-1)
+    own = in_plane(value)
     middle, there = own.mean(axis=-2, keepdims=True), p_flange.mean(axis=-2, keepdims=True)
     s = np.linalg.svd(own - middle, compute_uv=False)
     R = frames.nearest_rotation(np.swapaxes(p_flange - there, -1, -2) @ (own - middle))
@@ -79,8 +79,7 @@ def _closed(value: Array, p_flange: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 def _miss(X: Array, value: Array, p_flange: Array) -> Array:
     """Distances (..., m) of corners that poses (..., 4, 4) put into the flange frame."""
-    own = np.column_stack([value[:, 0], np.zeros(len(value)), value[:, 1]])
-    found = own @ np.swapaxes(X[..., :3, :3], -1, -2) + X[..., None, :3, 3]
+    found = in_plane(value) @ np.swapaxes(X[..., :3, :3], -1, -2) + X[..., None, :3, 3]
     return np.asarray(np.linalg.norm(found - p_flange, axis=-1))
 
 
@@ -121,8 +120,7 @@ def _random_rotations(count: int, rng: np.random.Generator) -> Array:
 def _turned(sightings: Sightings, turns: Array) -> Array:
     """Features (p, m, 3) in base with rotations (p, 3, 3) of a sensor at the flange's origin."""
     R, place = sightings.T_base_flange[:, :3, :3], sightings.T_base_flange[:, :3, 3]
-    own = np.column_stack([sightings.value[:, 0], np.zeros(len(place)), sightings.value[:, 1]])
-    flange = own @ np.swapaxes(turns, 1, 2)
+    flange = in_plane(sightings.value) @ np.swapaxes(turns, 1, 2)
     return np.asarray((R @ flange[..., None])[..., 0] + place)
 
 
@@ -147,8 +145,14 @@ def _held(
 
 
 def least_distances(view: View, near: MountState) -> MountState:
-    """Classic: the sum of squared distances from the line, every feature alike."""
+    """Classic: the sum of squared distances from the line, every feature alike.
+
+    Raises
+    ------
+    RankDeficientError
+        When the poses leave a direction open.
+    """
     plain = np.tile(ALIKE_M**2 * np.eye(3), (len(view.sightings.names), 1, 1))
     alike = View(view.model, replace(view.sightings, covariance=plain))
     problem = MountProblem((alike,), PoseNoise(0.0, 0.0), near)
-    return solve(problem, near, robust=False, sizes=problem.sizes).state
+    return solve(problem, near, robust=False, sizes=problem.sizes).settled()

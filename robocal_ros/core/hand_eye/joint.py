@@ -11,7 +11,7 @@ from robocal_ros.core.errors import (
     RobocalError,
     TooFewSamplesError,
 )
-from robocal_ros.core.hand_eye.diagnosis import read_and_look
+from robocal_ros.core.hand_eye.diagnosis import features, looked
 from robocal_ros.core.hand_eye.mount_fit import fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import MountState
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
@@ -55,9 +55,7 @@ def solve_joint(
     ]
     fit = fit_mount(views, MountState(X.T_flange_sensor, tuple(places)), settings.noise())
     require_radius(fit)
-    require_seen(
-        fit, float(np.abs(np.concatenate([v.sightings.value[:, 1] for v in views])).mean())
-    )
+    require_seen(fit)
     tasks = [task for task, _ in parts]
     result = result_of(tasks, fit, reads, _data(parts), settings)
     if not checks:
@@ -88,10 +86,11 @@ def _held_out(
 
 def _alone(task: Task, data: HandEyeData) -> tuple[Read, MountState | RobocalError]:
     """Features of one target, and where they lead alone, or why nowhere: others may show more."""
+    read = features(task, data)
     try:
-        return read_and_look(task, data)
+        return read, looked(task, data, read)
     except (TooFewSamplesError, RankDeficientError) as error:
-        return task.read(data), error
+        return read, error
 
 
 def _first(

@@ -9,7 +9,8 @@ Array = NDArray[np.float64]
 
 OFF_EQUATOR = 0.55  # of the radius: where a laser plane tells the side and the height of a sphere
 BEHIND = 0.7  # of the radius: how far the centre lies behind the arc that is seen
-ROUNDS = 20
+MOST_ROUNDS = 100  # the best centres settle in a handful
+SETTLED_M = 1e-6
 
 
 def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tuple[Array, Array]:
@@ -17,8 +18,9 @@ def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tup
 
     A laser plane passes a sphere on one of two sides. From each side of each pose the centre goes
     to where the others agree best: iteratively reweighted least squares with Cauchy's weights, so
-    that a pose which looks elsewhere does not count; each pose on the side that is nearer. Lengths
-    in the sensor frame are in terms of how far the sphere may be off and still be seen.
+    that a pose which looks elsewhere hardly counts; each pose on the side that is nearer. Lengths
+    in the sensor frame are in terms of how far the sphere may be off and still be seen. The centre
+    is rough, to some mm: nobody lays the light where a sphere is best seen.
     """
     R, origin = T_base_sensor[:, :3, :3], T_base_sensor[:, :3, 3]
     off = OFF_EQUATOR * radius_m
@@ -32,14 +34,16 @@ def looked_at(T_base_sensor: Array, radius_m: float, sensor: SensorRange) -> tup
     middle_m = sensor.middle_m + BEHIND * radius_m  # its surface is seen, not its centre
     starts = np.array([[0.0, side * off, middle_m] for side in (-1.0, 1.0)])
     centres = (np.einsum("mij,sj->smi", R, starts) + origin).reshape(-1, 3)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         miss, at = _misses(R, origin, centres, off, middle_m, allowed)
         weight = 1.0 / (1.0 + np.sum(miss**2, axis=2))
         precision = np.einsum("mij,j,mkj->mik", R, allowed**-2.0, R)
         wanted = origin + np.einsum("mij,pmj->pmi", R, at)
         A = np.einsum("pm,mik->pik", weight, precision)
         b = np.einsum("pm,mik,pmk->pi", weight, precision, wanted)
-        centres = np.linalg.solve(A, b[..., None])[..., 0]
+        before, centres = centres, np.linalg.solve(A, b[..., None])[..., 0]
+        if np.abs(centres - before).max() < SETTLED_M:
+            break
     miss, _ = _misses(R, origin, centres, off, middle_m, allowed)
     return centres, np.sum(np.log1p(np.sum(miss**2, axis=2)), axis=1)
 

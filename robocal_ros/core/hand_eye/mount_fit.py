@@ -1,12 +1,12 @@
 """Maximum likelihood of a mount: robust, with the robot's own error found where none is given."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import RankDeficientError, RobocalError
+from robocal_ros.core.errors import RankDeficientError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.hand_eye.mount_problem import (
     MountProblem,
@@ -31,6 +31,9 @@ POSE_NUMBERS = 6
 CALM_M = 1e-4  # and rad at 1 m: the noise of a good robot, to tell poses from noise
 LEAST_AIM = 1  # so that four poses suffice to tell how well the eye aims
 SETTLED = 0.02  # relative change of the noise, and of the state in standard deviations
+UNSETTLED = (
+    f"mount and noise of the poses had not settled after {ROUNDS} rounds: measure more often"
+)
 OPEN_M = 0.02  # expected error of a direction from which it counts as not seen
 
 
@@ -44,6 +47,7 @@ class MountFit:
     state, covariance : (k, k) of the problem's unknowns; scale: how far the misfit widened it.
     noise : of reported poses, given or found.
     rejected : names of sightings not used, with the reason.
+    creeping : why this is no solution, in words; empty where it is one.
     """
 
     views: tuple[View, ...]
@@ -68,6 +72,11 @@ def distances(views: tuple[View, ...], state: MountState) -> Array:
     """Distance of each sighting from its target, m."""
     pairs = zip(views, state.places, strict=True)
     return np.concatenate([_distance(view, state, place) for view, place in pairs])
+
+
+def misfit(views: tuple[View, ...], state: MountState) -> float:
+    """Median distance of sightings from their target, m."""
+    return float(np.median(distances(views, state)))
 
 
 def _distance(view: View, state: MountState, place: Array) -> Array:
@@ -96,10 +105,10 @@ def fit_mount(
     found = FIRST_NOISE if noise is None else replace(noise, aim_m=FIRST_NOISE.aim_m)
     poses = np.concatenate([view.sightings.pose for view in views])
     if len(np.unique(poses)) < len(poses):  # one sighting of a profile may be wrong, not all of it
-        estimate, wrong, found = _settle(views, state, found, noise, together=False)
+        estimate, wrong, found, _ = _settle(views, state, found, noise, together=False)
         state = estimate.state
         views = without(views, wrong, rejected)
-    estimate, wrong, found = _settle(views, state, found, noise, together=True)
+    estimate, wrong, found, settled = _settle(views, state, found, noise, together=True)
     views = without(views, wrong, rejected)
     last = MountProblem(views, found, estimate.state)
     return MountFit(
@@ -109,7 +118,7 @@ def fit_mount(
         estimate.scale,
         found,
         rejected,
-        estimate.creeping,
+        estimate.creeping or ("" if settled else UNSETTLED),
     )
 
 
@@ -120,8 +129,8 @@ def first_look(views: tuple[View, ...], start: MountState) -> MountState:
     """
     state = start
     for _ in range(LOOKS):
-        off = float(np.median(distances(views, state)))
-        noise = PoseNoise(max(off, FIRST_NOISE.sigma_m), FIRST_NOISE.sigma_rad, FIRST_NOISE.aim_m)
+        off = max(misfit(views, state), FIRST_NOISE.sigma_m)
+        noise = PoseNoise(off, FIRST_NOISE.sigma_rad, FIRST_NOISE.aim_m)
         problem = MountProblem(views, noise, state, together=False)
         state = _solved(problem, state).state
     return state
@@ -133,8 +142,11 @@ def _settle(
     noise: PoseNoise,
     given: PoseNoise | None,
     together: bool,
-) -> tuple[Estimate[MountState], NDArray[np.bool_], PoseNoise]:
-    """Solve, take weights and noise anew, until both stay: which sightings (m,) are wrong, too."""
+) -> tuple[Estimate[MountState], NDArray[np.bool_], PoseNoise, bool]:
+    """Solve, take weights and noise anew, until both stay; whether they do is told last.
+
+    Which sightings (m,) are wrong, too.
+    """
     for _ in range(ROUNDS):
         problem = MountProblem(views, noise, state, together)
         estimate = _solved(
@@ -142,13 +154,12 @@ def _settle(
         )
         away = _away(problem.pivot, state, estimate)
         state, before = estimate.state, noise
-        noise = restricted_noise(problem, state, ~estimate.rejected, given)
+        noise, sure = restricted_noise(problem, state, ~estimate.rejected, given)
         change = np.log([noise.sigma_m / before.sigma_m, noise.aim_m / before.aim_m])
-        if away < SETTLED and np.max(np.abs(change)) < SETTLED:
+        settled = sure and away < SETTLED and bool(np.max(np.abs(change)) < SETTLED)
+        if settled:
             break
-    else:
-        estimate = replace(estimate, converged=False)
-    return estimate, estimate.rejected[problem.sample], noise
+    return estimate, estimate.rejected[problem.sample], noise, settled
 
 
 def _away(pivot: Array, before: MountState, estimate: Estimate[MountState]) -> float:
@@ -209,10 +220,10 @@ def refuse_open(words: list[str]) -> RankDeficientError:
     return RankDeficientError(f"not determined: {joined(words)}", words)
 
 
-def require_seen(fit: MountFit, reach_m: float) -> None:
+def require_seen(fit: MountFit) -> None:
     """Refuse a direction that the poses, even of a good robot, show no better than `OPEN_M`.
 
-    ``reach_m``: distance at which turns count.
+    Turns count at the distance at which the targets were seen.
 
     Raises
     ------
@@ -224,9 +235,9 @@ def require_seen(fit: MountFit, reach_m: float) -> None:
     calm = replace(calm, sigma_rad=min(calm.sigma_rad, CALM_M))
     problem = MountProblem(fit.views, calm, fit.state)
     J = problem.linearise(fit.state)[1].reshape(-1, len(problem.names))
-    prior = problem.prior()
-    covariance = np.asarray(np.linalg.pinv(J.T @ J + (0.0 if prior is None else prior)))
-    words = open_directions(at_origin(covariance[:6, :6], problem.pivot), reach_m, T)
+    covariance = np.asarray(np.linalg.pinv(J.T @ J + problem.prior()))
+    reach_m = np.abs(np.concatenate([view.sightings.value[:, 1] for view in fit.views])).mean()
+    words = open_directions(at_origin(covariance[:6, :6], problem.pivot), float(reach_m), T)
     if words:
         raise refuse_open(words)
 
@@ -256,36 +267,3 @@ def without(
         }
         kept.append(view.take(~out))
     return tuple(kept)
-
-
-def solved_again(fit: MountFit) -> Callable[[tuple[View, ...]], MountState]:
-    """How the mount is found from part of the views of a fit: nothing is rejected any more."""
-
-    def again(views: tuple[View, ...]) -> MountState:
-        part = MountProblem(views, fit.noise, fit.state)
-        return solve(
-            part, fit.state, prior_information=part.prior(), robust=False, sizes=part.sizes
-        ).state
-
-    return again
-
-
-def leave_one_out(
-    views: tuple[View, ...], solved: Callable[[tuple[View, ...]], MountState]
-) -> Array | None:
-    """Distance of each sighting from what is ``solved`` without its pose, m.
-
-    None where the rest does not suffice.
-    """
-    sample = np.concatenate([view.sightings.pose for view in views])
-    own = np.zeros(len(sample))
-    for pose in np.unique(sample):
-        out = sample == pose
-        rest = without(views, out, {})
-        if any(len(view.sightings.names) == 0 for view in rest):
-            return None  # a target that only this pose saw
-        try:
-            own[out] = distances(views, solved(rest))[out]
-        except RobocalError:
-            return None
-    return own

@@ -196,15 +196,15 @@ class MountProblem:
             [np.zeros(len(SENSOR_UNKNOWNS)), *(v.model.deviation(place) for v, place in pairs)]
         )
 
-    def prior(self) -> Array | None:
-        """Information (k, k) about the unknowns beforehand; None where nothing is known."""
+    def prior(self) -> Array:
+        """Information (k, k) about the unknowns beforehand; zero where nothing is known."""
         k, first = len(self.names), len(SENSOR_UNKNOWNS)
         information = np.zeros((k, k))
         for view in self.views:
             own = len(view.model.names)
             information[first : first + own, first : first + own] = view.model.prior
             first += own
-        return information if np.any(information) else None
+        return information
 
 
 def pivot_of(views: tuple[View, ...]) -> Array:

@@ -12,6 +12,7 @@ from robocal_ros.core.hand_eye.look_point import OFF_EQUATOR, looked_at
 from robocal_ros.core.hand_eye.mount_problem import View
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.hand_eye.sightings import Seen, Sightings, TargetModel, same_pose
+from robocal_ros.core.hand_eye.sphere_start import FEWEST_PROFILES
 from robocal_ros.core.hand_eye.step_task import StepTask, require_marks
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import StepTarget
@@ -77,7 +78,7 @@ class PlannedSphere:
     radius_m: float
     sensor: SensorRange
     centre: tuple[float, float, float] | None = None
-    fewest: int = 5
+    fewest: int = field(default=FEWEST_PROFILES, init=False)
 
     def place(self, T_base_sensor: Array) -> Array:
         """Its centre."""
@@ -212,23 +213,24 @@ class PlannedStep:
         return known[:1] if self.marks is None else known
 
     def unseen(self, view: View) -> dict[int, str]:
-        """Poses that see less than two corners."""
+        """Poses that see less than two corners, or not the only one of a mark."""
         x, z, _ = view.sightings.value.T
         found: dict[int, str] = {}
         out = _out_of_range(x, z, np.zeros_like(z), self.sensor)
         for pose in np.unique(view.sightings.shot):
             rows = np.flatnonzero(view.sightings.shot == pose)
-            if sum(int(row) not in out for row in rows) < 2:
+            if sum(int(row) not in out for row in rows) < min(2, len(rows)):
                 found[int(pose)] = next(out[int(row)] for row in rows if int(row) in out)
         return found
 
     def candidates(self, T_base_sensor: Array, place: Array) -> Array:
         """Light through the marks: tilted about their line, and within the plane of the light."""
         every = [self.target.corners[mark] for mark in self._known()]
-        along = place[:3, :3] @ (every[0][-1] - every[0][0])
-        along /= np.linalg.norm(along)
         mean = frames.nearest_rotation(T_base_sensor[:, :3, :3].mean(axis=0))
-        x = along * np.sign(along @ mean[:, 0])
+        x = mean[:, 0]
+        if len(every[0]) > 1:  # a corner alone lies on no line
+            along = place[:3, :3] @ (every[0][-1] - every[0][0])
+            x = along / np.linalg.norm(along) * np.sign(along @ x)
         y = mean[:, 1] - x * (x @ mean[:, 1])
         y /= np.linalg.norm(y)
         level = np.column_stack([x, y, np.cross(x, y)])

@@ -17,12 +17,12 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import OPEN_M, open_directions
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View
 from robocal_ros.core.hand_eye.naming import joined
-from robocal_ros.core.hand_eye.quality import expected_error_m
+from robocal_ros.core.hand_eye.quality import expected_error_m, expected_errors_m
 from robocal_ros.core.hand_eye.result import at_origin
 
 Array = NDArray[np.float64]
 
-VAGUE_M, VAGUE_RAD = 1.0, 1.0  # what is known of a mount without any measurement
+VAGUE = 1.0  # m, rad: what is known without any measurement; an open direction has a large error
 MOST_PROPOSED = 12
 SPARE_POSES = 2  # beyond the fewest, so that one may be lost
 
@@ -86,7 +86,8 @@ class PlanReport:
         words.
     sigma : (6,) expected, sensor axes: m, rad; working_error_m: rms at the working distance.
     unseen : poses (by index) that do not see the target, with the reason.
-    proposed : (n, 4, 4) flange poses to add, best first; proposed_error_m: with all of them.
+    proposed : (n, 4, 4) flange poses to add, best first; proposed_error_m: with all of them, None
+        where there is none.
     """
 
     rank: int
@@ -161,37 +162,16 @@ def _shown(view: View, state: MountState, noise: PoseNoise, sensor: SensorRange)
     k = 6 + len(view.model.names)
     if not view.sightings.names:
         return _Shown(0, np.zeros((k, k)), None, ["no pose sees the target"])
-    J = _samples(view, state, noise, sensor)[1].reshape(-1, k)
-    information = J.T @ J + _prior(view)
-    covariance = np.asarray(np.linalg.inv(information + _vague(k)))
+    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
+    J = problem.linearise(state)[1].reshape(-1, k)
+    information = J.T @ J + problem.prior()
+    covariance = np.asarray(np.linalg.inv(information + VAGUE**-2 * np.eye(k)))
     size = np.ones(k)
     size[3:6] = sensor.middle_m
     rank = int(np.sum(np.linalg.eigvalsh(covariance * np.outer(size, size)) < OPEN_M**2))
     at_sensor = at_origin(covariance[:6, :6], sensor.pivot)
     words = open_directions(at_sensor, sensor.middle_m, view.sightings.T_base_flange)
     return _Shown(rank, information, None if words else covariance, words)
-
-
-def _vague(unknowns: int) -> Array:
-    """Information (k, k) of a guess, which makes of an open direction a large error."""
-    of_target = np.full(unknowns - 6, 1.0)
-    return np.diag(np.concatenate([np.repeat([VAGUE_M, VAGUE_RAD], 3) ** -2.0, of_target]))
-
-
-def _samples(
-    view: View, state: MountState, noise: PoseNoise, sensor: SensorRange
-) -> tuple[NDArray[np.int64], Array]:
-    """Poses (g,) that have sightings, and the whitened Jacobian (g, c, k) of each."""
-    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
-    return problem.poses, problem.linearise(state)[1]
-
-
-def _prior(view: View) -> Array:
-    """Information (k, k) about the target beforehand."""
-    k = len(view.model.names)
-    prior = np.zeros((6 + k, 6 + k))
-    prior[6:, 6:] = view.model.prior
-    return prior
 
 
 def _verdict(
@@ -218,33 +198,29 @@ def _propose(
     state: MountState,
     known: tuple[Array, PoseNoise, SensorRange, float],
     seen: int,
-) -> tuple[Array, float]:
+) -> tuple[Array, float | None]:
     """Add, one by one, the candidate that lowers the expected error most, until they will do."""
     information, noise, sensor, limit_m = known
     X, place = state.T_flange_sensor, state.places[0]
     candidates = target.candidates(T_base_flange @ X, place)
     view = target.view(candidates @ frames.invert(X), X, place)
-    poses, J = _samples(view, state, noise, sensor)
+    problem = MountProblem((view,), noise, state, pivot=sensor.pivot)
+    J = problem.linearise(state)[1]
     gain = np.zeros((len(candidates), *information.shape))
-    gain[poses] = np.swapaxes(J, 1, 2) @ J
+    gain[problem.poses] = np.swapaxes(J, 1, 2) @ J
     gain[list(target.unseen(view))] = 0.0
-    total = information + _vague(len(information))
+    total = information + VAGUE**-2 * np.eye(len(information))
     chosen: list[int] = []
     error = np.inf
     wanted = target.fewest + SPARE_POSES - seen
-    while len(chosen) < MOST_PROPOSED and (error > limit_m or len(chosen) < wanted):
+    while np.any(gain) and len(chosen) < MOST_PROPOSED:
+        if error <= limit_m and len(chosen) >= wanted:
+            break
         covariance = np.asarray(np.linalg.inv(total + gain)[:, :6, :6])
-        errors = _errors(covariance, sensor.field_points - sensor.pivot)
+        errors = expected_errors_m(covariance, sensor.field_points - sensor.pivot)
         best = int(np.argmin(errors))
         error = float(errors[best])
         total = total + gain[best]
         gain[best] = 0.0  # once: the same pose again shows the same error again
         chosen.append(best)
-    return candidates[chosen] @ frames.invert(X), error
-
-
-def _errors(covariance: Array, points: Array) -> Array:
-    """`expected_error_m` for many covariances (n, 6, 6)."""
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
-    spread = np.einsum("pij,njk,pik->np", J, covariance, J)
-    return np.asarray(np.sqrt(spread.mean(axis=1)))
+    return candidates[chosen] @ frames.invert(X), error if chosen else None

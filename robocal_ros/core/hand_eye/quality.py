@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_fit import MountFit, noise_numbers
 from robocal_ros.core.hand_eye.mount_problem import MountProblem, PoseNoise
+from robocal_ros.core.hand_eye.result import point_jacobian, shots_of
 
 Array = NDArray[np.float64]
 
@@ -62,9 +62,14 @@ def field_points(profiles: Sequence[Array]) -> Array:
 
 def expected_error_m(covariance: Array, points: Array) -> float:
     """Root mean square error of points (n, 3), counted from the pivot of a covariance (6, 6)."""
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], 2)
-    spread = J @ covariance @ np.swapaxes(J, 1, 2)
-    return float(np.sqrt(np.trace(spread, axis1=1, axis2=2).mean()))
+    return float(expected_errors_m(covariance, points))
+
+
+def expected_errors_m(covariance: Array, points: Array) -> Array:
+    """`expected_error_m` (...) for many covariances (..., 6, 6)."""
+    J = point_jacobian(points)
+    spread = J @ covariance[..., None, :, :] @ np.swapaxes(J, 1, 2)
+    return np.asarray(np.sqrt(np.trace(spread, axis1=-2, axis2=-1).mean(axis=-1)))
 
 
 def apart(T_one: Array, T_other: Array, points: Array) -> float:
@@ -147,9 +152,8 @@ def _inconsistent(fit: MountFit) -> Verdict | None:
         )
         words += " moved, does the robot repeat, are the poses those of the profiles?"
         return Verdict(Code.RESIDUAL_TOO_LARGE, words)
-    misfits = {name.partition("/")[0] for name in fit.rejected}
     wrong = len(fit.rejected)
-    if wrong > MOST_MISFITS * (wrong + len(fit.names)) and len(misfits) > 1:
+    if wrong > MOST_MISFITS * (wrong + len(fit.names)) and len(shots_of(fit.rejected)) > 1:
         words = f"{wrong} of {wrong + len(fit.names)} features do not fit the others: see the "
         return Verdict(Code.RESIDUAL_TOO_LARGE, f"{words}rejected ones")
     return None

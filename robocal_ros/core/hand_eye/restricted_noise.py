@@ -37,8 +37,7 @@ class RestrictedLikelihood:
         self.unknown += ["aim_m"] if np.any(G[..., 6:]) else []
         self._own, self._noise = C, problem.noise
         self._all = np.concatenate([r[..., None], J, G], axis=2)
-        prior, k = problem.prior(), J.shape[2]
-        self._known = np.zeros((k, k)) if prior is None else prior
+        self._known = problem.prior()
         self._pull = self._known @ problem.deviation(state)
 
     @property
@@ -83,25 +82,28 @@ class RestrictedLikelihood:
 
 def restricted_noise(
     problem: MountProblem, state: MountState, keep: NDArray[np.bool_], given: PoseNoise | None
-) -> PoseNoise:
+) -> tuple[PoseNoise, bool]:
     """The most likely noise of poses, unless it is ``given``, and of light that is laid by eye.
 
-    ``keep`` (g,): samples that are used.
+    ``keep`` (g,): samples that are used. The flag: whether the likelihood's top was reached.
     """
     from scipy.optimize import minimize
 
     likely = RestrictedLikelihood(problem, state, keep, given)
     if not likely.unknown:
-        return problem.noise
+        return problem.noise, True
+    low, high = np.log(NOISE_RANGE_M)
     best = minimize(
         likely.with_slope,
         likely.now,
         jac=True,
         method="L-BFGS-B",
-        bounds=[tuple(np.log(NOISE_RANGE_M))] * len(likely.unknown),
+        bounds=[(low, high)] * len(likely.unknown),
         options={"gtol": FLAT},
     )
-    return likely.noise(best.x)
+    # The search also ends, and well by its own account, where no step of it lowers the cost.
+    downhill = np.clip(best.x - best.jac, low, high) - best.x
+    return likely.noise(best.x), bool(np.max(np.abs(downhill)) <= FLAT)
 
 
 def averaged_covariance(problem: MountProblem, state: MountState, given: PoseNoise | None) -> Array:

@@ -1,7 +1,7 @@
 """The outcome of a hand-eye calibration, whatever the target."""
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -78,6 +78,13 @@ def at_origin(covariance: Array, pivot: Array) -> Array:
     return np.asarray(move @ covariance @ move.T)
 
 
+def point_jacobian(points: Array) -> Array:
+    """How points (n, 3), counted from the pivot, move with an increment: (n, 3, 6)."""
+    return np.concatenate(
+        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(points)], axis=2
+    )
+
+
 def point_covariance(result: HandEyeResult, points: Array) -> Array:
     """Covariance (n, 3, 3), m^2, sensor axes, of sensor points (n, 3) once they are in the flange.
 
@@ -88,8 +95,7 @@ def point_covariance(result: HandEyeResult, points: Array) -> Array:
     """
     if result.covariance is None:
         raise ValueError("a method without a covariance")
-    away = points - result.pivot
-    J = np.concatenate([np.broadcast_to(np.eye(3), (len(points), 3, 3)), -frames.skew(away)], 2)
+    J = point_jacobian(points - result.pivot)
     return np.asarray(J @ result.covariance @ np.swapaxes(J, 1, 2))
 
 
@@ -138,7 +144,7 @@ def hand_eye_document(result: HandEyeResult) -> Document:
 
 def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, str]:
     """Reasons by name; a shot that has no corner among the samples used stands there once."""
-    used = {_shots_alone(name) for name in samples}
+    used = shots_of(samples)
     found: dict[str, list[str]] = {}
     for name, why in rejected.items():
         shot = _shots_alone(name)
@@ -147,6 +153,11 @@ def by_shot(rejected: Mapping[str, str], samples: Collection[str]) -> dict[str, 
         else:
             found.setdefault(shot, []).append(_shots_alone(why))
     return {name: max(reasons, key=reasons.count) for name, reasons in found.items()}
+
+
+def shots_of(names: Iterable[str]) -> set[str]:
+    """Names of the shots that samples are named after: several corners may be of one."""
+    return {_shots_alone(name) for name in names}
 
 
 def _shots_alone(words: str) -> str:

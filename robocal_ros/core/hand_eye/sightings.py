@@ -62,6 +62,11 @@ def same_pose(T_base_flange: Array) -> Index:
     return np.asarray(np.argmax(np.all(np.abs(apart) < SAME, axis=(2, 3)), axis=1))
 
 
+def in_plane(value: Array) -> Array:
+    """Points (..., 3) of the laser plane, sensor frame, from features (..., 3) that begin x, z."""
+    return np.stack([value[..., 0], np.zeros(value.shape[:-1]), value[..., 1]], axis=-1)
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """What a model predicts for m sightings.

@@ -7,16 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.diagnosis import read_and_look
+from robocal_ros.core.hand_eye.diagnosis import features, looked
+from robocal_ros.core.hand_eye.leave_one_out import leave_one_out, solved_again
 from robocal_ros.core.hand_eye.mistakes import swapped
-from robocal_ros.core.hand_eye.mount_fit import (
-    MountFit,
-    distances,
-    fit_mount,
-    leave_one_out,
-    require_seen,
-    solved_again,
-)
+from robocal_ros.core.hand_eye.mount_fit import MountFit, distances, fit_mount, require_seen
 from robocal_ros.core.hand_eye.mount_problem import View, pivot_of
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.quality import (
@@ -79,10 +73,10 @@ def solve_task(
     InputError
         A mark that the target does not have.
     """
-    read, near = read_and_look(task, data)
-    fit = fit_mount((read.view,), near, settings.noise())
+    read = features(task, data)
+    fit = fit_mount((read.view,), looked(task, data, read), settings.noise())
     require_radius(fit)
-    require_seen(fit, float(np.abs(read.view.sightings.value[:, 1]).mean()))
+    require_seen(fit)
     if method == "classic":
         return _classic(task, read, fit, data, settings)
     return result_of([task], fit, [read], data, settings)

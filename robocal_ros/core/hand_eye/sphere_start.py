@@ -54,8 +54,7 @@ def _placed(T_base_flange: Array, turn: Array, centres: Array) -> tuple[Array, A
 def _misses(T_base_flange: Array, X: Array, place: Array, centres: Array) -> Array:
     """Distances (p, m) of centres (p, m, 3), put into base, from each sphere (p, 3)."""
     T = T_base_flange[None] @ X[:, None]
-    base = np.einsum("pmij,pmj->pmi", T[..., :3, :3], centres) + T[..., :3, 3]
-    return np.asarray(np.linalg.norm(base - place[:, None], axis=2))
+    return np.asarray(np.linalg.norm(frames.apply(T, centres) - place[:, None], axis=2))
 
 
 def sphere_starts(sightings: Sightings, radius_m: float) -> list[MountState]:
@@ -117,8 +116,7 @@ def classic_sphere(sightings: Sightings, radius_m: float, near: MountState) -> M
     M, t = linear_mounts(sightings.T_base_flange, centres[None])
     found = frames.transform(frames.nearest_rotation(M[0]), t[0])
     T = sightings.T_base_flange @ found
-    own = np.einsum("mij,mj->mi", T[:, :3, :3], centres) + T[:, :3, 3]
-    return MountState(found, (own.mean(axis=0),))
+    return MountState(found, (frames.apply(T, centres).mean(axis=0),))
 
 
 def agreed_centre(sightings: Sightings, radius_m: float, T_flange_sensor: Array) -> Array:
@@ -127,7 +125,7 @@ def agreed_centre(sightings: Sightings, radius_m: float, T_flange_sensor: Array)
     both = []
     for side in (1.0, -1.0):
         own = circle_centres(sightings.value, radius_m, np.full(len(T), side))
-        both.append(np.einsum("mij,mj->mi", T[:, :3, :3], own) + T[:, :3, 3])
+        both.append(frames.apply(T, own))
     points = np.concatenate(both)
     gap = np.linalg.norm(points[:, None, None] - np.stack(both)[None], axis=3).min(axis=1)
     near = points[int(np.argmin(np.median(gap, axis=1)))]

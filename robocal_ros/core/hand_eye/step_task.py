@@ -14,7 +14,7 @@ from robocal_ros.core.errors import InputError, ResidualError, RobocalError
 from robocal_ros.core.fitting.polyline import CornerFit, CornerRule, fit_corners
 from robocal_ros.core.hand_eye.corner_matching import Match, along, nearest
 from robocal_ros.core.hand_eye.edge_start import closed_corners, robust_corners
-from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look
+from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look, misfit
 from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.sightings import Sightings, same_pose
@@ -54,15 +54,15 @@ class StepTask:
         matches = reader.sure()
         view = reader.view(matches)
         near = self._look(view)
-        if (miss := _miss(view, near)) > TURNED_M:
+        if (miss := misfit((view,), near)) > TURNED_M:
             other = reader.view({name: match.turned for name, match in matches.items()})
             turned = self._look(other)
-            near = turned if _miss(other, turned) < TURNED * miss else near
-        return near
+            near = turned if misfit((other,), turned) < TURNED * miss else near
+        return near.T_flange_sensor
 
-    def _look(self, view: View) -> Array:
+    def _look(self, view: View) -> MountState:
         """Where the closed form leads: alone it may be far off where corners are nearly in line."""
-        return first_look((view,), self.starts(view)[0]).T_flange_sensor
+        return first_look((view,), self.starts(view)[0])
 
     def posed(self, view: View, data: HandEyeData) -> View:
         """Which corner is which depends on the poses."""
@@ -204,23 +204,9 @@ def require_marks(target: StepTarget, marks: Iterable[str]) -> None:
         raise InputError(f"mark '{strange}' is not one of {', '.join(target.corners)}")
 
 
-def _corner_model(view: View) -> CornerModel:
-    if not isinstance(view.model, CornerModel):
-        raise ValueError("a view of corners is needed")
-    return view.model
-
-
 def _in_flange(view: View) -> Array:
     """Marks (m, 3) of a view in the flange frame of their pose."""
-    model = _corner_model(view)
-    T = frames.invert(view.sightings.T_base_flange) @ model.T_base_user
-    return np.asarray(np.einsum("mij,mj->mi", T[:, :3, :3], model.corner_user) + T[:, :3, 3])
-
-
-def _miss(view: View, X: Array) -> float:
-    return float(np.median(_distances(view, X)))
-
-
-def _distances(view: View, X: Array) -> Array:
-    model, s = _corner_model(view), view.sightings
-    return model.distance(s.T_base_flange @ X, model.T_base_user, s.value)
+    if not isinstance(view.model, CornerModel):
+        raise ValueError("a view of corners is needed")
+    T = frames.invert(view.sightings.T_base_flange) @ view.model.T_base_user
+    return frames.apply(T, view.model.corner_user)

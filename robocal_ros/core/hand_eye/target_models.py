@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.sightings import Index, Seen
+from robocal_ros.core.hand_eye.sightings import Index, Seen, in_plane
 
 Array = NDArray[np.float64]
 
@@ -18,12 +18,6 @@ def _in_sensor(T_base_sensor: Array, point: Array) -> Array:
     """Points of the base, (3,) or (m, 3), in each sensor frame (m, 3)."""
     away = point - T_base_sensor[:, :3, 3]
     return np.asarray(np.einsum("mji,mj->mi", T_base_sensor[:, :3, :3], away))
-
-
-def _in_base(T_base_sensor: Array, point: Array) -> Array:
-    """Points (m, 3) of each sensor frame, in base."""
-    turned = np.einsum("mij,mj->mi", T_base_sensor[:, :3, :3], point)
-    return np.asarray(turned + T_base_sensor[:, :3, 3])
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ class SphereModel:
         """Distance of each profile's own sphere centre; its side is the predicted one."""
         side = np.where(_in_sensor(T_base_sensor, place)[:, 1] < 0.0, -1.0, 1.0)
         own = circle_centres(value, self.radius_m, side)
-        return np.asarray(np.linalg.norm(_in_base(T_base_sensor, own) - place, axis=1))
+        return np.asarray(np.linalg.norm(frames.apply(T_base_sensor, own) - place, axis=1))
 
     def take(self, rows: NDArray[np.bool_] | Index) -> "SphereModel":
         """The same for all sightings."""
@@ -136,8 +130,7 @@ class LineModel:
 
     def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
         """Distance of each feature from the line."""
-        own = np.column_stack([value[:, 0], np.zeros(len(value)), value[:, 1]])
-        away = _in_base(T_base_sensor, own) - place[0]
+        away = frames.apply(T_base_sensor, in_plane(value)) - place[0]
         return np.asarray(np.linalg.norm(away - np.outer(away @ place[1], place[1]), axis=1))
 
     def take(self, rows: NDArray[np.bool_] | Index) -> "LineModel":
@@ -222,9 +215,9 @@ class CornerModel:
 
     def distance(self, T_base_sensor: Array, place: Array, value: Array) -> Array:
         """Distance of each corner from its mark."""
-        own = np.column_stack([value[:, 0], np.zeros(len(value)), value[:, 1]])
         corner = self.corner_user @ place[:3, :3].T + place[:3, 3]
-        return np.asarray(np.linalg.norm(_in_base(T_base_sensor, own) - corner, axis=1))
+        base = frames.apply(T_base_sensor, in_plane(value))
+        return np.asarray(np.linalg.norm(base - corner, axis=1))
 
     def take(self, rows: NDArray[np.bool_] | Index) -> "CornerModel":
         """The corners at ``rows``."""

@@ -16,7 +16,12 @@ from robocal_ros.core.hand_eye.mount_problem import MountState, View
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.result import TargetKind
 from robocal_ros.core.hand_eye.sightings import Sightings, TargetModel, same_pose
-from robocal_ros.core.hand_eye.sphere_start import agreed_centre, classic_sphere, sphere_starts
+from robocal_ros.core.hand_eye.sphere_start import (
+    FEWEST_PROFILES,
+    agreed_centre,
+    classic_sphere,
+    sphere_starts,
+)
 from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget
 
@@ -125,7 +130,7 @@ class SphereTask:
 
     target: SphereTarget
     kind: Literal["sphere"] = field(default="sphere", init=False)
-    fewest: int = field(default=5, init=False)
+    fewest: int = field(default=FEWEST_PROFILES, init=False)
     read_by_poses: bool = field(default=False, init=False)
 
     def read(self, data: HandEyeData, T_flange_sensor: Array | None = None) -> Read:

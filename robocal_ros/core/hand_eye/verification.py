@@ -107,6 +107,8 @@ def verify(
     ------
     TooFewSamplesError
         When too few shots show the target.
+    RankDeficientError
+        When they do not tell where it is.
     """
     read = task.read(data)
     start = MountState(T_flange_sensor, (task.placed(read.view, T_flange_sensor),))
@@ -136,19 +138,24 @@ def _verdict(far: Array, lost: int, settings: HandEyeSettings) -> Verdict:
 def fit_place(
     view: View, start: MountState, noise: PoseNoise, rejected: dict[str, str]
 ) -> tuple[View, MountState]:
-    """The target's most likely place with the sensor held; outliers are named in ``rejected``."""
+    """The target's most likely place with the sensor held; outliers are named in ``rejected``.
+
+    Raises
+    ------
+    RankDeficientError
+        When the sightings do not tell it.
+    """
     if not view.model.names:
         return view, start
     problem = MountProblem((view,), noise, start)
-    prior = view.model.prior
     estimate = solve(
         _PlaceProblem(problem),
         start,
-        prior_information=prior if np.any(prior) else None,
+        prior_information=view.model.prior,
         sizes=problem.sizes,
     )
     kept = without((view,), estimate.rejected[problem.sample], rejected)
-    return kept[0], estimate.state
+    return kept[0], estimate.settled()
 
 
 class _PlaceProblem:

@@ -51,7 +51,7 @@ class MeasuringRobot:
     def in_base(self, data: Measurements) -> Array:
         """Measured centres (m, 3) carried to the base, m."""
         T = self.arm.fk(data.q) @ self.T_flange_sensor
-        return np.asarray(np.einsum("mij,mj->mi", T[:, :3, :3], data.position) + T[:, :3, 3])
+        return frames.apply(T, data.position)
 
     def scatter(self, data: Measurements) -> Array:
         """Measured centres less the mean of their sphere (m, 3), m: the centres are refitted."""
