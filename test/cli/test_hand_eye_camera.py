@@ -126,11 +126,38 @@ def test_images_give_the_camera(robocal) -> None:
     assert "no board" in document["rejected_because"]["shot3.png"]
     assert document["intrinsics"]["from_images"]
     assert document["intrinsics"]["fx_px"] == pytest.approx(610.0, rel=5e-3)
-    given = robocal(*images, "--intrinsics", "camera.yaml", "--check", "image_poses.csv")
+    split = ("--poses", "image_used.csv", *images[2:], "--check", "image_check.csv")
+    given = robocal(*split, "--intrinsics", "camera.yaml")
     assert not given["intrinsics"]["from_images"]
     assert given["intrinsics"]["sigma"] is None
     assert near(given)
-    assert given["held_out"]["n"] == 8
+    assert len(given["residual_mm"]["per_sample"]) == 5  # of the six one is blank
+    assert given["held_out"]["n"] == 3
+    assert given["held_out"]["rejected"] == []
+
+
+@pytest.mark.parametrize(
+    ("given", "row", "words"),
+    [
+        (
+            ("--poses", "image_poses.csv", "--images", "images", *BOARD,
+             "--check", "image_check.csv"), 2, "'shot6.png' is in --poses too",
+        ),
+        (
+            ("--poses", "camera_poses.csv", "--measured", "board_poses.csv",
+             "--check", "camera_poses.csv"), 2, "'s0' is in --poses too",
+        ),
+        (
+            ("--poses", "stream_poses.csv", "--measured", "stream_boards.csv",
+             "--check", "stream_poses.csv"), None, "other times must judge",
+        ),
+    ],
+    ids=["images", "poses", "streams"],
+)  # fmt: skip
+def test_what_was_used_does_not_judge(robocal, given, row: int | None, words: str) -> None:
+    error = robocal(*given, status=2)["error"]
+    assert words in error["message"]
+    assert error.get("row") == row
 
 
 @pytest.mark.parametrize(
