@@ -5,6 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from robocal_ros.core import frames
@@ -24,7 +25,11 @@ from robocal_ros.core.hand_eye.board import (
     see_boards,
 )
 from robocal_ros.core.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
-from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form
+from robocal_ros.core.hand_eye.camera_closed_forms import (
+    CLOSED_FORMS,
+    closed_form,
+    closed_form_of_all,
+)
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised, moved
 from robocal_ros.core.hand_eye.camera_quality import left_out
@@ -91,6 +96,34 @@ def test_closed_forms_give_both_placements(name: str, mount: str) -> None:
 def test_a_closed_form_that_fails_says_so() -> None:
     _, pairs = measured(3, 2)
     assert closed_form("tsai", pairs.take(np.array([0]))) is None
+
+
+def test_a_start_that_fails_is_refused() -> None:
+    """Tsai's method wants turns of more than 15 deg; these are 3 deg from each other."""
+    rng = np.random.default_rng(1)
+    cell = BoardCell()
+    views = cell.views(rng, 12)
+    views = TruePose(Rotation.from_rotvec(0.1 * views.R.as_rotvec()), views.t)
+    robot, board = cell.read_robot(cell.flange(views), rng), cell.read_board(views, rng)
+    pairs = PosePairs(robot, board, tuple(map(str, range(12))))
+    with pytest.raises(ResidualError, match="tsai does not solve these pairs: use method best"):
+        calibrate_camera(pairs, CameraSettings("tsai"))
+    assert calibrate_camera(pairs).more["closed_forms_mean_mm"]["tsai"] is None
+
+
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_a_closed_form_takes_a_hundred_of_many(name: str) -> None:
+    """From the first sample to the last; what it skips may be anything."""
+    _, pairs = measured(298, 2)
+    T = pairs.T_camera_board.copy()
+    skipped = np.arange(298) % 3 != 0
+    T[skipped, :3, 3] += 1.0
+    at = closed_form(name, replace(pairs, T_camera_board=T))
+    clean = closed_form_of_all(name, pairs.take(~skipped))
+    assert at is not None
+    assert clean is not None
+    assert np.array_equal(at.X, clean.X)
+    assert np.array_equal(at.Z, clean.Z)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)

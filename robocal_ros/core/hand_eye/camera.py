@@ -92,8 +92,8 @@ def calibrate_camera(
         When nothing fits them.
     """
     how = settings or CameraSettings()
-    require_sound(pairs, rejected or {})
-    fit = fit_pairs(pairs, how.noise, _start(pairs, how.method))
+    sound = require_sound(pairs, rejected or {})
+    fit = fit_pairs(pairs, how.noise, _start(pairs, how.method), sound)
     _require_no_mistake(fit)
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
     result, state = (_classic if how.method == "classic" else _best)(fit, how)
@@ -105,8 +105,10 @@ def calibrate_camera(
     return result if check is None else _judged(result, check, state)
 
 
-def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
-    """Refuse pairs in which no placement is worth a search, and name the mistake if it is known.
+def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> Placement:
+    """`robust_start`; refuse pairs in which no placement is worth a search.
+
+    The mistake is named if it is known.
 
     Raises
     ------
@@ -117,7 +119,7 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
     sound = robust_start(pairs)
     size_m = score(pairs, sound)
     if size_m <= LARGEST_START_M:
-        return
+        return sound
     words = mistake(pairs, sound)
     if words:
         raise InputError(words)
@@ -129,7 +131,12 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
 
 
 def _start(pairs: PosePairs, method: str) -> Placement | None:
-    return closed_form(method, pairs) if method in CLOSED_FORMS else None
+    if method not in CLOSED_FORMS:
+        return None
+    start = closed_form(method, pairs)
+    if start is None:
+        raise ResidualError(f"{method} does not solve these pairs: use method best")
+    return start
 
 
 def _forms_document(pairs: PosePairs, forms: Mapping[str, Placement | None]) -> Document:

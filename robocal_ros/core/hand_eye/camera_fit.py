@@ -114,11 +114,13 @@ class PairFit:
 
 
 def fit_pairs(
-    pairs: PosePairs, given: GivenNoise | None = None, start: Placement | None = None
-) -> PairFit:
+    pairs: PosePairs, given: GivenNoise | None = None, start: Placement | None = None,
+    sound: Placement | None = None,
+) -> PairFit:  # fmt: skip
     """Find the most likely placements, reject what does not fit, estimate the unknown noise.
 
-    ``start``: where the search begins; default `robust_start`.
+    ``start``: where the search begins; default ``sound``. ``sound``: a placement near the truth,
+    from which the noise is guessed; default `robust_start`.
 
     Raises
     ------
@@ -127,7 +129,7 @@ def fit_pairs(
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
     free = np.isnan(known)
-    sound = robust_start(pairs)
+    sound = robust_start(pairs) if sound is None else sound
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
     state = PairState(start or sound, np.zeros(count))
     enough = len(pairs) >= _ENOUGH_TO_DOUBT

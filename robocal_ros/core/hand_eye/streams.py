@@ -210,10 +210,9 @@ def pair_streams(
     """
     offset = coarse_offset(robot, camera)
     pairs, left_out = pairs_at(robot, camera, offset, mount)
-    require_sound(pairs, {})
-    fit = fit_pairs(pairs, given)
+    fit = fit_pairs(pairs, given, sound=require_sound(pairs, {}))
     for _ in range(_ROUNDS):
-        fit = fit_pairs(_with_offset(robot, pairs, fit, offset), given, fit.at)
+        fit = fit_pairs(_with_offset(robot, pairs, fit, offset), given, fit.at, fit.at)
         step = float(fit.estimate.state.common[0])
         offset += step
         pairs, left_out = pairs_at(robot, camera, offset, mount)
