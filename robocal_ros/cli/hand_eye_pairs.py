@@ -2,7 +2,6 @@
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.hand_eye_shots import arm_of, require_unused, robot_sigma_of
