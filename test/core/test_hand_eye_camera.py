@@ -32,7 +32,7 @@ from robocal_ros.core.hand_eye.camera_closed_forms import (
 )
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised, moved
-from robocal_ros.core.hand_eye.camera_quality import left_out
+from robocal_ros.core.hand_eye.camera_quality import left_out, unsettled
 from robocal_ros.core.hand_eye.camera_start import robust_start
 from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, Shared
 from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
@@ -401,6 +401,27 @@ def test_the_expected_error_is_that_at_fresh_poses() -> None:
         total += float(away @ away)
         told += float(found.working_error_m or 0.0) ** 2
     assert total / told == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (2.0 * runs)))
+
+
+def test_noise_that_swings_between_two_answers_settles() -> None:
+    """Whole steps go from the robot's position alone to its turn as well, and back."""
+    _, pairs = measured(8, 4, "to-hand")
+    fit = fit_pairs(pairs)
+    assert fit.settled
+    assert unsettled(fit) is None
+
+
+def test_what_is_no_solution_is_not_accepted() -> None:
+    _, pairs = measured(12, 18)
+    fit = fit_pairs(pairs)
+    crept = replace(fit, estimate=replace(fit.estimate, converged=False))
+    for wrong, words in (
+        (replace(fit, settled=False), "the noise did not settle"), (crept, "still crept"),
+    ):  # fmt: skip
+        refused = unsettled(wrong)
+        assert refused is not None
+        assert refused.code is Code.POSES_NOT_INFORMATIVE
+        assert words in refused.reason
 
 
 def test_poses_that_tell_little_are_not_accepted() -> None:

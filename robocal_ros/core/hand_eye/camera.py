@@ -23,6 +23,7 @@ from robocal_ros.core.hand_eye.camera_quality import (
     left_out,
     left_out_of_form,
     rms,
+    unsettled,
     verdict,
     working_error,
 )
@@ -221,7 +222,7 @@ def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
         rejected=_reasons(fit),
         target=_target_document(pairs, fit.at),
         working_error_m=error,
-        verdict=verdict(fit, size, error, how.limit_m),
+        verdict=unsettled(fit) or verdict(fit, size, error, how.limit_m),
         more={"start": how.method} | _forms_document(kept, closed_forms(kept)),
         parent=_parent(pairs),
     )
@@ -251,7 +252,7 @@ def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairStat
         leave_one_out_m=left_out_of_form(name, used, at),
         target=_target_document(used, at),
         working_error_m=error_m,
-        verdict=form_verdict(name, size, away_m, error_m, how.limit_m),
+        verdict=unsettled(fit) or form_verdict(name, size, away_m, error_m, how.limit_m),
         more={"start": name} | _forms_document(used, forms),
         parent=_parent(used),
     )

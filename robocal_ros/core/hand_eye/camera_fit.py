@@ -62,12 +62,14 @@ class PairFit:
     ----------
     noise : of both sides, given or estimated.
     expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
+    settled : whether noise and placements agree in the end; where the noise is known they do.
     """
 
     pairs: PosePairs
     noise: PairNoise
     expected: Array
     estimate: Estimate[PairState]
+    settled: bool
 
     @property
     def at(self) -> Placement:
@@ -99,13 +101,9 @@ class PairFit:
     @property
     def whole_covariance(self) -> Array:
         """The same with the common errors (12 + s, 12 + s)."""
-        widened = 1.0 if self.pairs.time_s is None else correlation(self._whitened)
-        return self.estimate.covariance * widened
-
-    @property
-    def _whitened(self) -> Array:
-        root = np.linalg.inv(np.linalg.cholesky(self.expected[~self.rejected]))
-        return np.asarray((root @ self.differences[~self.rejected][..., None])[..., 0])
+        if self.pairs.time_s is None:
+            return self.estimate.covariance
+        return self.estimate.covariance * correlation(self.estimate.residual[~self.rejected])
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -146,16 +144,17 @@ def fit_pairs(
             noise_known=enough or not np.any(free),
             robust=enough,
         )
-        before, state, X = noise, found.state, found.state.at.X
+        before, settled, state, X = noise, True, found.state, found.state.at.X
         if np.any(free) and enough:
             miss, J = linearised(pairs, state)
             keep = ~found.rejected
             used = pairs if np.all(keep) else pairs.take(keep)
             seen = Evidence.of(used, X, miss[keep], J[keep], state.common)
-            noise = estimate(seen, free, noise)
-        if _same(before, noise):
+            noise, settled = estimate(seen, free, noise)
+        settled = settled and _same(before, noise)
+        if settled:
             break
-    return PairFit(pairs, noise, V, found)
+    return PairFit(pairs, noise, V, found, settled)
 
 
 def _same(before: PairNoise, after: PairNoise) -> bool:
