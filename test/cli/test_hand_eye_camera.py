@@ -192,6 +192,9 @@ def test_tables_of_different_length_are_refused(robocal, folder: Path) -> None:
     [
         ("plumb_bob", "equidistant", "distortion_model is 'equidistant'"),
         ("image_width", "width", "'width' is not a known key"),
+        ("image_width: 640\n", "", "image_width is missing"),
+        ("640", "640.7", "image_width is 640.7; it must be a whole number"),
+        ("640", "0", "image_width is 0; it must be a whole number"),
         ("0.0, 1.0]", "0.0, 2.0]", "must be fx 0 cx"),
         ("640", "320", "images show the board"),
         ("cols: 5, data: [", "cols: 5, data: [1, ", "list of 5 numbers"),
@@ -200,7 +203,7 @@ def test_tables_of_different_length_are_refused(robocal, folder: Path) -> None:
 def test_wrong_intrinsics_are_named(robocal, folder: Path, old: str, new: str, words: str) -> None:
     (folder / "wrong.yaml").write_text(INTRINSICS.replace(old, new))
     images = ("--poses", "image_poses.csv", "--images", "images", *BOARD)
-    document = robocal(*images, "--intrinsics", "wrong.yaml", status=3 if old == "640" else 2)
+    document = robocal(*images, "--intrinsics", "wrong.yaml", status=3 if new == "320" else 2)
     assert words in document["error"]["message"]
 
 
