@@ -666,3 +666,10 @@ def test_what_is_no_image_or_no_board_is_refused() -> None:
             decode_image(data, "x.png")
     with pytest.raises(InputError, match="shows no pose"):
         Chessboard(9, 1, 0.025)
+
+
+def test_a_lens_that_cannot_be_undone_makes_no_image() -> None:
+    cell = BoardCell()
+    view = cell.views(np.random.default_rng(0), 1)
+    with pytest.raises(ValueError, match="cannot be undone"):
+        TrueLens(k1=-3.0).image(view, BOARD.columns, BOARD.rows, BOARD.square_m)
