@@ -31,9 +31,10 @@ from robocal_ros.core.hand_eye.camera_closed_forms import (
     closed_form_of_all,
 )
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
-from robocal_ros.core.hand_eye.camera_model import PairState, linearised, moved
+from robocal_ros.core.hand_eye.camera_model import PairState, linearised
 from robocal_ros.core.hand_eye.camera_quality import left_out, unsettled
 from robocal_ros.core.hand_eye.camera_start import robust_start
+from robocal_ros.core.hand_eye.increments import moved
 from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, Shared
 from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.increments import tangents
 from robocal_ros.core.hand_eye.tracker_data import (
     MOVED,
     Arc,
@@ -33,7 +34,6 @@ from robocal_ros.core.hand_eye.tracker_state import (
     UNKNOWNS,
     TrackerState,
     adjoint,
-    tangents,
 )
 
 Array = NDArray[np.float64]
