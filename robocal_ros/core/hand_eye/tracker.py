@@ -24,11 +24,10 @@ from robocal_ros.core.hand_eye.quality import (
 from robocal_ros.core.hand_eye.result import HandEyeResult, Method, point_covariance
 from robocal_ros.core.hand_eye.tracker_classic import Classic, each_without, solve_classic
 from robocal_ros.core.hand_eye.tracker_cube import Cube
-from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
+from robocal_ros.core.hand_eye.tracker_data import FACES, TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.core.hand_eye.tracker_features import Lines, fit_caps, fit_lines
 from robocal_ros.core.hand_eye.tracker_problem import TrackerProblem, sphere_in
 from robocal_ros.core.hand_eye.tracker_quality import (
-    FACES,
     misfit,
     profile_distances,
     states_without,

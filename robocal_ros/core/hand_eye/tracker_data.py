@@ -13,6 +13,7 @@ from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 
+FACES = ("face_1", "face_2")
 MOVED = 1e-3  # rad or m: a joint that changes by less stands still
 FEWEST_ARC_POINTS = 6
 FEWEST_FACE_POINTS = 4
@@ -117,7 +118,7 @@ class TrackerData:
         """
         if len(self.sphere) < 1:
             raise TooFewSamplesError("the tracker measured no centre of the sphere")
-        for name, points in zip(("face_1", "face_2"), self.faces, strict=True):
+        for name, points in zip(FACES, self.faces, strict=True):
             if len(points) < FEWEST_FACE_POINTS:
                 raise TooFewSamplesError(
                     f"{name} has {len(points)} tracker points (at least {FEWEST_FACE_POINTS}): "

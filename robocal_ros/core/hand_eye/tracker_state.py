@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.increments import moved, tangents
+from robocal_ros.core.hand_eye.tracker_data import FACES
 
 Array = NDArray[np.float64]
 
@@ -22,8 +23,7 @@ NAMES = tuple(
         ("sensor in flange", ("x", "y", "z", "turn x", "turn y", "turn z")),
         ("reflector", ("x", "y", "z")),
         ("sphere", ("x", "y", "z")),
-        ("face_1", ("tilt", "turn")),
-        ("face_2", ("tilt", "turn")),
+        *((face, ("tilt", "turn")) for face in FACES),
         ("face offset", ("1", "2")),
         ("axes", ("angle", "gap")),
     )
