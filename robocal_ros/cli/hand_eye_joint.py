@@ -20,7 +20,7 @@ from robocal_ros.cli.hand_eye_shots import (
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_mount
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
 from robocal_ros.storage.files import quoted
 
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> Outcome:
     if args.check is not None and not checks:
         raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
     result = solve_joint(parts, settings, checks)
-    document = hand_eye_document(result)
+    document: Document = {"held_out": None} | hand_eye_document(result)
     return Outcome(document, partial(show_mount, document=document))
 
 

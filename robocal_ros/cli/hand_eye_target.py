@@ -17,7 +17,7 @@ from robocal_ros.cli.hand_eye_shots import (
     task_of,
 )
 from robocal_ros.cli.hand_eye_view import show_mount
-from robocal_ros.cli.output import Outcome
+from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
 
 METHODS = ("best", "classic")
@@ -52,12 +52,13 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
         _require_unused(args, judges, shots)
     result = solve_task(task, shots.data, args.method, settings)
     result = replace(result, rejected={**shots.rejected, **result.rejected})
+    result = replace(result, more={**result.more, "held_out": None})
     if judges is not None:
         if result.place is None:
             raise ValueError("a result of one target has its place")
         seen = held_out(task, judges.data, result.T_flange_sensor, result.place)
         result = judged(result, seen, len(judges.data.names), settings, judges.rejected)
-    document = hand_eye_document(result)
+    document: Document = hand_eye_document(result)
     return Outcome(document, partial(show_mount, document=document))
 
 

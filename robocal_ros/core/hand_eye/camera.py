@@ -101,7 +101,7 @@ def calibrate_camera(
     result = replace(
         result,
         rejected={**(rejected or {}), **result.rejected},
-        more={**about, **result.more},
+        more={**about, **result.more, "held_out": None},
     )
     return result if check is None else _judged(result, check, state)
 

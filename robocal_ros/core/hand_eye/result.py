@@ -108,7 +108,7 @@ def hand_eye_document(result: HandEyeResult) -> Document:
     origin, both along the axes of the parent frame, to first order: where turns are uncertain the
     origin moves on an arc. ``covariance_at_pivot``, sensor axes, holds there too: of the
     `increment` about ``pivot_mm``, a point of the sensor frame. A shot whose
-    corners were all rejected is named once. ``held_out`` is null where nothing else judged.
+    corners were all rejected is named once.
     """
     covariance, rejected = parent_covariance(result), by_shot(result.rejected, result.samples)
     return {
@@ -131,7 +131,6 @@ def hand_eye_document(result: HandEyeResult) -> Document:
         "rejected": list(rejected),
         "rejected_because": rejected,
         "unobservable": list(result.unobservable),
-        "held_out": None,
         **result.more,
         "verdict": verdict_document(result.verdict),
     }
