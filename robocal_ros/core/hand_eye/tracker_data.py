@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +130,7 @@ class TrackerData:
                 f"the scan has {len(self.profiles)} profiles (at least {FEWEST_PROFILES})"
             )
 
-    @property
+    @cached_property
     def motion(self) -> Array:
         """Flange pose of each profile in that of the first: T_flange0_flange (m, 4, 4)."""
         return self.relative(self.q)
