@@ -23,6 +23,7 @@ HELP = "place a profile sensor by a laser tracker that sees the flange, and a cu
 
 METHODS = ("best", "classic")
 LIMIT_MM = 0.5
+WHERE = "at the working distance"  # the expected error holds
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +66,7 @@ def _add_limits(parser: argparse.ArgumentParser) -> None:
         ("joint-sigma-mm", "0.02"),
     ):  # fmt: skip
         noise.add_argument(f"--{option}", type=positive, metavar="S", help=f"default {default}")
-    add_limit(parser, "at the working distance", LIMIT_MM)
+    add_limit(parser, WHERE, LIMIT_MM)
 
 
 def run(args: argparse.Namespace) -> Outcome:
@@ -135,7 +136,7 @@ def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", di
 
 
 def _show(console: "Console", document: Document) -> None:
-    show_placed(console, document, "Sensor")
+    show_placed(console, document, "Sensor", WHERE)
     residual = document["residual_mm"]
     console.print(
         f"Profiles from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"

@@ -225,6 +225,7 @@ def test_people_read_it_too(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     assert text.startswith("ACCEPT: ")
     assert "Camera in the flange frame, mm: " in text
     assert "Time offset" in text
+    assert "Expected error where the boards were: " in text
     assert "daniilidis" in text
 
 

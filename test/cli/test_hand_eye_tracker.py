@@ -97,6 +97,7 @@ def test_people_read_the_verdict_first(folder):
     first = done.stdout.splitlines()[0]
     assert first.startswith("ACCEPT: ")
     assert "at the working distance" in first
+    assert "Expected error at the working distance: " in done.stdout
 
 
 def test_a_tight_limit_is_a_verdict_not_an_error(folder):
