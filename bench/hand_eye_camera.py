@@ -9,7 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bench.hand_eye_sets import BOARD, arm_streams, board_shots, folder, tmac_pairs, turned_tsai
+from bench.hand_eye_sets import (
+    ARM_RMS_MM,
+    BOARD,
+    BOARD_RMS_MM,
+    TMAC_MM,
+    arm_streams,
+    board_shots,
+    folder,
+    tmac_pairs,
+    turned_tsai,
+)
 from bench.tables import Goal, Table
 from robocal_ros.core.hand_eye.board import boards_of_corners, see_boards
 from robocal_ros.core.hand_eye.camera_closed_forms import (
@@ -33,8 +43,6 @@ MANY = 200
 NOISE = BoardNoise()
 ROBOT = GivenNoise(NOISE.robot_m, NOISE.robot_rad, camera_scale=1.0)
 CAMERA_ALONE = GivenNoise(1e-9, 1e-9, camera_scale=1.0)
-TMAC_MM = {"B": 0.80, "D": 0.77}
-BOARD_RMS_MM, ARM_RMS_MM = 2.46, 4.3
 
 
 def measured(cell: BoardCell, count: int, rng: np.random.Generator) -> PosePairs:

@@ -65,7 +65,8 @@ def test_board_poses_give_the_camera(robocal) -> None:
     assert document["verdict"]["accept"]
     assert near(document)
     assert document["held_out"]["n"] == 6
-    assert document["held_out"]["mean_mm"] < 3.0
+    # 0.39 mm by the noise of both sides and its lever, 0.2 mm by the camera's own place: doubled
+    assert document["held_out"]["mean_mm"] < 1.0
     assert set(document["rejected_because"]) == set()
     assert len(document["residual_mm"]["per_sample"]) == 14
     alone = robocal(*pairs)
@@ -86,7 +87,8 @@ def test_every_start_gives_the_same_camera(robocal) -> None:
         assert np.all(np.abs(away) < 0.02 * np.array(best["sigma"]["xyz_mm"]))
     classic = robocal(*pairs, "classic")
     assert classic["sigma"] is None
-    assert 0.0 < classic["leave_one_out_mm"]["mean"] < classic["leave_one_out_mm"]["max"] < 5.0
+    # five sigmas of 0.25 mm an axis, and half as much again for solving without the sample
+    assert 0.0 < classic["leave_one_out_mm"]["mean"] < classic["leave_one_out_mm"]["max"] < 2.0
     assert classic["start"] in CLOSED_FORMS
 
 
@@ -243,7 +245,7 @@ def mean(document: dict[str, Any]) -> float:
 
 @pytest.mark.data
 @pytest.mark.parametrize("method", ["best", *CLOSED_FORMS])
-@pytest.mark.parametrize(("series", "limit_mm"), [("B", 0.80), ("D", 0.77)])
+@pytest.mark.parametrize(("series", "limit_mm"), hand_eye_sets.TMAC_MM.items())
 def test_a_tracked_target_from_every_start(
     tables: Path, robocal, series: str, limit_mm: float, method: str
 ) -> None:
@@ -257,7 +259,7 @@ def test_a_tracked_target_from_every_start(
 
 
 @pytest.mark.data
-@pytest.mark.parametrize(("series", "limit_mm"), [("B", 0.80), ("D", 0.77)])
+@pytest.mark.parametrize(("series", "limit_mm"), hand_eye_sets.TMAC_MM.items())
 def test_a_start_that_failed_does_not_matter(data_dir: Path, series: str, limit_mm: float) -> None:
     """Tsai's method on series B, with X and Z exchanged, is off by 2.9 mm."""
     pairs = hand_eye_sets.tmac_pairs(series)
@@ -275,7 +277,7 @@ def test_real_images_fit_better_than_any_closed_form(tables: Path, data_dir: Pat
     images = ("--poses", tables / "board_poses.csv", "--images", data_dir / "camera_hand_eye")
     document = robocal(*images, *BOARD)
     assert len(document["rejected"]) <= 1
-    assert document["residual_mm"]["rms"] <= 2.46
+    assert document["residual_mm"]["rms"] <= hand_eye_sets.BOARD_RMS_MM
     forms = document["closed_forms_mean_mm"].values()  # of the same samples
     assert mean(document) <= min(value for value in forms if value is not None)
     assert document["intrinsics"]["noise_px"] < 0.2
@@ -286,6 +288,6 @@ def test_real_streams_and_their_offset(tables: Path, robocal) -> None:
     document = robocal(
         "--poses", tables / "arm_poses.csv", "--measured", tables / "arm_measured.csv"
     )
-    assert document["residual_mm"]["rms"] <= 4.3
+    assert document["residual_mm"]["rms"] <= hand_eye_sets.ARM_RMS_MM
     assert abs(document["time_offset_s"]) < 0.04  # one image
     assert len(document["rejected"]) < 0.05 * 1703
