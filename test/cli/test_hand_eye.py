@@ -420,7 +420,7 @@ class TestPlan:
         one.write_text("\n".join([*merged, *proposed[1:]]) + "\n")
         again = robocal(*self.plan(kind, one, mount, *known, "--limit-mm", 0.3))
         assert again["verdict"]["accept"], again["verdict"]
-        # the same poses but for the table's digits, 1e-6 of what is measured or less
+        # the same poses, but for what lies beyond the 12 digits of the table
         assert again["working_error_mm"] == pytest.approx(found["proposed_error_mm"], rel=1e-6)
 
     def test_marks_of_proposed_poses(self, made, mount, tmp_path):
