@@ -3,15 +3,31 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bench.hand_eye_sets import BOARD, arm_streams, board_shots, folder, tmac_pairs, turned_tsai
+from bench.hand_eye_sets import (
+    ARM_RMS_MM,
+    BOARD,
+    BOARD_RMS_MM,
+    TMAC_MM,
+    arm_streams,
+    board_shots,
+    folder,
+    tmac_pairs,
+    turned_tsai,
+)
 from bench.tables import Goal, Table
 from robocal_ros.core.hand_eye.board import boards_of_corners, see_boards
-from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, HAND_EYE, closed_form
+from robocal_ros.core.hand_eye.camera_closed_forms import (
+    CLOSED_FORMS,
+    HAND_EYE,
+    closed_form,
+    closed_form_of_all,
+)
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.camera_model import linearised
 from robocal_ros.core.hand_eye.camera_quality import distances, rms
@@ -27,8 +43,6 @@ MANY = 200
 NOISE = BoardNoise()
 ROBOT = GivenNoise(NOISE.robot_m, NOISE.robot_rad, camera_scale=1.0)
 CAMERA_ALONE = GivenNoise(1e-9, 1e-9, camera_scale=1.0)
-TMAC_MM = {"B": 0.80, "D": 0.77}
-BOARD_RMS_MM, ARM_RMS_MM = 2.46, 4.3
 
 
 def measured(cell: BoardCell, count: int, rng: np.random.Generator) -> PosePairs:
@@ -194,7 +208,7 @@ def speed_table() -> Table:
         "ours, noise estimated": lambda: fit_pairs(pairs),
     }
     for name in CLOSED_FORMS:
-        solvers[f"OpenCV {name}"] = lambda name=name: closed_form(name, pairs)  # type: ignore[misc]
+        solvers[f"OpenCV {name}"] = partial(closed_form_of_all, name, pairs)
     spent: dict[str, list[float]] = {name: [] for name in solvers}
     for _ in range(9):
         for name, solve in solvers.items():
@@ -292,7 +306,7 @@ def arm_table() -> Table:
     untold = rms(np.linalg.norm(fit_pairs(as_told).differences[:, :3], axis=1)) * 1e3
     table.add("best, stamps as they are", "0", untold, None)
     for name in CLOSED_FORMS:
-        at = closed_form(name, few)
+        at = closed_form_of_all(name, few)
         scatter = None if at is None else rms(distances(as_told, at)) * 1e3
         table.add(f"OpenCV {name}, stamps as they are", "0", scatter, None)
     return table

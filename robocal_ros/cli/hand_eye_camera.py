@@ -20,6 +20,7 @@ HELP = "place a camera from images of a chessboard, or from poses of a board or 
 METHODS = ("best", "classic", "tsai", "park", "horaud", "andreff", "daniilidis", "shah", "li")
 MOUNTS = ("in-hand", "to-hand")
 LIMIT_MM = 2.0
+WHERE = "where the boards were"  # the expected error holds
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +62,7 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
     )
     add_robot(parser)
     add_robot_sigma(parser, "default: from the residuals")
-    add_limit(parser, "where the boards were", LIMIT_MM)
+    add_limit(parser, WHERE, LIMIT_MM)
     parser.add_argument(
         "--check",
         type=Path,
@@ -93,7 +94,7 @@ def _board(value: str) -> tuple[int, int]:
 
 
 def _show(console: "Console", document: Document) -> None:
-    show_placed(console, document, "Camera")
+    show_placed(console, document, "Camera", WHERE)
     if document.get("time_offset_s") is not None:
         console.print(
             f"Time offset, to be added to the camera's stamps: {document['time_offset_s']:.4f} s "

@@ -2,11 +2,11 @@
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.cli.hand_eye_shots import arm_of, robot_sigma_of
+from robocal_ros.cli.hand_eye_shots import arm_of, require_unused, robot_sigma_of
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.files import quoted
 
 if TYPE_CHECKING:
     from robocal_ros.core.hand_eye.board import Chessboard, Intrinsics, SeenBoards
@@ -50,10 +50,19 @@ def _settings(args: argparse.Namespace) -> "CameraSettings":
     return CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
 
 
-def _read(path: Path, args: argparse.Namespace, file_column: str | None) -> "PoseTable":
+def _tables(
+    args: argparse.Namespace, file_column: str | None
+) -> "tuple[PoseTable, PoseTable | None]":
+    """The robot's poses that solve, and those that judge."""
     from robocal_ros.storage.hand_eye_tables import read_pose_table
 
-    return read_pose_table(path, arm_of(args), file_column)
+    arm = arm_of(args)
+    used = read_pose_table(args.poses, arm, file_column)
+    if args.check is None:
+        return used, None
+    judges = read_pose_table(args.check, arm, file_column)
+    require_unused(judges, used)
+    return used, judges
 
 
 def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
@@ -65,11 +74,12 @@ def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandE
     columns, rows = args.board
     board = Chessboard(columns, rows, args.square_mm * 1e-3)
     intrinsics = None if args.intrinsics is None else read_intrinsics(args.intrinsics)
-    pairs, seen = _pairs_of_images(args.poses, args, board, intrinsics)
+    used, judges = _tables(args, "image")
+    pairs, seen = _pairs_of_images(used, args, board, intrinsics)
     check = None
-    if args.check is not None:
-        judges, shown = _pairs_of_images(args.check, args, board, seen.intrinsics)
-        check = CheckPairs(judges, shown.rejected)
+    if judges is not None:
+        held, shown = _pairs_of_images(judges, args, board, seen.intrinsics)
+        check = CheckPairs(held, shown.rejected)
     return calibrate_camera(
         pairs,
         settings,
@@ -80,13 +90,13 @@ def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandE
 
 
 def _pairs_of_images(
-    path: Path, args: argparse.Namespace, board: "Chessboard", intrinsics: "Intrinsics | None"
-) -> "tuple[PosePairs, SeenBoards]":
+    table: "PoseTable", args: argparse.Namespace, board: "Chessboard",
+    intrinsics: "Intrinsics | None",
+) -> "tuple[PosePairs, SeenBoards]":  # fmt: skip
     from robocal_ros.core.hand_eye.board import see_boards
     from robocal_ros.core.hand_eye.board_pairs import board_pairs
     from robocal_ros.storage.camera_files import read_images
 
-    table = _read(path, args, "image")
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
     pairs = board_pairs(seen, table.names, table.T_base_flange, args.mount)
@@ -98,9 +108,8 @@ def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEy
     from robocal_ros.core.hand_eye.streams import calibrate_streams
     from robocal_ros.storage.hand_eye_tables import read_pose_table
 
-    robot = _read(args.poses, args, None)
+    robot, check = _tables(args, None)
     camera = read_pose_table(args.measured, None, None)
-    check = None if args.check is None else _read(args.check, args, None)
     tables = [robot, camera] if check is None else [robot, camera, check]
     stamped = all(table.stamp_ns is not None for table in tables)
     if stamped and not all(table.named for table in tables):
@@ -113,10 +122,21 @@ def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEy
     pairs, alone = _paired(robot, camera, args.mount)
     judges = None
     if check is not None:
+        _require_other_samples(check, robot)
         held, absent = _paired(check, camera, args.mount)
         judges = CheckPairs(held, {name: absent[name] for name in check.names if name in absent})
         alone = {name: why for name, why in alone.items() if name not in held.names}
     return calibrate_camera(pairs, settings, check=judges, rejected=alone)
+
+
+def _require_other_samples(judges: "PoseTable", used: "PoseTable") -> None:
+    known = set(used.names)
+    for name, row in zip(judges.names, judges.rows, strict=True):
+        if name in known:
+            raise InputError(
+                f"{quoted(name)} is in --poses too: other samples must judge",
+                file=judges.path, row=row, column="sample",
+            )  # fmt: skip
 
 
 def _stamps(table: "PoseTable") -> Any:

@@ -15,7 +15,7 @@ from robocal_ros.core.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.hand_eye.tracker_data import TrackerData
+    from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise
     from robocal_ros.core.kinematics import SerialArm
 
 NAME = "tracker"
@@ -23,6 +23,7 @@ HELP = "place a profile sensor by a laser tracker that sees the flange, and a cu
 
 METHODS = ("best", "classic")
 LIMIT_MM = 0.5
+WHERE = "at the working distance"  # the expected error holds
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,25 +61,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_limits(parser: argparse.ArgumentParser) -> None:
     noise = parser.add_argument_group("noise, one sigma")
-    noise.add_argument(
-        "--tracker-sigma-mm", type=positive, default=0.015, metavar="S", help="default 0.015"
-    )
-    noise.add_argument(
-        "--joint-sigma-deg", type=positive, default=0.003, metavar="S", help="default 0.003"
-    )
-    noise.add_argument(
-        "--joint-sigma-mm", type=positive, default=0.02, metavar="S", help="default 0.02"
-    )
-    add_limit(parser, "at the working distance", LIMIT_MM)
+    for option, default in (
+        ("tracker-sigma-mm", "0.015"), ("joint-sigma-deg", "0.0029 (5e-5 rad)"),
+        ("joint-sigma-mm", "0.02"),
+    ):  # fmt: skip
+        noise.add_argument(f"--{option}", type=positive, metavar="S", help=f"default {default}")
+    add_limit(parser, WHERE, LIMIT_MM)
 
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from math import radians
-
     from robocal_ros.core.hand_eye.result import hand_eye_document
     from robocal_ros.core.hand_eye.tracker import solve_tracker
-    from robocal_ros.core.hand_eye.tracker_data import TrackerNoise, TrackerTarget
+    from robocal_ros.core.hand_eye.tracker_data import TrackerTarget
     from robocal_ros.storage.tracker_tables import read_tracker_target
 
     warnings: list[str] = []
@@ -88,14 +83,27 @@ def run(args: argparse.Namespace) -> Outcome:
     else:
         target = read_tracker_target(args.target)
     data, rejected = _read(args, arm)
-    noise = TrackerNoise(
-        args.tracker_sigma_mm * 1e-3, radians(args.joint_sigma_deg), args.joint_sigma_mm * 1e-3
-    )
-    result = solve_tracker(data, target, noise, args.method, args.limit_mm * 1e-3)
+    result = solve_tracker(data, target, _noise(args), args.method, args.limit_mm * 1e-3)
     warn(warnings)
     result = replace(result, rejected={**rejected, **result.rejected})
     document = hand_eye_document(result)
     return Outcome(document, partial(_show, document=document))
+
+
+def _noise(args: argparse.Namespace) -> "TrackerNoise":
+    """What is given of it; the rest as `TrackerNoise` has it."""
+    from math import radians
+
+    from robocal_ros.core.hand_eye.tracker_data import TrackerNoise
+
+    given = {}
+    if args.tracker_sigma_mm is not None:
+        given["tracker_m"] = args.tracker_sigma_mm * 1e-3
+    if args.joint_sigma_deg is not None:
+        given["joint_rad"] = radians(args.joint_sigma_deg)
+    if args.joint_sigma_mm is not None:
+        given["joint_m"] = args.joint_sigma_mm * 1e-3
+    return TrackerNoise(**given)
 
 
 def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", dict[str, str]]:
@@ -128,7 +136,7 @@ def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", di
 
 
 def _show(console: "Console", document: Document) -> None:
-    show_placed(console, document, "Sensor")
+    show_placed(console, document, "Sensor", WHERE)
     residual = document["residual_mm"]
     console.print(
         f"Profiles from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"

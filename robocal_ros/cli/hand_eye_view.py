@@ -13,7 +13,7 @@ MOST_NAMED = 5  # samples left out for one reason
 
 def show_mount(console: "Console", document: Document) -> None:
     """Print where a line laser sits, how well that is known, and which samples were left out."""
-    show_placed(console, document, "Sensor")
+    show_placed(console, document, "Sensor", "in the field of view")
     residual = document["residual_mm"]
     console.print(
         f"Samples from the target: rms {residual['rms']:.3f} mm, largest {residual['max']:.3f} mm"
@@ -21,8 +21,8 @@ def show_mount(console: "Console", document: Document) -> None:
     show_judged(console, document)
 
 
-def show_placed(console: "Console", document: Document, what: str) -> None:
-    """Print the decision, where a sensor sits, and how well that is known."""
+def show_placed(console: "Console", document: Document, what: str, where: str) -> None:
+    """Print the decision, where a sensor sits, and how well that is known, ``where`` it looks."""
     show_verdict(console, document)
     parent = "flange" if "T_flange_sensor" in document else "base"
     show_pose(console, f"{what} in the {parent} frame", document[f"T_{parent}_sensor"])
@@ -30,7 +30,7 @@ def show_placed(console: "Console", document: Document, what: str) -> None:
         show_sigma(console, document["sigma"])
     error_mm = document["working_error_mm"]
     if error_mm is not None:
-        console.print(f"Expected error in the field of view: {error_mm:.3f} mm rms")
+        console.print(f"Expected error {where}: {error_mm:.3f} mm rms")
 
 
 def show_judged(console: "Console", document: Document) -> None:

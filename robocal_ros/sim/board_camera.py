@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 IN_HAND, TO_HAND = "in-hand", "to-hand"
 _SAMPLES = 2  # per pixel and axis
+_MOST_ROUNDS, _SETTLED = 50, 1e-9
 _MIDDLE = (0.1, 0.0625, 0.0)  # of 9 x 6 corners 25 mm apart
 _WHITE, _BLACK, _BEHIND = 225.0, 25.0, 120.0
 
@@ -156,17 +157,25 @@ class TrueLens:
 
 @cache
 def _rays(lens: TrueLens) -> tuple[Array, Array]:
-    """Undistorted x and y at depth 1 of every sample of an image."""
+    """Undistorted x and y at depth 1 of every sample of an image.
+
+    Raises
+    ------
+    ValueError
+        When the lens bends rays so far that there is no way back.
+    """
     fine = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     u = (np.arange(lens.width)[:, None] + fine).ravel()
     v = (np.arange(lens.height)[:, None] + fine).ravel()
     x, y = np.meshgrid((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy)
     ideal_x, ideal_y = x, y
-    for _ in range(8):  # the way back through the distortion
+    for _ in range(_MOST_ROUNDS):  # the way back through the distortion
         r2 = ideal_x**2 + ideal_y**2
         stretch = 1.0 + lens.k1 * r2 + lens.k2 * r2**2
-        ideal_x, ideal_y = x / stretch, y / stretch
-    return ideal_x, ideal_y
+        last, ideal_x, ideal_y = np.stack([ideal_x, ideal_y]), x / stretch, y / stretch
+        if np.abs(np.stack([ideal_x, ideal_y]) - last).max() < _SETTLED:
+            return ideal_x, ideal_y
+    raise ValueError(f"the distortion of {lens} cannot be undone")
 
 
 def moving_flange(time_s: Array) -> TruePose:

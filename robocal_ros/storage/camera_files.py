@@ -11,6 +11,7 @@ from robocal_ros.storage.hand_eye_tables import PoseTable
 from robocal_ros.storage.made_files import read_fields
 
 MODELS = {"plumb_bob": 5, "rational_polynomial": 8}  # and how many coefficients they have
+MOST_PX = 100_000  # along a side of an image
 NOT_NEEDED = ("camera_name", "rectification_matrix", "projection_matrix")
 
 
@@ -44,10 +45,10 @@ def read_intrinsics(path: Path) -> Intrinsics:
               "distortion_coefficients")  # fmt: skip
     top.only(*needed, *NOT_NEEDED)
     model = top.choice("distortion_model", tuple(MODELS))
-    size = tuple(int(top.positive(key, 0.0)) for key in needed[:2])
+    width, height = (top.whole(key, 1, MOST_PX) for key in needed[:2])
     matrix, distortion = top.below("camera_matrix"), top.below("distortion_coefficients")
     K = np.array(matrix.numbers("data", 9)).reshape(3, 3)
     if not (K[0, 0] > 0.0 and K[1, 1] > 0.0 and np.allclose(K[2], [0.0, 0.0, 1.0])):
         matrix.fail("must be fx 0 cx, 0 fy cy, 0 0 1 by rows, in px", "data")
     coefficients = np.array(distortion.numbers("data", MODELS[model]))
-    return Intrinsics(K, coefficients, (size[0], size[1]))
+    return Intrinsics(K, coefficients, (width, height))

@@ -75,8 +75,8 @@ def _board(top: Fields, folder: Path) -> BoardTarget:
     from robocal_ros.storage.camera_files import read_intrinsics  # heavy: not at a node's start
 
     top.only("kind", "columns", "rows", "square_mm", "intrinsics")
-    columns, rows = (_whole(top, key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows"))
-    square_m = _positive(top, "square_mm") * 1e-3
+    columns, rows = (top.whole(key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows"))
+    square_m = top.positive("square_mm") * 1e-3
     if "intrinsics" not in top.values:
         return BoardTarget(columns, rows, square_m)
     camera = read_intrinsics(folder / top.text("intrinsics"))
@@ -118,8 +118,8 @@ def _step(top: Fields) -> StepTarget:
 def _staircase(fields: Fields) -> Staircase:
     lengths = ("length_mm", "height_mm", "depth_mm")
     fields.only("steps", *lengths, "corners", "first")
-    steps = _whole(fields, "steps", 1, MOST_STEPS)
-    length, height, depth = (_positive(fields, key) * 1e-3 for key in lengths)
+    steps = fields.whole("steps", 1, MOST_STEPS)
+    length, height, depth = (fields.positive(key) * 1e-3 for key in lengths)
     corners = CORNERS[fields.choice("corners", tuple(CORNERS), "convex")]
     if corners == "concave" and steps < 2:
         fields.fail("is 1; only between two steps there is a concave corner", "steps")
@@ -182,18 +182,6 @@ def _direction(fields: Fields, key: str) -> Array:
     if length == 0.0:
         fields.fail("has no length", key)
     return vector / length
-
-
-def _whole(fields: Fields, key: str, low: int, high: int) -> int:
-    value = fields.number(key)
-    if value != int(value) or not low <= value <= high:
-        fields.fail(f"is {value:g}; it must be a whole number from {low} to {high}", key)
-    return int(value)
-
-
-def _positive(fields: Fields, key: str) -> float:
-    fields.number(key)
-    return fields.positive(key, 1.0)
 
 
 def _sigma(fields: Fields, key: str) -> float:

@@ -92,12 +92,19 @@ class Fields:
             return default
         return self._number(self._get(key), key)
 
-    def positive(self, key: str, default: float) -> float:
+    def positive(self, key: str, default: float | None = None) -> float:
         """A number above zero."""
         value = self.number(key, default)
         if value <= 0.0:
             self.fail(f"is {value:g}; it must be above 0", key)
         return value
+
+    def whole(self, key: str, low: int, high: int) -> int:
+        """A whole number from ``low`` to ``high``."""
+        value = self.number(key)
+        if value != int(value) or not low <= value <= high:
+            self.fail(f"is {value:g}; it must be a whole number from {low} to {high}", key)
+        return int(value)
 
     def numbers(
         self, key: str, count: int, default: tuple[float, ...] | None = None

@@ -11,7 +11,7 @@ import yaml
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.tracker_data import Arc, TrackerData, TrackerTarget
+from robocal_ros.core.hand_eye.tracker_data import FACES, Arc, TrackerData, TrackerTarget
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.storage.cells import Cells, read_cells, texts, write_cells
 from robocal_ros.storage.files import nearest, quoted, write_text
@@ -24,7 +24,6 @@ from robocal_ros.storage.tables import joint_texts
 Array = NDArray[np.float64]
 
 ARCS = ("arc_a", "arc_b")
-FACES = ("face_1", "face_2")
 SPHERE = "sphere"
 ROLES = (*ARCS, SPHERE, *FACES)
 BESIDE = ("sample", "stamp_s")  # for the user's own record

@@ -11,6 +11,7 @@ NOISE = BoardNoise(1e-4, 2e-4, (2e-4, 2e-4, 2e-4), (5e-4, 5e-4, 5e-4))
 CELL = BoardCell(noise=NOISE)
 LENS = TrueLens()
 OFFSET_S = 0.08
+USED = 6  # images that solve where the others judge
 MATRIX = [LENS.fx, 0.0, LENS.cx, 0.0, LENS.fy, LENS.cy, 0.0, 0.0, 1.0]
 INTRINSICS = f"""image_width: 640
 image_height: 480
@@ -48,7 +49,10 @@ def stream_tables(folder: Path) -> None:
 
 
 def image_tables(folder: Path, count: int = 9) -> None:
-    """Images of a chessboard in ``images``, their poses, the true intrinsics; one is blank."""
+    """Images of a chessboard in ``images``, their poses, the true intrinsics; one is blank.
+
+    ``image_used`` and ``image_check`` are the first six of the poses and the others.
+    """
     import cv2
 
     rng = np.random.default_rng(2)
@@ -60,5 +64,10 @@ def image_tables(folder: Path, count: int = 9) -> None:
         image = LENS.image(views.take(i), 9, 6, 0.025)
         cv2.imwrite(str(place / file), image if i != 3 else np.full_like(image, 80))
     robot = CELL.read_robot(CELL.flange(views), rng)
-    write_pose_table(folder / "image_poses.csv", robot, files, file_column="image")
+    for name, part in (
+        ("poses", slice(None)), ("used", slice(USED)), ("check", slice(USED, None)),
+    ):  # fmt: skip
+        write_pose_table(
+            folder / f"image_{name}.csv", robot[part], files[part], file_column="image"
+        )
     (folder / "camera.yaml").write_text(INTRINSICS)

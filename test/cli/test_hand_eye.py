@@ -125,7 +125,9 @@ class TestRecovered:
             for check in [made / kind / "check.csv"]
         ]
         assert found["held_out"]["n"] == sum(one["held_out"]["n"] for one in judges)
-        assert found["held_out"]["rms_mm"] < 0.3  # robot 0.05 mm, profile 0.04 mm
+        # 0.23 mm is to be expected: of the robot 0.05 mm in each axis, and at 20 of the 28 samples,
+        # the corners, the aim of 0.2 mm along the edges and its turn; 1.3 for a scatter of 4 shots
+        assert found["held_out"]["rms_mm"] < 0.3
         some = shots_of("line")
         T = some.T_base_flange[SHOTS : SHOTS + CHECKS].copy()
         T[:, 2, 3] += 0.03  # as far as the edge was lowered before these were seen
@@ -418,7 +420,8 @@ class TestPlan:
         one.write_text("\n".join([*merged, *proposed[1:]]) + "\n")
         again = robocal(*self.plan(kind, one, mount, *known, "--limit-mm", 0.3))
         assert again["verdict"]["accept"], again["verdict"]
-        assert again["working_error_mm"] == pytest.approx(found["proposed_error_mm"], rel=0.02)
+        # the same poses, but for what lies beyond the 12 digits of the table
+        assert again["working_error_mm"] == pytest.approx(found["proposed_error_mm"], rel=1e-6)
 
     def test_marks_of_proposed_poses(self, made, mount, tmp_path):
         """The light of each lies on the mark that is told, by the place of the stairs."""
@@ -443,7 +446,8 @@ class TestPlan:
         found = robocal(*self.plan("sphere", poses, mount, *self.centre()))
         assert found["verdict"]["code"] == "RANK_DEFICIENT"
         assert "all poses turn about" in found["verdict"]["reason"]
-        assert found["sigma"] is None or found["unobservable"]
+        assert found["sigma"] is None
+        assert found["unobservable"]
 
     def test_one_place_of_the_profile_is_not_enough(self, mount, tmp_path):
         poses = write_part(tmp_path, "poses", same_place(), range(SHOTS))

@@ -1,5 +1,6 @@
 """``robocal hand-eye tracker``: both methods from files, and what it says of wrong files."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,8 +82,13 @@ def test_a_six_axis_arm_needs_no_target_file(tmp_path):
     found = run(tmp_path, "--radius-mm", "19.05", robot="ur10", target=None)
     direct = solve_tracker(data, made.sizes.target, made.sizes.noise)
     xyz_mm = direct.T_flange_sensor[:3, 3] * 1e3
-    # the option's 0.003 deg is not the simulation's 5e-5 rad: the weights differ by 5 %
-    assert found["T_flange_sensor"]["xyz_mm"] == pytest.approx(xyz_mm, abs=0.02)
+    assert found["T_flange_sensor"]["xyz_mm"] == pytest.approx(xyz_mm, abs=1e-6)  # files: 1e-8
+    other = run(
+        tmp_path, "--radius-mm", "19.05", "--joint-sigma-deg", "0.01", robot="ur10", target=None
+    )
+    noise = replace(made.sizes.noise, joint_rad=np.radians(0.01))
+    xyz_mm = solve_tracker(data, made.sizes.target, noise).T_flange_sensor[:3, 3] * 1e3
+    assert other["T_flange_sensor"]["xyz_mm"] == pytest.approx(xyz_mm, abs=1e-6)
 
 
 def test_people_read_the_verdict_first(folder):
@@ -91,6 +97,7 @@ def test_people_read_the_verdict_first(folder):
     first = done.stdout.splitlines()[0]
     assert first.startswith("ACCEPT: ")
     assert "at the working distance" in first
+    assert "Expected error at the working distance: " in done.stdout
 
 
 def test_a_tight_limit_is_a_verdict_not_an_error(folder):

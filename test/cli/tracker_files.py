@@ -13,7 +13,7 @@ SCAN = "scan"
 
 
 def tracker_files(folder: Path, cell: TrackerCell) -> TrackerData:
-    """Write poses.csv, tracker.csv, target.yaml and the profiles; what was measured."""
+    """What was measured, written: scan_poses.csv, tracker.csv, tracker_target.yaml, profiles."""
     data = cell.measure(np.random.default_rng(4))
     (folder / SCAN).mkdir()
     files = [f"{profile.name}.csv" for profile in data.profiles]

@@ -5,6 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from robocal_ros.core import frames
@@ -24,11 +25,16 @@ from robocal_ros.core.hand_eye.board import (
     see_boards,
 )
 from robocal_ros.core.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
-from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form
+from robocal_ros.core.hand_eye.camera_closed_forms import (
+    CLOSED_FORMS,
+    closed_form,
+    closed_form_of_all,
+)
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
-from robocal_ros.core.hand_eye.camera_model import PairState, linearised, moved
-from robocal_ros.core.hand_eye.camera_quality import left_out
+from robocal_ros.core.hand_eye.camera_model import PairState, linearised
+from robocal_ros.core.hand_eye.camera_quality import left_out, unsettled
 from robocal_ros.core.hand_eye.camera_start import robust_start
+from robocal_ros.core.hand_eye.increments import moved
 from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, Shared
 from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
 
@@ -91,6 +97,34 @@ def test_closed_forms_give_both_placements(name: str, mount: str) -> None:
 def test_a_closed_form_that_fails_says_so() -> None:
     _, pairs = measured(3, 2)
     assert closed_form("tsai", pairs.take(np.array([0]))) is None
+
+
+def test_a_start_that_fails_is_refused() -> None:
+    """Tsai's method wants turns of more than 15 deg; these are 3 deg from each other."""
+    rng = np.random.default_rng(1)
+    cell = BoardCell()
+    views = cell.views(rng, 12)
+    views = TruePose(Rotation.from_rotvec(0.1 * views.R.as_rotvec()), views.t)
+    robot, board = cell.read_robot(cell.flange(views), rng), cell.read_board(views, rng)
+    pairs = PosePairs(robot, board, tuple(map(str, range(12))))
+    with pytest.raises(ResidualError, match="tsai does not solve these pairs: use method best"):
+        calibrate_camera(pairs, CameraSettings("tsai"))
+    assert calibrate_camera(pairs).more["closed_forms_mean_mm"]["tsai"] is None
+
+
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_a_closed_form_takes_a_hundred_of_many(name: str) -> None:
+    """From the first sample to the last; what it skips may be anything."""
+    _, pairs = measured(298, 2)
+    T = pairs.T_camera_board.copy()
+    skipped = np.arange(298) % 3 != 0
+    T[skipped, :3, 3] += 1.0
+    at = closed_form(name, replace(pairs, T_camera_board=T))
+    clean = closed_form_of_all(name, pairs.take(~skipped))
+    assert at is not None
+    assert clean is not None
+    assert np.array_equal(at.X, clean.X)
+    assert np.array_equal(at.Z, clean.Z)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -370,6 +404,27 @@ def test_the_expected_error_is_that_at_fresh_poses() -> None:
     assert total / told == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (2.0 * runs)))
 
 
+def test_noise_that_swings_between_two_answers_settles() -> None:
+    """Whole steps go from the robot's position alone to its turn as well, and back."""
+    _, pairs = measured(8, 4, "to-hand")
+    fit = fit_pairs(pairs)
+    assert fit.settled
+    assert unsettled(fit) is None
+
+
+def test_what_is_no_solution_is_not_accepted() -> None:
+    _, pairs = measured(12, 18)
+    fit = fit_pairs(pairs)
+    crept = replace(fit, estimate=replace(fit.estimate, converged=False))
+    for wrong, words in (
+        (replace(fit, settled=False), "the noise did not settle"), (crept, "still crept"),
+    ):  # fmt: skip
+        refused = unsettled(wrong)
+        assert refused is not None
+        assert refused.code is Code.POSES_NOT_INFORMATIVE
+        assert words in refused.reason
+
+
 def test_poses_that_tell_little_are_not_accepted() -> None:
     _, pairs = measured(12, 17)
     found = calibrate_camera(pairs, CameraSettings(limit_m=1e-5))
@@ -612,3 +667,10 @@ def test_what_is_no_image_or_no_board_is_refused() -> None:
             decode_image(data, "x.png")
     with pytest.raises(InputError, match="shows no pose"):
         Chessboard(9, 1, 0.025)
+
+
+def test_a_lens_that_cannot_be_undone_makes_no_image() -> None:
+    cell = BoardCell()
+    view = cell.views(np.random.default_rng(0), 1)
+    with pytest.raises(ValueError, match="cannot be undone"):
+        TrueLens(k1=-3.0).image(view, BOARD.columns, BOARD.rows, BOARD.square_m)

@@ -110,6 +110,37 @@ def test_check_poses_of_another_time_judge() -> None:
     found = calibrate_streams(first, camera, check=second)
     expected = np.sqrt(3.0 * (4e-4**2 + 1e-4**2))
     assert found.more["held_out"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.25)
+    held = found.more["held_out"]["n"]
+    assert held > len(camera.names) // 3
+    assert len(found.samples) + len(found.rejected) + held == len(camera.names)
+
+
+def test_check_poses_are_named_where_they_belong() -> None:
+    """A pause of the check is its own; before the robot's first pose nothing judges."""
+    _, robot, camera = recorded(0.0, "in-hand", 5)
+    late = [robot.time_s >= low for low in (2.0, 11.0)]
+    first, second = (
+        PoseStream(robot.time_s[part], robot.T[part], tuple(np.array(robot.names)[part]))
+        for part in (
+            late[0] & (robot.time_s < 11.0),
+            late[1] & ((robot.time_s < 14.0) | (robot.time_s > 15.0)),
+        )
+    )
+    found = calibrate_streams(first, camera, check=second)
+    time = dict(zip(camera.names, camera.time_s, strict=True))
+    judged = found.more["held_out"]
+    assert judged["rejected"]
+    assert all(13.95 < time[name] < 15.05 for name in judged["rejected"])
+    assert set(judged["rejected_because"].values()) == {"no robot pose at its time"}
+    alone = [name for name, why in found.rejected.items() if why == "no robot pose at its time"]
+    assert any(time[name] < 2.0 for name in alone)
+    assert all(time[name] < 2.05 or 10.95 < time[name] < 11.05 for name in alone)
+
+
+def test_check_poses_that_were_used_are_refused() -> None:
+    _, robot, camera = recorded(0.1, "in-hand", 5)
+    with pytest.raises(InputError, match="other times must judge"):
+        calibrate_streams(robot, camera, check=robot)
 
 
 def test_streams_of_two_runs_are_refused() -> None:

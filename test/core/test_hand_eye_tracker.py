@@ -14,6 +14,7 @@ from robocal_ros.core.errors import (
     ResidualError,
     TooFewSamplesError,
 )
+from robocal_ros.core.hand_eye import tracker
 from robocal_ros.core.hand_eye.profile import Profile
 from robocal_ros.core.hand_eye.tracker import solve_best, solve_tracker, spread
 from robocal_ros.core.hand_eye.tracker_classic import solve_classic
@@ -366,6 +367,22 @@ def test_arcs_that_are_too_few_too_short_or_of_several_joints():
         solve(with_arc(0, moved))
     with pytest.raises(RankDeficientError, match="both of joint 2"):
         solve(with_arc(1, replace(arc, name="arc_b")))
+
+
+def test_a_path_that_is_no_circle():
+    """It bends one way, then the other: circles of ever larger radius are no worse."""
+    arc = noisy().arcs[0]
+    t = np.linspace(-1.0, 1.0, len(arc.q))
+    bent = np.column_stack([0.1 * t, 0.005 * t**3, np.zeros(len(t))])
+    with pytest.raises(ResidualError, match="arc_a: no circle fits its points"):
+        solve(with_arc(0, replace(arc, points=bent)))
+
+
+def test_a_sphere_whose_place_moves_on_is_refused(monkeypatch):
+    """After one round alone: the closed form leaves it more than 10 um off."""
+    monkeypatch.setattr(tracker, "MOST_ROUNDS", 1)
+    with pytest.raises(ResidualError, match="did not settle in 1 rounds"):
+        solve(noisy())
 
 
 def test_axes_that_contradict_the_robot_file():

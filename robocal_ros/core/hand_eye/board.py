@@ -1,7 +1,7 @@
 """A chessboard in images: its corners, the camera's intrinsics, and where the board is."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,8 +191,7 @@ def boards_of_corners(
         kept = np.flatnonzero(~gross).tolist()
         _require(len(kept), intrinsics, out)
         seen = _solve(tuple(names[i] for i in kept), corners[kept], board, size, intrinsics)
-    seen.rejected.update(out)
-    return seen
+    return replace(seen, rejected=out)
 
 
 def _require(count: int, intrinsics: Intrinsics | None, rejected: dict[str, str]) -> None:

@@ -23,6 +23,7 @@ from robocal_ros.core.hand_eye.camera_quality import (
     left_out,
     left_out_of_form,
     rms,
+    unsettled,
     verdict,
     working_error,
 )
@@ -92,8 +93,8 @@ def calibrate_camera(
         When nothing fits them.
     """
     how = settings or CameraSettings()
-    require_sound(pairs, rejected or {})
-    fit = fit_pairs(pairs, how.noise, _start(pairs, how.method))
+    sound = require_sound(pairs, rejected or {})
+    fit = fit_pairs(pairs, how.noise, _start(pairs, how.method), sound)
     _require_no_mistake(fit)
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
     result, state = (_classic if how.method == "classic" else _best)(fit, how)
@@ -105,8 +106,10 @@ def calibrate_camera(
     return result if check is None else _judged(result, check, state)
 
 
-def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
-    """Refuse pairs in which no placement is worth a search, and name the mistake if it is known.
+def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> Placement:
+    """`robust_start`; refuse pairs in which no placement is worth a search.
+
+    The mistake is named if it is known.
 
     Raises
     ------
@@ -117,7 +120,7 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
     sound = robust_start(pairs)
     size_m = score(pairs, sound)
     if size_m <= LARGEST_START_M:
-        return
+        return sound
     words = mistake(pairs, sound)
     if words:
         raise InputError(words)
@@ -129,7 +132,12 @@ def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> None:
 
 
 def _start(pairs: PosePairs, method: str) -> Placement | None:
-    return closed_form(method, pairs) if method in CLOSED_FORMS else None
+    if method not in CLOSED_FORMS:
+        return None
+    start = closed_form(method, pairs)
+    if start is None:
+        raise ResidualError(f"{method} does not solve these pairs: use method best")
+    return start
 
 
 def _forms_document(pairs: PosePairs, forms: Mapping[str, Placement | None]) -> Document:
@@ -214,7 +222,7 @@ def _best(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairState]:
         rejected=_reasons(fit),
         target=_target_document(pairs, fit.at),
         working_error_m=error,
-        verdict=verdict(fit, size, error, how.limit_m),
+        verdict=unsettled(fit) or verdict(fit, size, error, how.limit_m),
         more={"start": how.method} | _forms_document(kept, closed_forms(kept)),
         parent=_parent(pairs),
     )
@@ -244,7 +252,7 @@ def _classic(fit: PairFit, how: CameraSettings) -> tuple[HandEyeResult, PairStat
         leave_one_out_m=left_out_of_form(name, used, at),
         target=_target_document(used, at),
         working_error_m=error_m,
-        verdict=form_verdict(name, size, away_m, error_m, how.limit_m),
+        verdict=unsettled(fit) or form_verdict(name, size, away_m, error_m, how.limit_m),
         more={"start": name} | _forms_document(used, forms),
         parent=_parent(used),
     )

@@ -20,10 +20,17 @@ _LEAST_DETERMINANT = 0.5  # of what OpenCV calls a rotation
 
 
 def closed_form(name: str, pairs: PosePairs) -> Placement | None:
+    """`closed_form_of_all`, of at most 100 of the samples, spread evenly."""
+    if len(pairs) > MOST_COMPARED:
+        pairs = pairs.take(np.linspace(0, len(pairs) - 1, MOST_COMPARED).astype(int))
+    return closed_form_of_all(name, pairs)
+
+
+def closed_form_of_all(name: str, pairs: PosePairs) -> Placement | None:
     """One of ``CLOSED_FORMS`` (cv2.calibrateHandEye, cv2.calibrateRobotWorldHandEye).
 
     OpenCV's five give X alone; Z is then the mean of what the samples make of it. None where
-    OpenCV fails or gives what is no number.
+    OpenCV fails or gives what is no number. Time grows with the square of the samples.
     """
     import cv2
 
@@ -32,6 +39,8 @@ def closed_form(name: str, pairs: PosePairs) -> Placement | None:
         if name in HAND_EYE:
             code = getattr(cv2, f"CALIB_HAND_EYE_{name.upper()}")
             X = _transform(_call(cv2.calibrateHandEye, carrier, board, method=code))
+            if np.array_equal(X, np.eye(4)):  # what OpenCV gives where motions tell too little
+                return None
             Z = _mean(carrier @ X @ board)
         else:
             code = getattr(cv2, f"CALIB_ROBOT_WORLD_HAND_EYE_{name.upper()}")
@@ -49,9 +58,8 @@ def closed_form(name: str, pairs: PosePairs) -> Placement | None:
 
 
 def closed_forms(pairs: PosePairs) -> dict[str, Placement | None]:
-    """Each of OpenCV's, from at most 100 of the samples, spread evenly."""
-    rows = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_COMPARED)).astype(int))
-    return {name: closed_form(name, pairs.take(rows)) for name in CLOSED_FORMS}
+    """Each of OpenCV's."""
+    return {name: closed_form(name, pairs) for name in CLOSED_FORMS}
 
 
 def _call(solve: Callable[..., Any], first: Array, second: Array, method: int) -> Any:

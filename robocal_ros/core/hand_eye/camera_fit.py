@@ -62,12 +62,14 @@ class PairFit:
     ----------
     noise : of both sides, given or estimated.
     expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
+    settled : whether noise and placements agree in the end; where the noise is known they do.
     """
 
     pairs: PosePairs
     noise: PairNoise
     expected: Array
     estimate: Estimate[PairState]
+    settled: bool
 
     @property
     def at(self) -> Placement:
@@ -99,13 +101,9 @@ class PairFit:
     @property
     def whole_covariance(self) -> Array:
         """The same with the common errors (12 + s, 12 + s)."""
-        widened = 1.0 if self.pairs.time_s is None else correlation(self._whitened)
-        return self.estimate.covariance * widened
-
-    @property
-    def _whitened(self) -> Array:
-        root = np.linalg.inv(np.linalg.cholesky(self.expected[~self.rejected]))
-        return np.asarray((root @ self.differences[~self.rejected][..., None])[..., 0])
+        if self.pairs.time_s is None:
+            return self.estimate.covariance
+        return self.estimate.covariance * correlation(self.estimate.residual[~self.rejected])
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -114,11 +112,13 @@ class PairFit:
 
 
 def fit_pairs(
-    pairs: PosePairs, given: GivenNoise | None = None, start: Placement | None = None
-) -> PairFit:
+    pairs: PosePairs, given: GivenNoise | None = None, start: Placement | None = None,
+    sound: Placement | None = None,
+) -> PairFit:  # fmt: skip
     """Find the most likely placements, reject what does not fit, estimate the unknown noise.
 
-    ``start``: where the search begins; default `robust_start`.
+    ``start``: where the search begins; default ``sound``. ``sound``: a placement near the truth,
+    from which the noise is guessed; default `robust_start`.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def fit_pairs(
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
     free = np.isnan(known)
-    sound = robust_start(pairs)
+    sound = robust_start(pairs) if sound is None else sound
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
     state = PairState(start or sound, np.zeros(count))
     enough = len(pairs) >= _ENOUGH_TO_DOUBT
@@ -144,16 +144,17 @@ def fit_pairs(
             noise_known=enough or not np.any(free),
             robust=enough,
         )
-        before, state, X = noise, found.state, found.state.at.X
+        before, settled, state, X = noise, True, found.state, found.state.at.X
         if np.any(free) and enough:
             miss, J = linearised(pairs, state)
             keep = ~found.rejected
             used = pairs if np.all(keep) else pairs.take(keep)
             seen = Evidence.of(used, X, miss[keep], J[keep], state.common)
-            noise = estimate(seen, free, noise)
-        if _same(before, noise):
+            noise, settled = estimate(seen, free, noise)
+        settled = settled and _same(before, noise)
+        if settled:
             break
-    return PairFit(pairs, noise, V, found)
+    return PairFit(pairs, noise, V, found, settled)
 
 
 def _same(before: PairNoise, after: PairNoise) -> bool:

@@ -131,7 +131,6 @@ def wrong_scale(pairs: PosePairs, at: Placement) -> str:
 
 def mistake(pairs: PosePairs, at: Placement) -> str:
     """The mistake that explains why pairs fit badly, in words; empty where none does."""
-    scale = wrong_scale(pairs, at)
     now = score(pairs, at)
     robot, board = pairs.T_base_flange, pairs.T_camera_board
     turned = replace(pairs, T_base_flange=frames.invert(robot))
@@ -151,11 +150,11 @@ def mistake(pairs: PosePairs, at: Placement) -> str:
                     f"each board pose fits the robot pose {lag} row(s) {words} its own: the pairs "
                     "are shifted"
                 ] = _shifted(pairs, sign)
-    scores = {words: score(other, robust_start(other)) for words, other in tries.items()}
+    scores = {words: score(tried, robust_start(tried)) for words, tried in tries.items()}
     best = min(scores, key=lambda words: scores[words])
     if scores[best] < CLEARLY_BETTER * now:
         return best
-    return scale
+    return wrong_scale(pairs, at)
 
 
 def _right_handed(pairs: PosePairs) -> dict[str, PosePairs]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.increments import moved
 from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
 
 Array = NDArray[np.float64]
@@ -25,12 +26,6 @@ class PairState:
 
     at: Placement
     common: Array
-
-
-def moved(T: Array, step: Array) -> Array:
-    """A pose (4, 4) after an increment (v, w) along its own axes."""
-    R = T[:3, :3]
-    return frames.transform(R @ frames.exp_rotation(step[3:]), T[:3, 3] + R @ step[:3])
 
 
 def linearised(pairs: PosePairs, state: PairState) -> tuple[Array, Array]:

@@ -25,8 +25,9 @@ SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data
 _NORMAL_MEDIAN = 1.538  # median length of three unit normals
 _GENEROUS = 2.0
 _LEAST_TOLD = 1e-6  # of what the samples would tell of a variance without unknowns
-_ROUNDS = 8
+_ROUNDS, _WHOLE_STEPS = 60, 8
 _SETTLED = 1e-2
+_FAINT = 1e-6  # of the largest that a variance has been: as good as none
 
 
 @dataclass(frozen=True)
@@ -136,16 +137,21 @@ class Evidence:
         )
 
 
-def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> PairNoise:
-    """Variances of the ``free`` components (3,); ``noise`` holds the others and the start."""
-    theta = noise.variances
-    for _ in range(_ROUNDS):
+def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> tuple[PairNoise, bool]:
+    """Variances of the ``free`` components (3,); ``noise`` holds the others and the start.
+
+    And whether they settled.
+    """
+    theta = largest = noise.variances
+    for turn in range(_ROUNDS):
         new = _round(seen, theta, free)
-        settled = np.all(np.abs(new - theta) <= _SETTLED * np.maximum(new, theta))
-        theta = new
-        if settled:
-            break
-    return _noise(theta)
+        largest = np.maximum(largest, new)
+        size = np.maximum(np.maximum(new, theta), _FAINT * largest)
+        if np.all(np.abs(new - theta) <= _SETTLED * size):
+            return _noise(new), True
+        # whole steps may swing between two answers for ever
+        theta = new if turn < _WHOLE_STEPS else 0.5 * (theta + new)
+    return _noise(theta), False
 
 
 def _round(seen: Evidence, theta: Array, free: NDArray[np.bool_]) -> Array:

@@ -38,8 +38,7 @@ def left_out(fit: PairFit) -> Array | None:
     rest = np.eye(6) - J @ M @ J.swapaxes(1, 2)
     if float(np.linalg.eigvalsh(rest).min()) < LEAST_REST:
         return None
-    whitened = np.linalg.solve(root, fit.differences[used][..., None])
-    alone = root @ np.linalg.solve(rest, whitened)
+    alone = root @ np.linalg.solve(rest, fit.estimate.residual[used][..., None])
     return np.asarray(np.linalg.norm(alone[:, :3, 0], axis=1))
 
 
@@ -67,8 +66,19 @@ def working_error(fit: PairFit) -> float:
     return float(np.sqrt(np.trace(J @ fit.covariance[:6, :6] @ J.T)))
 
 
+def unsettled(fit: PairFit) -> Verdict | None:
+    """Refuse a fit that is no solution; None where it is one."""
+    if fit.estimate.converged and fit.settled:
+        return None
+    return Verdict(
+        Code.POSES_NOT_INFORMATIVE,
+        fit.estimate.creeping
+        or "the noise did not settle; measure at more poses, or give the robot's noise",
+    )
+
+
 def verdict(fit: PairFit, size: Array, error_m: float, limit_m: float) -> Verdict:
-    """Whether a fit may be used; ``size`` (n,) of the residuals used, m."""
+    """Whether a solution may be used; ``size`` (n,) of the residuals used, m."""
     count, total = len(size), len(fit.pairs)
     words = (
         f"{count} of {total} samples within {rms(size) * 1e3:.3f} mm rms; expected error "

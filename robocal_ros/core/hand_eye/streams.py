@@ -34,6 +34,7 @@ LONGEST_GAP = 5.0  # usual periods between two robot poses that are interpolated
 _FREE_S = 0.5  # prior sigma of what is left of the offset
 _CLOSE_S = 1e-6
 _ROUNDS = 12
+_ALONE = "no robot pose at its time"
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,10 +210,9 @@ def pair_streams(
     """
     offset = coarse_offset(robot, camera)
     pairs, left_out = pairs_at(robot, camera, offset, mount)
-    require_sound(pairs, {})
-    fit = fit_pairs(pairs, given)
+    fit = fit_pairs(pairs, given, sound=require_sound(pairs, {}))
     for _ in range(_ROUNDS):
-        fit = fit_pairs(_with_offset(robot, pairs, fit, offset), given, fit.at)
+        fit = fit_pairs(_with_offset(robot, pairs, fit, offset), given, fit.at, fit.at)
         step = float(fit.estimate.state.common[0])
         offset += step
         pairs, left_out = pairs_at(robot, camera, offset, mount)
@@ -242,17 +242,33 @@ def calibrate_streams(
     Raises
     ------
     InputError, TooFewSamplesError, RankDeficientError, ResidualError
-        As `pair_streams` and `calibrate_camera`.
+        As `pair_streams` and `calibrate_camera`; a check of times that were used to solve.
     """
     how = settings or CameraSettings()
     found = pair_streams(robot, camera, mount, how.noise)
-    judges = None
-    if check is not None:  # the common error is the offset, which is in the times already
-        judges = CheckPairs(pairs_at(check, camera, found.offset_s, mount)[0])
+    judges = None if check is None else _judges(found, check, camera)
+    elsewhere = set() if judges is None else {*judges.pairs.names, *judges.rejected}
     return calibrate_camera(
         found.pairs,
         how,
         check=judges,
-        rejected=dict.fromkeys(found.left_out, "no robot pose at its time"),
+        rejected={name: _ALONE for name in found.left_out if name not in elsewhere},
         more={"time_offset_s": found.offset_s, "time_offset_sigma_s": found.sigma_s},
     )
+
+
+def _judges(found: StreamPairs, check: PoseStream, camera: PoseStream) -> CheckPairs:
+    """Pairs of the check's stretch, and the camera poses there that have none of the robot."""
+    # the common error is the offset, which is in the times already
+    pairs = pairs_at(check, camera, found.offset_s, found.pairs.mount)[0]
+    used, held = set(found.pairs.names), set(pairs.names)
+    twice = [name for name in pairs.names if name in used]
+    if twice:
+        raise InputError(
+            f"{len(twice)} of the camera's poses, first {twice[0]}, lie in the robot's stream and "
+            "in that of the check: other times must judge"
+        )
+    time = camera.time_s + found.offset_s
+    there = (time >= check.time_s[0]) & (time <= check.time_s[-1])
+    alone = set(np.array(camera.names)[there].tolist()) & set(found.left_out) - held
+    return CheckPairs(pairs, {name: _ALONE for name in found.left_out if name in alone})

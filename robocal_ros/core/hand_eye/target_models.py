@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.increments import moved, tangents
 from robocal_ros.core.hand_eye.sightings import Index, Seen, in_plane
 
 Array = NDArray[np.float64]
@@ -110,7 +111,7 @@ class LineModel:
         slope[:, 2] = 0.0
         spread = np.zeros((len(s), 3, len(self.names)))
         if not self.known:
-            across = _across(direction)
+            across = tangents(direction)
             spread[:, :, :2] = across
             spread[:, :, 2:] = along[:, None, None] * across
         value = np.column_stack([p[:, 0], p[:, 2], np.zeros(len(p))])
@@ -120,7 +121,7 @@ class LineModel:
         """The line after a step across it."""
         if self.known:
             return place
-        across = _across(place[1])
+        across = tangents(place[1])
         direction = place[1] + across @ step[2:]
         return np.stack([place[0] + across @ step[:2], direction / np.linalg.norm(direction)])
 
@@ -136,13 +137,6 @@ class LineModel:
     def take(self, rows: NDArray[np.bool_] | Index) -> "LineModel":
         """The same for all sightings."""
         return self
-
-
-def _across(direction: Array) -> Array:
-    """Two unit vectors (3, 2) across a unit direction, and each other."""
-    first = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
-    first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(direction, first)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +198,7 @@ class CornerModel:
         """The user frame after a step along its own axes."""
         if self.information is None:
             return place
-        return np.asarray(place @ frames.transform(frames.exp_rotation(step[3:]), step[:3]))
+        return moved(place, step)
 
     def deviation(self, place: Array) -> Array:
         """How far the user frame is from the taught one."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ResidualError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.hand_eye.quality import (
     HandEyeSettings,
@@ -23,11 +24,10 @@ from robocal_ros.core.hand_eye.quality import (
 from robocal_ros.core.hand_eye.result import HandEyeResult, Method, point_covariance
 from robocal_ros.core.hand_eye.tracker_classic import Classic, each_without, solve_classic
 from robocal_ros.core.hand_eye.tracker_cube import Cube
-from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise, TrackerTarget
+from robocal_ros.core.hand_eye.tracker_data import FACES, TrackerData, TrackerNoise, TrackerTarget
 from robocal_ros.core.hand_eye.tracker_features import Lines, fit_caps, fit_lines
 from robocal_ros.core.hand_eye.tracker_problem import TrackerProblem, sphere_in
 from robocal_ros.core.hand_eye.tracker_quality import (
-    FACES,
     misfit,
     profile_distances,
     states_without,
@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 
 LIMIT_M = 5e-4  # of the error to expect at the working distance
 SMALLEST_NOISE_M = 1e-7  # no sensor sees less; keeps data without noise solvable
-ROUNDS = 2  # the sphere is linear only near its place
+MOST_ROUNDS, NEAR_M = 10, 1e-5  # the sphere is linear only near its place
 
 
 def solve_tracker(
@@ -163,6 +163,8 @@ def solve_best(
     ------
     TooFewSamplesError, RankDeficientError
         As `core.estimation.solve`.
+    ResidualError
+        When the place of the sphere does not settle.
     """
     fits = [fit_lines(scan, name) for scan, name in zip(classic.parts, FACES, strict=False)]
     scatter_m = float(np.sqrt(np.mean([scatter**2 for _, scatter in fits])))
@@ -170,13 +172,18 @@ def solve_best(
     lines = [_with_noise(lines, noise_m) for lines, _ in fits]
     state = _state(classic)
     axes = AxisPair.of(data, classic.axes)
-    for _ in range(ROUNDS):
+    for _ in range(MOST_ROUNDS):
         place = sphere_in(state.sensor_poses(data.motion), state.centre)
         caps = fit_caps(classic.parts[2], place, target.sphere_radius_m, noise_m)
         problem = TrackerProblem(data, target, noise, state, axes, lines, caps)
         estimate = solve(problem, state)
         state = estimate.state
-    return problem, estimate
+        if np.abs(sphere_in(state.sensor_poses(data.motion), state.centre) - place).max() < NEAR_M:
+            return problem, estimate
+    raise ResidualError(
+        f"the place of the sphere in the profiles did not settle in {MOST_ROUNDS} rounds: scan "
+        "more of it, and check the robot file"
+    )
 
 
 def _with_noise(lines: Lines, noise_m: float) -> Lines:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.errors import RankDeficientError, ResidualError, RobocalError
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
+from robocal_ros.core.hand_eye.increments import tangents
 from robocal_ros.core.hand_eye.tracker_cube import (
     PARALLEL_FACES,
     Cube,
@@ -282,6 +283,5 @@ def _reversed(scan: Scan) -> Scan:
 
 def _rotation_from_y(direction: Array) -> Array:
     """A rotation (3, 3) whose y column is a unit vector (3,)."""
-    side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-    side /= np.linalg.norm(side)
-    return np.column_stack([side, direction, np.cross(side, direction)])
+    side, back = tangents(direction).T
+    return np.column_stack([side, direction, -back])

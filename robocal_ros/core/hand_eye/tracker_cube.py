@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import RankDeficientError, ResidualError
+from robocal_ros.core.fitting.profile_noise import MAD
+from robocal_ros.core.hand_eye.tracker_data import FACES
 from robocal_ros.core.hand_eye.tracker_flange import angle_between, two_axis_frame
 
 Array = NDArray[np.float64]
@@ -19,7 +21,6 @@ Array = NDArray[np.float64]
 NARROWEST_M = 5e-3  # rms extent of the points on a face in its narrower direction
 REJECT = 5.0  # standard deviations
 LARGEST_SCATTER = 10.0  # of the points of a face, over the tracker's noise
-MAD = 1.4826  # standard deviation by the median distance
 PARALLEL_FACES = float(np.cos(np.radians(20.0)))
 
 
@@ -98,7 +99,7 @@ def tracked_cube(
         When the points of a face miss a plane, or those of the sphere's centre differ.
     """
     first, second = outward(
-        *(_tracked_face(f"face_{i + 1}", points, sigma_m) for i, points in enumerate(faces))
+        *(_tracked_face(*face, sigma_m) for face in zip(FACES, faces, strict=True))
     )
     normals = np.array([first.normal, second.normal])
     if abs(normals[0] @ normals[1]) > PARALLEL_FACES:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 
+FACES = ("face_1", "face_2")
 MOVED = 1e-3  # rad or m: a joint that changes by less stands still
 FEWEST_ARC_POINTS = 6
 FEWEST_FACE_POINTS = 4
@@ -117,7 +119,7 @@ class TrackerData:
         """
         if len(self.sphere) < 1:
             raise TooFewSamplesError("the tracker measured no centre of the sphere")
-        for name, points in zip(("face_1", "face_2"), self.faces, strict=True):
+        for name, points in zip(FACES, self.faces, strict=True):
             if len(points) < FEWEST_FACE_POINTS:
                 raise TooFewSamplesError(
                     f"{name} has {len(points)} tracker points (at least {FEWEST_FACE_POINTS}): "
@@ -128,7 +130,7 @@ class TrackerData:
                 f"the scan has {len(self.profiles)} profiles (at least {FEWEST_PROFILES})"
             )
 
-    @property
+    @cached_property
     def motion(self) -> Array:
         """Flange pose of each profile in that of the first: T_flange0_flange (m, 4, 4)."""
         return self.relative(self.q)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.fitting.profile_noise import MAD
 from robocal_ros.core.hand_eye.tracker_scan import Scan
 
 Array = NDArray[np.float64]
@@ -21,7 +22,6 @@ FEWEST_LINES = 4
 REJECT = 4.5  # standard deviations
 STEEPEST = 0.25  # cosine between beam and normal below which a point of the sphere tells little
 FAINT = 1e-9  # share of the largest information below which a combination tells nothing
-_MAD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def fit_lines(scan: Scan, name: str) -> tuple[Lines, float]:
         if last:
             noise = float(np.sqrt(np.sum(miss[shown] ** 2) / freedom))
         else:
-            noise = _MAD * float(np.median(np.abs(miss[shown])))
+            noise = MAD * float(np.median(np.abs(miss[shown])))
             used = used & (np.abs(miss) <= REJECT * noise)
     seen &= spread > 0.0
     lines = Lines(

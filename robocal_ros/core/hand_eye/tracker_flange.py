@@ -29,6 +29,7 @@ LARGEST_SCATTER = 10.0  # of a path's points, over the tracker's noise
 RAYLEIGH = 1.177  # median distance over the standard deviation of a coordinate
 MOST_REJECTED = 0.2
 LARGEST_SKEW_RAD = float(np.radians(1.0))  # of the axes, against the nominal geometry
+MOST_ROUNDS, SETTLED_M = 50, 1e-10  # of a circle
 PARALLEL = float(np.sin(np.radians(5.0)))
 
 
@@ -74,12 +75,14 @@ def fit_axis(arc: Arc, joint: int, slides: bool, sigma_m: float) -> Axis:
     TooFewSamplesError
         When the path is too short.
     ResidualError
-        When they scatter ten times more than the tracker does, or more than a fifth are wild.
+        When they scatter ten times more than the tracker does, more than a fifth are wild, or no
+        circle fits them.
     """
     used = np.ones(len(arc.points), dtype=np.bool_)
     while True:
         points, counts = arc.points[used], arc.q[used, joint]
-        direction, centre, miss = (_line if slides else _circle)(points, counts)
+        fit = _line(points, counts) if slides else _circle(arc.name, points, counts)
+        direction, centre, miss = fit
         scatter = float(np.median(miss)) / RAYLEIGH
         if scatter > LARGEST_SCATTER * sigma_m:
             _refuse_path(arc, joint, slides, scatter, sigma_m)
@@ -111,26 +114,37 @@ def _line(points: Array, counts: Array) -> tuple[Array, Array, Array]:
     return direction * np.sign(along @ (counts - counts.mean())), centre, miss
 
 
-def _circle(points: Array, counts: Array) -> tuple[Array, Array, Array]:
+def _circle(name: str, points: Array, counts: Array) -> tuple[Array, Array, Array]:
     """Plane, then circle in it: to first order the axial and the radial distances part so."""
     middle = points.mean(axis=0)
     basis = np.linalg.svd(points - middle, full_matrices=False)[2]
     local = (points - middle) @ basis.T
     xy, height = local[:, :2], local[:, 2]
-    rows = np.column_stack([2.0 * xy, np.ones(len(xy))])  # Kasa's circle as the start
-    start = np.linalg.lstsq(rows, np.sum(xy**2, axis=1), rcond=None)[0]
-    centre, radius = start[:2], float(np.sqrt(start[2] + start[:2] @ start[:2]))
-    for _ in range(5):
-        away = xy - centre
-        distance = np.linalg.norm(away, axis=1)
-        rows = np.column_stack([away / distance[:, None], np.ones(len(xy))])
-        step = np.linalg.lstsq(rows, distance - radius, rcond=None)[0]
-        centre, radius = centre + step[:2], radius + float(step[2])
+    centre, radius = _plane_circle(name, xy)
     away = xy - centre
     miss = np.hypot(height, np.linalg.norm(away, axis=1) - radius)
     a, b = (away[np.argsort(counts)][part] for part in (slice(None, -1), slice(1, None)))
     turn = float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) * np.linalg.det(basis)
     return basis[2] * np.sign(turn), middle + centre @ basis[:2], miss
+
+
+def _plane_circle(name: str, xy: Array) -> tuple[Array, float]:
+    """Centre (2,) and radius of the circle nearest to points (n, 2)."""
+    rows = np.column_stack([2.0 * xy, np.ones(len(xy))])  # Kasa's circle as the start
+    start = np.linalg.lstsq(rows, np.sum(xy**2, axis=1), rcond=None)[0]
+    centre, radius = start[:2], float(np.sqrt(start[2] + start[:2] @ start[:2]))
+    for _ in range(MOST_ROUNDS):
+        away = xy - centre
+        distance = np.linalg.norm(away, axis=1)
+        rows = np.column_stack([away / distance[:, None], np.ones(len(xy))])
+        step = np.linalg.lstsq(rows, distance - radius, rcond=None)[0]
+        centre, radius = centre + step[:2], radius + float(step[2])
+        if np.linalg.norm(step) < SETTLED_M:
+            return centre, radius
+    raise ResidualError(
+        f"{name}: no circle fits its points (a fit did not settle in {MOST_ROUNDS} rounds): check "
+        "that the reflector sits firmly and that one joint alone moved, or drive a longer arc"
+    )
 
 
 def _require_long(

@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.increments import tangents
 from robocal_ros.core.hand_eye.tracker_data import (
+    FACES,
     MOVED,
     Arc,
     TrackerData,
@@ -33,7 +35,6 @@ from robocal_ros.core.hand_eye.tracker_state import (
     UNKNOWNS,
     TrackerState,
     adjoint,
-    tangents,
 )
 
 Array = NDArray[np.float64]
@@ -84,7 +85,7 @@ class TrackerProblem:
         found: list[str] = []
         for name, points in parts:
             found += [f"{name} {i + 1}" for i in range(len(points)) for _ in range(3)]
-        for name, points in zip(("face_1", "face_2"), self.data.faces, strict=True):
+        for name, points in zip(FACES, self.data.faces, strict=True):
             found += [f"{name} {i + 1}" for i in range(len(points))]
         found += ["axes"] * 2
         found += ["height"] if self.target.height_m is not None else []

@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
 from robocal_ros.core.estimation import Estimate
-from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerTarget
+from robocal_ros.core.hand_eye.tracker_data import FACES, TrackerData, TrackerTarget
 from robocal_ros.core.hand_eye.tracker_problem import TrackerProblem
 from robocal_ros.core.hand_eye.tracker_scan import Scan
 from robocal_ros.core.hand_eye.tracker_state import TrackerState
 
 Array = NDArray[np.float64]
 
-FACES = ("face_1", "face_2")
 LARGEST_SCALE = 3.0  # of residuals over the noise that was told
 LEAST_REST = 1e-6  # what the others say about a profile, where they say anything
 

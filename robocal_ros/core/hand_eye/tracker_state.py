@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.increments import moved, tangents
+from robocal_ros.core.hand_eye.tracker_data import FACES
 
 Array = NDArray[np.float64]
 
@@ -21,8 +23,7 @@ NAMES = tuple(
         ("sensor in flange", ("x", "y", "z", "turn x", "turn y", "turn z")),
         ("reflector", ("x", "y", "z")),
         ("sphere", ("x", "y", "z")),
-        ("face_1", ("tilt", "turn")),
-        ("face_2", ("tilt", "turn")),
+        *((face, ("tilt", "turn")) for face in FACES),
         ("face offset", ("1", "2")),
         ("axes", ("angle", "gap")),
     )
@@ -57,8 +58,8 @@ class TrackerState:
         )
         normals = self.normals + tilts
         return TrackerState(
-            T_tracker_flange=_moved(self.T_tracker_flange, step[FLANGE]),
-            T_flange_sensor=_moved(self.T_flange_sensor, step[SENSOR]),
+            T_tracker_flange=moved(self.T_tracker_flange, step[FLANGE]),
+            T_flange_sensor=moved(self.T_flange_sensor, step[SENSOR]),
             reflector=self.reflector + step[REFLECTOR],
             centre=self.centre + step[CENTRE],
             normals=normals / np.linalg.norm(normals, axis=1)[:, None],
@@ -69,17 +70,6 @@ class TrackerState:
     def sensor_poses(self, motion: Array) -> Array:
         """T_tracker_sensor (m, 4, 4) of the profiles, from their T_flange0_flange (m, 4, 4)."""
         return np.asarray(self.T_tracker_flange @ motion @ self.T_flange_sensor)
-
-
-def _moved(T: Array, twist: Array) -> Array:
-    return np.asarray(T @ frames.transform(frames.exp_rotation(twist[3:]), twist[:3]))
-
-
-def tangents(normal: Array) -> Array:
-    """Two unit vectors (3, 2) square to a unit vector (3,) and to each other."""
-    side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    side /= np.linalg.norm(side)
-    return np.column_stack([side, np.cross(normal, side)])
 
 
 def adjoint(T: Array) -> Array:
