@@ -6,7 +6,6 @@ docs/hand_eye_node.md.
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import Head, hand_eye_kind
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.decision_services import DecisionServices
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -26,6 +25,7 @@ from robocal_ros.nodes.frame_watch import FrameWatch
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
+from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
@@ -64,13 +64,7 @@ class HandEyeNode(HouseNode):
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
         self._config = session_config(settings)
-        self._serial_in_use = settings["serial"] or NO_SERIAL
-        folder = settings["state_dir"]
-        self._history = CalibrationHistory.open(
-            self._serial_in_use,
-            model_hash=self._nominal.model_hash,
-            state_dir=Path(folder) if folder else None,
-        )
+        self._serial_in_use, self._history = open_history(settings, self._nominal)
         self._kind = hand_eye_kind(self._config.sensor_frame)
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
         self._guard = SourceGuard(self, JOINTS)
@@ -253,8 +247,7 @@ class HandEyeNode(HouseNode):
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        if self._serial_in_use == NO_SERIAL:
-            health.worsen(WARN, "no serial is set: the history is kept as 'unset'")
+        warn_without_serial(health, self._serial_in_use)
         health.values = values
         return health
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.hand_eye.target_documents import KIND_OF, Document, target_document
+from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import pose_settings
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
@@ -26,7 +27,7 @@ def _range_fault(values: list[float]) -> str | None:
 
 SETTINGS = (
     Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
-    Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    STATE_DIR,
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
     Setting("sensor_frame", "sensor", "Name of the sensor's frame, in its messages and on tf"),
