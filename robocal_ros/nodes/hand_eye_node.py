@@ -117,12 +117,9 @@ class HandEyeNode(HouseNode):
             session = self._session
             if session is None:
                 return
-            if kind == JOINTS:
-                if not session.received[JOINTS]:
-                    self._guard.look()
-                if self._guard.fault:
-                    session.refuse(JOINTS, InputError(self._guard.fault))
-                    return
+            if kind == JOINTS and (fault := self._guard.fault_at(session.received[JOINTS])):
+                session.refuse(JOINTS, InputError(fault))
+                return
             take_hand_eye_message(session, kind, message)
             if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
                 self._newest_ns = session.newest_joints_ns

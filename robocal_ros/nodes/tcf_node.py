@@ -135,10 +135,8 @@ class TcfNode(HouseNode):
             if session is None:
                 return
             if kind == JOINTS:
-                if not session.received[JOINTS]:
-                    self._guard.look()
-                if self._guard.fault:
-                    session.ignored.add(JOINTS, self._guard.fault)
+                if fault := self._guard.fault_at(session.received[JOINTS]):
+                    session.ignored.add(JOINTS, fault)
                     return
                 if self._motion is not None:
                     self._motion.take(message)

@@ -113,10 +113,9 @@ class ThermalNode(HouseNode):
             session = self._session
             if session is None:
                 return
-            if kind == JOINTS and not session.desk.received[JOINTS]:
-                self._guard.look()
-            if kind == JOINTS and self._guard.fault:
-                session.desk.ignored.add(JOINTS, self._guard.fault)
+            desk = session.desk
+            if kind == JOINTS and (fault := self._guard.fault_at(desk.received[JOINTS])):
+                desk.ignored.add(JOINTS, fault)
                 return
             take_message(session, kind, message)
             if session.waiting:
