@@ -87,7 +87,7 @@ class HandEyeNode(HouseNode):
         self._last: Outcome | None = None
         self._shown: tuple[int, int] | None = None
         self._on_tf: int | None = None  # the revision
-        self._silence, self._newest_ns = Silence(), 0
+        self._silence = Silence()
         self._show_in_force()
         self._outputs.status(self._session, None)
 
@@ -121,9 +121,7 @@ class HandEyeNode(HouseNode):
                 session.refuse(JOINTS, InputError(fault))
                 return
             take_hand_eye_message(session, kind, message)
-            if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
-                self._newest_ns = session.newest_joints_ns
-                self._silence.heard(time.monotonic())
+            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
             if (command := session.recognised()) is not None:
                 self._desk.ask(command)
 

@@ -102,7 +102,7 @@ class TcfNode(HouseNode):
         self._last: Outcome | None = None
         self._run_end: Future = Future()
         self._shown: tuple[int, int, int] | None = None
-        self._silence, self._newest_ns = Silence(), 0
+        self._silence = Silence()
         if self._motion is not None:
             self._motion.activate(self._session)
         self._show_in_force()
@@ -143,9 +143,7 @@ class TcfNode(HouseNode):
             elif self._motion is not None:
                 self._motion.beam(message)
             take_tool_message(session, kind, message)
-            if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
-                self._newest_ns = session.newest_joints_ns
-                self._silence.heard(time.monotonic())
+            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
             if (command := session.recognised()) is not None:
                 self._desk.ask(command)
             elif session.waiting:
