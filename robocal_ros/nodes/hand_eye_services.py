@@ -105,15 +105,14 @@ class HandEyeServices:
         return response
 
     def _result_twin(self, request: Any, response: Any) -> Any:
-        """How the newest capture ended; while it waits: no success, with CONFLICT."""
+        """How the newest capture ended; while it waits: no success, with NONE."""
         data = self._session.data
         if data is None or not data.captures:
             response.message = trigger_text(0, Code.CONFLICT, "nothing was captured yet")
             return response
         last = data.captures[max(data.captures)]
         response.success = last.code is Code.ACCEPT
-        code = Code.CONFLICT if last.code is Code.NONE else last.code
-        response.message = trigger_text(last.handle, code, last.reason)
+        response.message = trigger_text(last.handle, last.code, last.reason)
         return response
 
     async def _remove(self, request: Any, response: Any) -> Any:

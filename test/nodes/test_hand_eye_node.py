@@ -200,7 +200,7 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
         sensor.robot.rest(0.1)
         assert call("capture")[1].startswith(f"{number} ACCEPT")
         waits = call("result")
-        assert (waits[0], waits[1].split()[:2]) == (False, [str(number), "CONFLICT"])
+        assert (waits[0], waits[1].split()[:2]) == (False, [str(number), "NONE"])
         sensor.robot.rest(0.7, shot)
         sensor.ended(number)
         done = call("result")
@@ -209,6 +209,19 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
     assert call("accept") == (True, "1 ACCEPT revision 1: calibration 1 in force")
     assert call("rollback") == (True, "0 ACCEPT revision 2: nothing in force")
     assert call("remove") == (True, "0 ACCEPT capture 8 removed, 7 samples are left")
+
+
+def test_a_plc_that_asks_while_it_is_none_hears_of_a_clock_that_jumps(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    assert sensor.start().success
+    assert graph.call(Trigger, f"{NAME}/capture_trigger").success
+    assert graph.call(Trigger, f"{NAME}/result_trigger").message.startswith("1 NONE waits for")
+    sensor.robot.now_ns -= 60 * 10**9
+    sensor.robot.rest(0.1)
+    sensor.ended(1)
+    told = graph.call(Trigger, f"{NAME}/result_trigger")
+    assert (told.success, told.message) == (False, "1 CONFLICT the clock jumped back: capture again")
 
 
 def test_a_capture_comes_after_all_that_the_node_has_received(
