@@ -21,7 +21,9 @@ from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.decision_services import DecisionServices
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.frame_watch import FrameWatch
+from robocal_ros.nodes.hand_eye_files import HandEyeFiles
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
@@ -72,7 +74,9 @@ class HandEyeNode(HouseNode):
         for kind, (message_type, profile) in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), profile)
         self._desk = CommandDesk(self, COMMAND_S, self._show)
-        HandEyeServices(self, settings, self._desk.ask, lambda: self._session, self._history)
+        ask, session = self._desk.ask, self._running
+        self._files = HandEyeFiles(self, ask, session, self._history)
+        HandEyeServices(self, settings, ask, self._files, session, self._history)
         DecisionServices(self.add_service, self._ask_decision, self._history, self._kind)
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(WATCH_S, self._watch, steady=True)
@@ -109,6 +113,11 @@ class HandEyeNode(HouseNode):
         if self._history is not None:
             self._history.close()
         self._history = None
+
+    def _running(self) -> HandEyeSession:
+        if self._session is None:
+            raise NotActiveError("no session: activate the node")
+        return self._session
 
     # ---- samples and commands -------------------------------------------------------------------
 
@@ -174,6 +183,7 @@ class HandEyeNode(HouseNode):
         self._last = outcome
         self._publish(name, lambda: self._outputs.event(outcome.command, outcome))
         if name == CALIBRATE:
+            self._publish(name, lambda: self._files.keep(outcome))
             self._publish(name, lambda: self._show_quality(outcome))
         self._publish(name, self._show_in_force)
         self._publish(name, lambda: self._outputs.status(session, outcome))

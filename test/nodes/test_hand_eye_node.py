@@ -221,7 +221,10 @@ def test_a_plc_that_asks_while_it_is_none_hears_of_a_clock_that_jumps(
     sensor.robot.rest(0.1)
     sensor.ended(1)
     told = graph.call(Trigger, f"{NAME}/result_trigger")
-    assert (told.success, told.message) == (False, "1 CONFLICT the clock jumped back: capture again")
+    assert (told.success, told.message) == (
+        False,
+        "1 CONFLICT the clock jumped back: capture again",
+    )
 
 
 def test_a_capture_comes_after_all_that_the_node_has_received(
