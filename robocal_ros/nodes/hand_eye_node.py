@@ -201,7 +201,7 @@ class HandEyeNode(HouseNode):
         if history is None:
             return
         frame = str(history.model(number)["parent"]) if number else self._config.flange_frame
-        self._outputs.quality(outcome, frame, history.get(number) if number else None)
+        self._outputs.quality(outcome, frame)
 
     def _show_in_force(self) -> None:
         """Put the sensor in force onto tf and record the new state, when either changed."""

@@ -116,7 +116,7 @@ class HandEyeServices:
         outcome = await self._files.calibrate(Command(CALIBRATE, arguments))
         document = outcome.document or {}
         response.candidate_id, response.samples = outcome.calibration_id, outcome.samples
-        response.expected_error_mm = -1.0
+        response.expected_error_mm = response.residual_mm = -1.0
         response.unobservable = list(document.get("unobservable", ()))
         if outcome.calibration_id:
             model = self._history.model(outcome.calibration_id)

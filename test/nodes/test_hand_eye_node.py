@@ -73,6 +73,12 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     graph.spin_until(lambda: quality, "the verdict")
     assert (quality[-1].candidate_id, quality[-1].accept) == (result.candidate_id, True)
     assert quality[-1].predicted_rms_mm == pytest.approx(result.expected_error_mm)
+    names = ("mean", "rms", "p95", "max")
+    mean, rms, p95, most = (getattr(quality[-1], f"candidate_{name}_mm") for name in names)
+    assert 0.0 < mean < rms < most
+    assert mean < p95 < most  # between the two largest of ten
+    assert {getattr(quality[-1], f"current_{name}_mm") for name in names} == {-1.0}
+    assert (quality[-1].rank, quality[-1].condition) == (0, -1.0)
     assert quality[-1].header.frame_id == "tool0"
     # Nothing is in force before somebody accepts it.
     assert [m for m in tf if m.transforms] == []
@@ -128,6 +134,7 @@ def test_a_moving_robot_is_not_captured_and_a_sample_is_removed(graph: Any, tmp_
     graph.spin_until(lambda: [s.handle for s in sensor.status[-1].samples] == [1, 3], "the status")
     few = sensor.calibrate()
     assert (few.success, few.status, few.candidate_id) == (False, Code.TOO_FEW_SAMPLES, 0)
+    assert (few.expected_error_mm, few.residual_mm) == (-1.0, -1.0)
     assert sensor.calibrate(handles=[2]).status == Code.BAD_INPUT
 
 
@@ -356,7 +363,7 @@ def test_the_verdict_names_the_directions_that_stay_open() -> None:
     add: Any = lambda *_: SimpleNamespace(publish=published.append)  # noqa: E731
     open_ways = {"unobservable": ["along the light", "about z"]}
     refused = Outcome(Command("calibrate"), Code.RANK_DEFICIENT, "not determined", open_ways)
-    HandEyeOutputs(add, "ur10", "K7").quality(refused, "tool0", None)
+    HandEyeOutputs(add, "ur10", "K7").quality(refused, "tool0")
     assert list(published[0].unobservable) == open_ways["unobservable"]
     assert (published[0].code, published[0].accept) == (Code.RANK_DEFICIENT, False)
     assert published[0].reason == "not determined"
