@@ -51,7 +51,7 @@ SETTINGS = (
     Setting(
         "robot_sigma_deg",
         0.0,
-        "And of its turn about each axis, where robot_sigma_mm is given",
+        "And of its turn about each axis; 0: robot_sigma_mm over 1 m, of a camera from the data",
         unit="deg",
         low=0.0,
         high=1.0,
@@ -81,12 +81,16 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
     Raises
     ------
     InputError
-        When the sensor's frame has no name of its own.
+        When the sensor's frame has no name of its own, or the error of a turn is given alone.
     """
     names = settings["base_frame"], settings["flange_frame"], settings["sensor_frame"]
     if not all(names) or len(set(names)) < len(names):
         told = ", ".join(f"'{name}'" for name in names)
         raise InputError(f"base, flange and sensor need frames of different names, not {told}")
+    if settings["robot_sigma_deg"] and not settings["robot_sigma_mm"]:
+        raise InputError(
+            f"robot_sigma_deg is {settings['robot_sigma_deg']:g}, but robot_sigma_mm is 0: give both"
+        )
     return HandEyeConfig(
         base_frame=settings["base_frame"],
         flange_frame=settings["flange_frame"],

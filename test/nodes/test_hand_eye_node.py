@@ -386,6 +386,12 @@ def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
         assert node.state == "unconfigured"
 
 
+def test_the_error_of_a_turn_alone_is_refused(graph: Any, tmp_path: Path) -> None:
+    node = graph.add(HandEyeNode, settings_of(tmp_path, robot_sigma_deg=0.01))
+    assert node.state == "unconfigured"
+    assert "robot_sigma_deg is 0.01, but robot_sigma_mm is 0: give both" in node._failure
+
+
 def test_a_status_that_cannot_be_carried_takes_no_answer_from_its_caller(
     graph: Any, sensor: LiveSensor
 ) -> None:
