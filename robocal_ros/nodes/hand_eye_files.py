@@ -139,6 +139,10 @@ class HandEyeFiles:
 
 
 def _path(request: Any) -> Path:
+    """The whole path: the caller does not see the node's working folder."""
     if not request.path:
         raise InputError("path is empty: name the file")
-    return Path(request.path)
+    try:
+        return Path(request.path).expanduser().absolute()
+    except RuntimeError as error:
+        raise InputError(f"{error}: name the whole path", file=request.path) from error

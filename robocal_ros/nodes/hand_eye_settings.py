@@ -88,9 +88,8 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
         told = ", ".join(f"'{name}'" for name in names)
         raise InputError(f"base, flange and sensor need frames of different names, not {told}")
     if settings["robot_sigma_deg"] and not settings["robot_sigma_mm"]:
-        raise InputError(
-            f"robot_sigma_deg is {settings['robot_sigma_deg']:g}, but robot_sigma_mm is 0: give both"
-        )
+        turn_deg = settings["robot_sigma_deg"]
+        raise InputError(f"robot_sigma_deg is {turn_deg:g}, but robot_sigma_mm is 0: give both")
     return HandEyeConfig(
         base_frame=settings["base_frame"],
         flange_frame=settings["flange_frame"],

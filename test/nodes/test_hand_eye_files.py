@@ -85,3 +85,20 @@ def test_a_disk_that_fails_is_told_and_the_candidate_stays(graph: Any, sensor: L
     assert (failed.success, failed.message.split()[1]) == (False, "STORAGE_FAILED")
     assert graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me").success
     assert "8 samples were dropped" in sensor.start().message
+
+
+def test_a_path_is_told_in_full(
+    graph: Any, sensor: LiveSensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    (tmp_path / "home").mkdir()
+    for given, path in (("a.mcap", tmp_path / "a.mcap"), ("~/a.mcap", tmp_path / "home/a.mcap")):
+        saved = graph.call(HandEyeFile, f"{NAME}/save", path=given)
+        assert (saved.success, saved.message) == (True, f"8 samples saved in {path}")
+        assert path.is_file()
+        loaded = graph.call(HandEyeFile, f"{NAME}/load", path=given)
+        assert (loaded.success, loaded.message.endswith(str(path))) == (True, True)
+    nobody = graph.call(HandEyeFile, f"{NAME}/save", path="~nobody-of-this-name/a.mcap")
+    assert (nobody.success, nobody.status) == (False, Code.BAD_INPUT)
+    assert "name the whole path" in nobody.message
