@@ -26,6 +26,7 @@ from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
 
 NS = 1_000_000_000
+_ERRORS = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
 
 
 def time_message(stamp_ns: int) -> Time:
@@ -87,14 +88,10 @@ def kinematic_model(
     return message
 
 
-def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header) -> Any:
-    """The verdict on a candidate; without one the figures are 0 and the reason says why.
-
-    Raises
-    ------
-    InputError
-        When a figure is not finite.
-    """
+def verdict_message(
+    outcome: Outcome, *, robot: str, serial: str, stamp: Header, cycle_id: str = ""
+) -> CalibrationQuality:
+    """A verdict and why; of a candidate the errors are -1, until they are told, else 0."""
     message = CalibrationQuality(
         header=stamp,
         robot=robot,
@@ -103,14 +100,31 @@ def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header)
         code=int(outcome.status),
         accept=outcome.done,
         reason=outcome.message,
-        cycle_id=str(outcome.command.arguments.get("cycle_id", "")),
+        cycle_id=cycle_id,
         samples=outcome.samples,
     )
+    if outcome.calibration_id:
+        errors = [f"{whose}_{name}" for whose in ("current", "candidate") for name in _ERRORS]
+        for name in (*errors, "predicted_rms_mm", "condition"):
+            setattr(message, name, -1.0)
+    return message
+
+
+def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header) -> Any:
+    """The verdict on a thermal model; without one the figures are 0 and the reason says why.
+
+    Raises
+    ------
+    InputError
+        When a figure is not finite.
+    """
+    cycle_id = str(outcome.command.arguments.get("cycle_id", ""))
+    message = verdict_message(outcome, robot=robot, serial=serial, stamp=stamp, cycle_id=cycle_id)
     document = outcome.document
     if document is None:
         return message
-    _set_errors(message, "current", document["in_force"]["held_out"])
-    _set_errors(message, "candidate", document["calibrated"]["held_out"])
+    set_errors(message, "current", document["in_force"]["held_out"])
+    set_errors(message, "candidate", document["calibrated"]["held_out"])
     message.predicted_rms_mm = document["calibrated"]["predicted"]["model_rms_mm"]
     message.held_out = document["calibrated"]["held_out"]["n"]
     message.rank = document["rank"]
@@ -150,8 +164,15 @@ def accuracy_message(
     )
 
 
-def _set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
-    for name in ("mean_mm", "rms_mm", "p95_mm", "max_mm"):
+def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
+    """Tell errors, mm, by the names ``mean_mm``, ``rms_mm``, ``p95_mm`` and ``max_mm``.
+
+    Raises
+    ------
+    InputError
+        When one is not finite.
+    """
+    for name in _ERRORS:
         _require_finite(f"{whose}_{name}", [errors[name]])
         setattr(message, f"{whose}_{name}", float(errors[name]))
 

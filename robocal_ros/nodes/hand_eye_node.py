@@ -6,7 +6,6 @@ docs/hand_eye_node.md.
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,14 +17,17 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import Head, hand_eye_kind
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.decision_services import DecisionServices
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.frame_watch import FrameWatch
+from robocal_ros.nodes.hand_eye_files import HandEyeFiles
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
+from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
@@ -64,13 +66,7 @@ class HandEyeNode(HouseNode):
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
         self._config = session_config(settings)
-        self._serial_in_use = settings["serial"] or NO_SERIAL
-        folder = settings["state_dir"]
-        self._history = CalibrationHistory.open(
-            self._serial_in_use,
-            model_hash=self._nominal.model_hash,
-            state_dir=Path(folder) if folder else None,
-        )
+        self._serial_in_use, self._history = open_history(settings, self._nominal)
         self._kind = hand_eye_kind(self._config.sensor_frame)
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
         self._guard = SourceGuard(self, JOINTS)
@@ -78,7 +74,9 @@ class HandEyeNode(HouseNode):
         for kind, (message_type, profile) in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), profile)
         self._desk = CommandDesk(self, COMMAND_S, self._show)
-        HandEyeServices(self, settings, self._desk.ask, lambda: self._session, self._history)
+        ask, session = self._desk.ask, self._running
+        self._files = HandEyeFiles(self, ask, session, self._history)
+        HandEyeServices(self, settings, ask, self._files, session, self._history)
         DecisionServices(self.add_service, self._ask_decision, self._history, self._kind)
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(WATCH_S, self._watch, steady=True)
@@ -93,7 +91,7 @@ class HandEyeNode(HouseNode):
         self._last: Outcome | None = None
         self._shown: tuple[int, int] | None = None
         self._on_tf: int | None = None  # the revision
-        self._silence, self._newest_ns = Silence(), 0
+        self._silence = Silence()
         self._show_in_force()
         self._outputs.status(self._session, None)
 
@@ -116,6 +114,11 @@ class HandEyeNode(HouseNode):
             self._history.close()
         self._history = None
 
+    def _running(self) -> HandEyeSession:
+        if self._session is None:
+            raise NotActiveError("no session: activate the node")
+        return self._session
+
     # ---- samples and commands -------------------------------------------------------------------
 
     def _taker(self, kind: str) -> Any:
@@ -123,16 +126,11 @@ class HandEyeNode(HouseNode):
             session = self._session
             if session is None:
                 return
-            if kind == JOINTS:
-                if not session.received[JOINTS]:
-                    self._guard.look()
-                if self._guard.fault:
-                    session.refuse(JOINTS, InputError(self._guard.fault))
-                    return
+            if kind == JOINTS and (fault := self._guard.fault_at(session.received[JOINTS])):
+                session.refuse(JOINTS, InputError(fault))
+                return
             take_hand_eye_message(session, kind, message)
-            if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
-                self._newest_ns = session.newest_joints_ns
-                self._silence.heard(time.monotonic())
+            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
             if (command := session.recognised()) is not None:
                 self._desk.ask(command)
 
@@ -185,6 +183,7 @@ class HandEyeNode(HouseNode):
         self._last = outcome
         self._publish(name, lambda: self._outputs.event(outcome.command, outcome))
         if name == CALIBRATE:
+            self._publish(name, lambda: self._files.keep(outcome))
             self._publish(name, lambda: self._show_quality(outcome))
         self._publish(name, self._show_in_force)
         self._publish(name, lambda: self._outputs.status(session, outcome))
@@ -202,7 +201,7 @@ class HandEyeNode(HouseNode):
         if history is None:
             return
         frame = str(history.model(number)["parent"]) if number else self._config.flange_frame
-        self._outputs.quality(outcome, frame, history.get(number) if number else None)
+        self._outputs.quality(outcome, frame)
 
     def _show_in_force(self) -> None:
         """Put the sensor in force onto tf and record the new state, when either changed."""
@@ -253,8 +252,7 @@ class HandEyeNode(HouseNode):
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        if self._serial_in_use == NO_SERIAL:
-            health.worsen(WARN, "no serial is set: the history is kept as 'unset'")
+        warn_without_serial(health, self._serial_in_use)
         health.values = values
         return health
 

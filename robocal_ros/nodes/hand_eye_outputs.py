@@ -9,7 +9,7 @@ from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import Entry, Head
+from robocal_ros.core.proposals import Head
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.static_tf import StaticTf
 from robocal_ros.nodes.thermal_outputs import EVENTS
@@ -70,29 +70,21 @@ class HandEyeOutputs:
         self.transforms += transforms
         self._tf.publish(transforms)
 
-    def quality(self, outcome: Outcome, frame: str, entry: Entry | None) -> None:
+    def quality(self, outcome: Outcome, frame: str) -> None:
         """Show the verdict on a calibration, or why there is none."""
-        message = CalibrationQuality(
-            header=conversions.header(outcome.command.stamp_ns or 0, frame),
-            robot=self._robot,
-            serial=self._serial,
-            candidate_id=outcome.calibration_id,
-            code=int(outcome.status),
-            accept=outcome.done,
-            reason=outcome.message,
-            samples=outcome.samples,
+        stamp = conversions.header(outcome.command.stamp_ns or 0, frame)
+        message = conversions.verdict_message(
+            outcome, robot=self._robot, serial=self._serial, stamp=stamp
         )
         document = outcome.document or {}
         message.unobservable = list(document.get("unobservable", ()))
         message.rejected = list(document.get("rejected", ()))
-        if entry is not None:
-            left_out = document["leave_one_out_mm"]
-            message.predicted_rms_mm = float(document["working_error_mm"] or 0.0)
-            if left_out is not None:
-                message.held_out = outcome.samples
-                message.candidate_mean_mm = float(left_out["mean"])
-                message.candidate_max_mm = float(left_out["max"])
-                message.candidate_rms_mm = float(entry.candidate_rms_mm or 0.0)
+        if (error_mm := document.get("working_error_mm")) is not None:
+            message.predicted_rms_mm = float(error_mm)
+        if (left_out := document.get("leave_one_out_mm")) is not None:
+            message.held_out = outcome.samples
+            errors = {f"{name}_mm": value for name, value in left_out.items()}
+            conversions.set_errors(message, "candidate", errors)
         self._quality.publish(message)
 
     def event(self, command: Command, outcome: Outcome | None) -> None:

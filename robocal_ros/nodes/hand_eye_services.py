@@ -1,14 +1,12 @@
 """The services of the hand-eye node: each call becomes a command to the session."""
 
-from collections.abc import Awaitable, Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 from robocal_msgs.srv import (
     CalibrateHandEye,
     CaptureHandEye,
-    HandEyeFile,
     RemoveHandEye,
     StartHandEye,
 )
@@ -18,25 +16,24 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.nodes.conversions import transform_message, trigger_text
 from robocal_ros.nodes.decision_services import answer, twin
-from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
+from robocal_ros.nodes.endpoints import EndpointNode
+from robocal_ros.nodes.hand_eye_files import Ask, HandEyeFiles
 from robocal_ros.nodes.hand_eye_outputs import MOUNTS, TARGETS
 from robocal_ros.nodes.hand_eye_plan import HandEyePlan
 from robocal_ros.nodes.hand_eye_settings import start_arguments
-from robocal_ros.sessions.events import CALIBRATE, CAPTURE, LOAD, REMOVE, START, Command, Outcome
+from robocal_ros.sessions.events import CALIBRATE, CAPTURE, REMOVE, START, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_data import MOST_POINTS, data_set_begun
 from robocal_ros.storage.calibrations import CalibrationHistory
-
-Ask = Callable[[Command], Awaitable[Outcome]]
 
 
 class HandEyeServices:
-    """Data set, captures, calibration and files, with their Trigger twins.
+    """Data set, captures, calibration, with their Trigger twins.
 
     Parameters
     ----------
     ask : gives a command to the session and awaits its outcome.
-    session : the one that runs; None while the node is inactive.
+    files : asks where data sets begin or are calibrated.
+    session : the one that runs; raises while the node is inactive.
     """
 
     def __init__(
@@ -44,11 +41,12 @@ class HandEyeServices:
         node: EndpointNode,
         settings: Mapping[str, Any],
         ask: Ask,
-        session: Callable[[], HandEyeSession | None],
+        files: HandEyeFiles,
+        session: Callable[[], HandEyeSession],
         history: CalibrationHistory,
     ) -> None:
         self._node, self._settings, self._ask = node, settings, ask
-        self._session_now, self._history = session, history
+        self._files, self._session, self._history = files, session, history
         add = node.add_service
         add(StartHandEye, "~/start", self._start)
         add(Trigger, "~/start_trigger", self._start_twin)
@@ -58,23 +56,14 @@ class HandEyeServices:
         add(RemoveHandEye, "~/remove", self._remove)
         add(Trigger, "~/remove_trigger", twin(ask, REMOVE, {"handle": 0}))
         add(CalibrateHandEye, "~/calibrate", self._calibrate)
-        add(Trigger, "~/calibrate_trigger", twin(ask, CALIBRATE, {}))
-        add(HandEyeFile, "~/load", self._load)
-        add(HandEyeFile, "~/save", self._save)
-        HandEyePlan(node, settings, lambda: self._session, history)
-
-    @property
-    def _session(self) -> HandEyeSession:
-        session = self._session_now()
-        if session is None:
-            raise NotActiveError("no session: activate the node")
-        return session
+        add(Trigger, "~/calibrate_trigger", twin(files.calibrate, CALIBRATE, {}))
+        HandEyePlan(node, settings, session, history)
 
     async def _start(self, request: Any, response: Any) -> Any:
         kind, mount = _named(TARGETS, request.target), _named(MOUNTS, request.mount)
         given = kind, request.target_file, request.feature, request.method, mount
         arguments = start_arguments(self._settings, *given)
-        return answer(response, await self._ask(Command(START, arguments)))
+        return answer(response, await self._files.begin(Command(START, arguments)))
 
     async def _start_twin(self, request: Any, response: Any) -> Any:
         try:
@@ -82,7 +71,7 @@ class HandEyeServices:
         except RobocalError as error:
             response.message = trigger_text(0, error.code, str(error))
             return response
-        return await twin(self._ask, START, arguments)(request, response)
+        return await twin(self._files.begin, START, arguments)(request, response)
 
     async def _capture_now(self, arguments: Mapping[str, Any]) -> Outcome:
         """A capture takes nothing that was received before its call."""
@@ -105,15 +94,14 @@ class HandEyeServices:
         return response
 
     def _result_twin(self, request: Any, response: Any) -> Any:
-        """How the newest capture ended; while it waits: no success, with CONFLICT."""
-        data = self._session.data
+        """How the newest capture ended; while it waits: no success, with NONE."""
+        data = self._session().data
         if data is None or not data.captures:
             response.message = trigger_text(0, Code.CONFLICT, "nothing was captured yet")
             return response
         last = data.captures[max(data.captures)]
         response.success = last.code is Code.ACCEPT
-        code = Code.CONFLICT if last.code is Code.NONE else last.code
-        response.message = trigger_text(last.handle, code, last.reason)
+        response.message = trigger_text(last.handle, last.code, last.reason)
         return response
 
     async def _remove(self, request: Any, response: Any) -> Any:
@@ -125,10 +113,10 @@ class HandEyeServices:
 
     async def _calibrate(self, request: Any, response: Any) -> Any:
         arguments = {"method": request.method, "handles": list(request.handles)}
-        outcome = await self._ask(Command(CALIBRATE, arguments))
+        outcome = await self._files.calibrate(Command(CALIBRATE, arguments))
         document = outcome.document or {}
         response.candidate_id, response.samples = outcome.calibration_id, outcome.samples
-        response.expected_error_mm = -1.0
+        response.expected_error_mm = response.residual_mm = -1.0
         response.unobservable = list(document.get("unobservable", ()))
         if outcome.calibration_id:
             model = self._history.model(outcome.calibration_id)
@@ -142,38 +130,9 @@ class HandEyeServices:
             response.rejected = [f"{name}: {why}" for name, why in because.items()]
         return answer(response, outcome)
 
-    async def _load(self, request: Any, response: Any) -> Any:
-        from robocal_ros.storage.hand_eye_bags import read_data_set  # heavy: not at a node's start
-
-        document = read_data_set(_path(request), self._session.nominal)
-        outcome = await self._ask(Command(LOAD, {"path": request.path, "set": document}))
-        response.samples = outcome.samples
-        return answer(response, outcome)
-
-    def _save(self, request: Any, response: Any) -> Any:
-        from robocal_ros.storage.hand_eye_bags import write_data_set
-
-        session, path = self._session, _path(request)
-        document = session.document()
-        topic = data_set_begun(document).topic
-        write_data_set(path, document, topic, session.config.sensor_frame, session.nominal)
-        response.success, response.status = True, int(Code.ACCEPT)
-        response.samples = len(document["samples"])
-        response.message = f"{response.samples} samples saved in {path}"
-        points = sum(len(row["values"]) for row in document["samples"])
-        if points > MOST_POINTS:
-            response.message += f"; {points} points are too many to load (at most {MOST_POINTS})"
-        return response
-
 
 def _handle(outcome: Outcome) -> int:
     return int(outcome.command.arguments["handle"]) if outcome.done else 0
-
-
-def _path(request: Any) -> Path:
-    if not request.path:
-        raise InputError("path is empty: name the file")
-    return Path(request.path)
 
 
 def _named(names: Mapping[int, str], number: int) -> str:

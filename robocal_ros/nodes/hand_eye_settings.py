@@ -8,6 +8,7 @@ import numpy as np
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.hand_eye.target_documents import KIND_OF, Document, target_document
+from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import pose_settings
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
@@ -26,7 +27,7 @@ def _range_fault(values: list[float]) -> str | None:
 
 SETTINGS = (
     Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
-    Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    STATE_DIR,
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
     Setting("sensor_frame", "sensor", "Name of the sensor's frame, in its messages and on tf"),
@@ -50,7 +51,7 @@ SETTINGS = (
     Setting(
         "robot_sigma_deg",
         0.0,
-        "And of its turn about each axis, where robot_sigma_mm is given",
+        "And of its turn about each axis; 0: robot_sigma_mm over 1 m, of a camera from the data",
         unit="deg",
         low=0.0,
         high=1.0,
@@ -80,12 +81,15 @@ def session_config(settings: Mapping[str, Any]) -> HandEyeConfig:
     Raises
     ------
     InputError
-        When the sensor's frame has no name of its own.
+        When the sensor's frame has no name of its own, or the error of a turn is given alone.
     """
     names = settings["base_frame"], settings["flange_frame"], settings["sensor_frame"]
     if not all(names) or len(set(names)) < len(names):
         told = ", ".join(f"'{name}'" for name in names)
         raise InputError(f"base, flange and sensor need frames of different names, not {told}")
+    if settings["robot_sigma_deg"] and not settings["robot_sigma_mm"]:
+        turn_deg = settings["robot_sigma_deg"]
+        raise InputError(f"robot_sigma_deg is {turn_deg:g}, but robot_sigma_mm is 0: give both")
     return HandEyeConfig(
         base_frame=settings["base_frame"],
         flange_frame=settings["flange_frame"],

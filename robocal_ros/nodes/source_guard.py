@@ -30,6 +30,12 @@ class SourceGuard:
         if UNCORRECTED in self._topic:
             self.fault = f"{self._topic} comes from a correction node: {self._why}"
 
+    def fault_at(self, received: int) -> str:
+        """The fault, when so many readings were received; before the first one it looks."""
+        if not received:
+            self.look()
+        return self.fault
+
     def look(self) -> None:
         """Look again when the number of publishers changed; cheap otherwise."""
         count = self._node.count_publishers(self._topic)

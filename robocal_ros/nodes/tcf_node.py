@@ -14,10 +14,11 @@ from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.motion.loading import load_motion
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import qos, tcf_motion
-from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
+from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.tcf_motion import TcfMotion
@@ -69,13 +70,7 @@ class TcfNode(HouseNode):
         taught = taught_tool(settings, self._nominal)
         load_motion(self._nominal)
         self._config = session_config(settings, placed.laser, placed.station, taught)
-        self._serial_in_use = settings["serial"] or NO_SERIAL
-        folder = settings["state_dir"]
-        self._history = CalibrationHistory.open(
-            self._serial_in_use,
-            model_hash=self._nominal.model_hash,
-            state_dir=Path(folder) if folder else None,
-        )
+        self._serial_in_use, self._history = open_history(settings, self._nominal)
         frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
         self._outputs = TcfOutputs(self.add_output, self._nominal, self._serial_in_use, frames)
         self._guard = SourceGuard(self, JOINTS)
@@ -107,7 +102,7 @@ class TcfNode(HouseNode):
         self._last: Outcome | None = None
         self._run_end: Future = Future()
         self._shown: tuple[int, int, int] | None = None
-        self._silence, self._newest_ns = Silence(), 0
+        self._silence = Silence()
         if self._motion is not None:
             self._motion.activate(self._session)
         self._show_in_force()
@@ -140,19 +135,15 @@ class TcfNode(HouseNode):
             if session is None:
                 return
             if kind == JOINTS:
-                if not session.received[JOINTS]:
-                    self._guard.look()
-                if self._guard.fault:
-                    session.ignored.add(JOINTS, self._guard.fault)
+                if fault := self._guard.fault_at(session.received[JOINTS]):
+                    session.ignored.add(JOINTS, fault)
                     return
                 if self._motion is not None:
                     self._motion.take(message)
             elif self._motion is not None:
                 self._motion.beam(message)
             take_tool_message(session, kind, message)
-            if session.newest_joints_ns != self._newest_ns:  # a clock that stands is no reading
-                self._newest_ns = session.newest_joints_ns
-                self._silence.heard(time.monotonic())
+            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
             if (command := session.recognised()) is not None:
                 self._desk.ask(command)
             elif session.waiting:
@@ -276,8 +267,7 @@ class TcfNode(HouseNode):
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        if self._serial_in_use == NO_SERIAL:
-            health.worsen(WARN, "no serial is set: the history is kept as 'unset'")
+        warn_without_serial(health, self._serial_in_use)
         health.values = values
         return health
 

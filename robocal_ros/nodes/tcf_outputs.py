@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, SessionEvent, ToolFrame, ToolStep
@@ -84,22 +85,18 @@ class TcfOutputs:
     def quality(self, outcome: Outcome) -> None:
         """Show the verdict on a run."""
         document = outcome.document or {}
-        sigma_mm = document.get("sigma_mm", 0.0)
-        self._quality.publish(
-            CalibrationQuality(
-                header=conversions.header(outcome.command.stamp_ns or 0, self._base),
-                robot=self._nominal.name,
-                serial=self._serial,
-                candidate_id=outcome.calibration_id,
-                code=int(outcome.status),
-                accept=outcome.done,
-                reason=outcome.message,
-                cycle_id=str(document.get("cycle_id", "")),
-                samples=outcome.samples,
-                candidate_rms_mm=float(document.get("misfit_mm", 0.0)),
-                predicted_rms_mm=max(sigma_mm) if isinstance(sigma_mm, list) else float(sigma_mm),
-            )
+        message = conversions.verdict_message(
+            outcome,
+            robot=self._nominal.name,
+            serial=self._serial,
+            stamp=conversions.header(outcome.command.stamp_ns or 0, self._base),
+            cycle_id=str(document.get("cycle_id", "")),
         )
+        if "misfit_mm" in document:
+            message.candidate_rms_mm = float(document["misfit_mm"])
+        if "sigma_mm" in document:
+            message.predicted_rms_mm = float(np.max(document["sigma_mm"]))
+        self._quality.publish(message)
 
     def event(self, command: Command, outcome: Outcome | None) -> None:
         """Record a command and what came of it."""

@@ -13,6 +13,7 @@ from robocal_ros.core.tool.judging import ToolLimits
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
+from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import given_pose, pose_settings
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
@@ -26,7 +27,7 @@ def _speed(name: str, default: float, what: str, high: float) -> Setting:
 
 SETTINGS = (
     Setting("robot", "ur10", "Robot type (config/robots) or path of a robot file"),
-    Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    STATE_DIR,
     *pose_settings(
         "taught",
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",

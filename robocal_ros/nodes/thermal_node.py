@@ -1,6 +1,5 @@
 """The thermal node: measurements in, judged models out, decisions kept (docs/thermal_node.md)."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +14,12 @@ from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.identification import require_parameters
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.data_clock import DataClock
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
+from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.set_up_services import SetUpServices
 from robocal_ros.nodes.source_guard import SourceGuard
@@ -67,13 +67,7 @@ class ThermalNode(HouseNode):
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
         require_parameters(self._nominal, settings["drift_parameters"])
-        self._serial_in_use = settings["serial"] or NO_SERIAL
-        folder = settings["state_dir"]
-        self._history = CalibrationHistory.open(
-            self._serial_in_use,
-            model_hash=self._nominal.model_hash,
-            state_dir=Path(folder) if folder else None,
-        )
+        self._serial_in_use, self._history = open_history(settings, self._nominal)
         self._outputs = ThermalOutputs(
             self.add_output, self._nominal, self._serial_in_use, settings["base_frame"]
         )
@@ -119,10 +113,9 @@ class ThermalNode(HouseNode):
             session = self._session
             if session is None:
                 return
-            if kind == JOINTS and not session.desk.received[JOINTS]:
-                self._guard.look()
-            if kind == JOINTS and self._guard.fault:
-                session.desk.ignored.add(JOINTS, self._guard.fault)
+            desk = session.desk
+            if kind == JOINTS and (fault := self._guard.fault_at(desk.received[JOINTS])):
+                desk.ignored.add(JOINTS, fault)
                 return
             take_message(session, kind, message)
             if session.waiting:
@@ -234,8 +227,7 @@ class ThermalNode(HouseNode):
         lost = [topic for topic, count in self.inputs.items() if count.lost]
         if lost:
             health.worsen(WARN, f"messages lost on {', '.join(lost)}")
-        if self._serial_in_use == NO_SERIAL:
-            health.worsen(WARN, "no serial is set: the history is kept as 'unset'")
+        warn_without_serial(health, self._serial_in_use)
         health.values = values
         return health
 

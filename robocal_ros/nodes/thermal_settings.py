@@ -5,6 +5,7 @@ from typing import Any
 
 from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.samples import DEFAULT_TARGET
+from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
 from robocal_ros.sessions.thermal_config import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
@@ -18,7 +19,7 @@ def _field_fault(field: list[float]) -> str | None:
 
 SETTINGS = (
     Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
-    Setting("state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"),
+    STATE_DIR,
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("measuring_frame", "", "Frame of the measurements; empty: that of the first one used"),
     Setting("target", DEFAULT_TARGET, "Target where a measurement's frame_id names none"),

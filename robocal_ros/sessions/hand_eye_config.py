@@ -17,8 +17,8 @@ class HandEyeConfig:
     base_frame, flange_frame, sensor_frame : names of the frames.
     standstill : when the robot counts as standing still about a measurement.
     capture_timeout_s : a capture without standstill or without a measurement for so long fails.
-    robot_sigma_m, robot_sigma_rad : error of a reported flange pose about each axis, one sigma;
-        None: found from the samples.
+    robot_sigma_m, robot_sigma_rad : error of a reported flange pose along and about each axis, one
+        sigma; None: found from the samples, but the second of a line laser as `HandEyeSettings`.
     limit_m : largest expected error at the working distance that is accepted.
     """
 

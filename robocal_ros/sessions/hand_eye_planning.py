@@ -222,8 +222,10 @@ def judged_plan(
     """
     from robocal_ros.core.hand_eye.mount_problem import PoseNoise
     from robocal_ros.core.hand_eye.planning import check_plan
+    from robocal_ros.core.hand_eye.quality import HandEyeSettings
 
-    noise = PoseNoise(config.robot_sigma_m or ROBOT_SIGMA_M, config.robot_sigma_rad or 0.0)
+    given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
+    noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)
     if marks and len(marks) != len(T_base_flange):
         raise InputError(f"{len(marks)} marks for {len(T_base_flange)} poses: give each its own")
     for mark in marks:

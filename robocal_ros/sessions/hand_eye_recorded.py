@@ -9,7 +9,7 @@ from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.recorded import configured_with, recorded_arguments
-from robocal_ros.sessions.seeding import bring_into_force
+from robocal_ros.sessions.seeding import seeded
 
 OWN = "sensor"  # only a hand-eye session's configuration has it
 
@@ -43,8 +43,6 @@ def hand_eye_session_as_recorded(
     """
     arguments = recorded_arguments(nominal, configured, ("model", OWN))
     config = HandEyeConfig.of_document(arguments["config"])
-    if not history.list(1):
-        own = hand_eye_kind(config.sensor_frame)
-        bring_into_force(history, THERMAL, nominal, arguments["model"], software)
-        bring_into_force(history, own, nominal, arguments[OWN], software)
+    in_force = {THERMAL: arguments["model"], hand_eye_kind(config.sensor_frame): arguments[OWN]}
+    seeded(history, nominal, in_force, software)
     return HandEyeSession(nominal, history, config, software)

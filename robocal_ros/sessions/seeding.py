@@ -53,14 +53,32 @@ def session_as_recorded(
         tracker = arguments["tracker"]
     except KeyError as error:
         raise InputError(f"the recorded configuration lacks {error}") from error
-    fresh = not history.list(1)
-    if fresh:
-        bring_into_force(history, THERMAL, nominal, model, software)
-        bring_into_force(history, REFERENCE, nominal, reference, software)
-    session = ThermalSession(nominal, history, config_of(arguments), software)
-    if fresh and tracker is not None and session.follower is not None:
-        session.follower.go_on_from(FollowerState.of_document(tracker))
+    config = config_of(arguments)
+    state = None if tracker is None else FollowerState.of_document(tracker)
+    in_force = {THERMAL: model, REFERENCE: reference}
+    fresh = seeded(history, nominal, in_force, software)
+    session = ThermalSession(nominal, history, config, software)
+    if fresh and state is not None and session.follower is not None:
+        session.follower.go_on_from(state)
     return session
+
+
+def seeded(
+    history: History,
+    nominal: SerialArm,
+    in_force: Mapping[str, Mapping[str, Any] | None],
+    software: str,
+) -> bool:
+    """Bring what was in force, by its kind, into an empty history; whether it was empty.
+
+    Called once all else of the recording was read: what is left in a history after a failure would
+    be taken for the user's own at the next try.
+    """
+    if history.list(1):
+        return False
+    for kind, model in in_force.items():
+        bring_into_force(history, kind, nominal, model, software)
+    return True
 
 
 def bring_into_force(

@@ -10,7 +10,14 @@ class Silence:
     def __init__(self) -> None:
         self._looked_s: float | None = None
         self._heard_s = 0.0
+        self._newest_ns = 0
         self.lasts_s = 0.0
+
+    def heard_if_new(self, stamp_ns: int, now_s: float) -> None:
+        """The newest reading has this stamp; one whose clock stands is no new reading."""
+        if stamp_ns != self._newest_ns:
+            self._newest_ns = stamp_ns
+            self.heard(now_s)
 
     def heard(self, now_s: float) -> None:
         """It was heard now (steady clock)."""

@@ -7,7 +7,7 @@ from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.recorded import configured_with, recorded_arguments
-from robocal_ros.sessions.seeding import bring_into_force
+from robocal_ros.sessions.seeding import seeded
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig
 
@@ -47,8 +47,7 @@ def tool_session_as_recorded(
         The configuration cannot be read.
     """
     arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
-    if not history.list(1):
-        for name, kind in IN_FORCE.items():
-            bring_into_force(history, kind, nominal, arguments[name], software)
     config = ToolConfig.of_document(arguments["config"])
+    in_force = {kind: arguments[name] for name, kind in IN_FORCE.items()}
+    seeded(history, nominal, in_force, software)
     return ToolSession(nominal, history, config, software)

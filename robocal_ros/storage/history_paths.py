@@ -1,5 +1,6 @@
-"""Where the histories live: one file per robot serial in the state folder."""
+"""Where the histories live: a file per robot serial in the state folder, and what is beside it."""
 
+import itertools
 import os
 from pathlib import Path
 from urllib.parse import quote, unquote
@@ -43,6 +44,29 @@ def history_path(serial: str, folder: Path) -> Path:
     if not serial.strip() or len(name) > _LONGEST_NAME:
         raise InputError(f"robot serial {serial!r}: must have 1 to {_LONGEST_NAME} characters")
     return folder / (name + _SUFFIX)
+
+
+def made_folder_beside(history: Path, name: str) -> Path:
+    """Folder of further files of a history's robot, ``<serial>/<name>`` beside it; made if need be.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be made.
+    """
+    folder = history.with_suffix("") / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"the folder {folder} cannot be made: {error.strerror}") from error
+    return folder
+
+
+def unused(folder: Path, stem: str, suffix: str) -> Path:
+    """A file that is not there yet: named by its stem, else with a number behind it."""
+    names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))
+    paths = (folder / (name + suffix) for name in names)
+    return next(path for path in paths if not path.exists())
 
 
 def known_serials(folder: Path) -> list[str]:

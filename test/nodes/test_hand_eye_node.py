@@ -73,6 +73,12 @@ def test_a_sensor_is_calibrated_accepted_kept_and_rolled_back(
     graph.spin_until(lambda: quality, "the verdict")
     assert (quality[-1].candidate_id, quality[-1].accept) == (result.candidate_id, True)
     assert quality[-1].predicted_rms_mm == pytest.approx(result.expected_error_mm)
+    names = ("mean", "rms", "p95", "max")
+    mean, rms, p95, most = (getattr(quality[-1], f"candidate_{name}_mm") for name in names)
+    assert 0.0 < mean < rms < most
+    assert mean < p95 < most  # between the two largest of ten
+    assert {getattr(quality[-1], f"current_{name}_mm") for name in names} == {-1.0}
+    assert (quality[-1].rank, quality[-1].condition) == (0, -1.0)
     assert quality[-1].header.frame_id == "tool0"
     # Nothing is in force before somebody accepts it.
     assert [m for m in tf if m.transforms] == []
@@ -128,6 +134,7 @@ def test_a_moving_robot_is_not_captured_and_a_sample_is_removed(graph: Any, tmp_
     graph.spin_until(lambda: [s.handle for s in sensor.status[-1].samples] == [1, 3], "the status")
     few = sensor.calibrate()
     assert (few.success, few.status, few.candidate_id) == (False, Code.TOO_FEW_SAMPLES, 0)
+    assert (few.expected_error_mm, few.residual_mm) == (-1.0, -1.0)
     assert sensor.calibrate(handles=[2]).status == Code.BAD_INPUT
 
 
@@ -200,7 +207,7 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
         sensor.robot.rest(0.1)
         assert call("capture")[1].startswith(f"{number} ACCEPT")
         waits = call("result")
-        assert (waits[0], waits[1].split()[:2]) == (False, [str(number), "CONFLICT"])
+        assert (waits[0], waits[1].split()[:2]) == (False, [str(number), "NONE"])
         sensor.robot.rest(0.7, shot)
         sensor.ended(number)
         done = call("result")
@@ -209,6 +216,22 @@ def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Path) -> None:
     assert call("accept") == (True, "1 ACCEPT revision 1: calibration 1 in force")
     assert call("rollback") == (True, "0 ACCEPT revision 2: nothing in force")
     assert call("remove") == (True, "0 ACCEPT capture 8 removed, 7 samples are left")
+
+
+def test_a_plc_that_asks_while_it_is_none_hears_of_a_clock_that_jumps(
+    graph: Any, sensor: LiveSensor
+) -> None:
+    assert sensor.start().success
+    assert graph.call(Trigger, f"{NAME}/capture_trigger").success
+    assert graph.call(Trigger, f"{NAME}/result_trigger").message.startswith("1 NONE waits for")
+    sensor.robot.now_ns -= 60 * 10**9
+    sensor.robot.rest(0.1)
+    sensor.ended(1)
+    told = graph.call(Trigger, f"{NAME}/result_trigger")
+    assert (told.success, told.message) == (
+        False,
+        "1 CONFLICT the clock jumped back: capture again",
+    )
 
 
 def test_a_capture_comes_after_all_that_the_node_has_received(
@@ -340,7 +363,7 @@ def test_the_verdict_names_the_directions_that_stay_open() -> None:
     add: Any = lambda *_: SimpleNamespace(publish=published.append)  # noqa: E731
     open_ways = {"unobservable": ["along the light", "about z"]}
     refused = Outcome(Command("calibrate"), Code.RANK_DEFICIENT, "not determined", open_ways)
-    HandEyeOutputs(add, "ur10", "K7").quality(refused, "tool0", None)
+    HandEyeOutputs(add, "ur10", "K7").quality(refused, "tool0")
     assert list(published[0].unobservable) == open_ways["unobservable"]
     assert (published[0].code, published[0].accept) == (Code.RANK_DEFICIENT, False)
     assert published[0].reason == "not determined"
@@ -361,6 +384,12 @@ def test_frames_need_names_of_their_own(graph: Any, tmp_path: Path) -> None:
     for frame in ("", "tool0"):
         node = graph.add(HandEyeNode, settings_of(tmp_path, sensor_frame=frame))
         assert node.state == "unconfigured"
+
+
+def test_the_error_of_a_turn_alone_is_refused(graph: Any, tmp_path: Path) -> None:
+    node = graph.add(HandEyeNode, settings_of(tmp_path, robot_sigma_deg=0.01))
+    assert node.state == "unconfigured"
+    assert "robot_sigma_deg is 0.01, but robot_sigma_mm is 0: give both" in node._failure
 
 
 def test_a_status_that_cannot_be_carried_takes_no_answer_from_its_caller(

@@ -104,6 +104,19 @@ def test_a_centre_of_the_request_is_where_the_sphere_is_looked_for(history):
         unseen(CENTRE)
 
 
+def test_a_plan_takes_the_noise_that_calibrate_takes(history):
+    """A shift that is given alone is a turn too, at an arm's length of 1 m."""
+    driver = driver_of(history)
+    driver.sphere(1)
+    poses, sensor = sphere_set()[1].true_T_base_flange, SensorRange(width_m=0.09)
+
+    def error_m(turn_rad: float | None) -> float:
+        config = HandEyeConfig(robot_sigma_m=2e-4, robot_sigma_rad=turn_rad)
+        return judged_plan(driver.session.data, poses, [], TRUTH, sensor, config).working_error_m
+
+    assert error_m(None) == error_m(2e-4) > error_m(1e-9)
+
+
 def test_other_units_are_named():
     q = np.array([-30.0, -100.0, -110.0, -60.0, 90.0, 20.0])
     with pytest.raises(InputError, match=r"planned pose 2: joint .* is at -110 rad: degrees"):

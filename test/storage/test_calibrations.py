@@ -25,7 +25,13 @@ from robocal_ros.core.errors import (
 )
 from robocal_ros.core.proposals import Action, Head, State
 from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_paths import history_path, known_serials, state_folder
+from robocal_ros.storage.history_paths import (
+    history_path,
+    known_serials,
+    made_folder_beside,
+    state_folder,
+    unused,
+)
 from robocal_ros.storage.history_schema import MIGRATIONS, SCHEMA_VERSION
 
 BY = {"by": "Ada", "reason": "tested", "wall_ns": 1_700_000_002_000_000_000}
@@ -568,6 +574,26 @@ class TestDamage:
         history.close()
         with reopened(history) as other:
             assert other.damaged is not None
+
+
+class TestFolderBeside:
+    def test_it_belongs_to_the_serial_and_hides_no_history(self, tmp_path: Path) -> None:
+        file = history_path("K.7/a", tmp_path)
+        folder = made_folder_beside(file, "hand_eye")
+        assert folder == made_folder_beside(file, "hand_eye") == tmp_path / "K.7%2Fa" / "hand_eye"
+        assert folder.is_dir()
+        assert known_serials(tmp_path) == []
+
+    def test_no_file_is_named_twice(self, tmp_path: Path) -> None:
+        for name in ("1.mcap", "1_2.mcap", "1_3.mcap"):
+            path = unused(tmp_path, "1", ".mcap")
+            assert path.name == name
+            path.touch()
+
+    def test_a_folder_that_cannot_be_made(self, tmp_path: Path) -> None:
+        (tmp_path / "K7").touch()
+        with pytest.raises(StorageError, match="cannot be made"):
+            made_folder_beside(history_path("K7", tmp_path), "hand_eye")
 
 
 class TestVersions:

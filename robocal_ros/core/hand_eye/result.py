@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.assessment import Verdict, summarise
 from robocal_ros.core.documents import transform_document, verdict_document
 
 Array = NDArray[np.float64]
@@ -183,4 +183,10 @@ def _residual_document(samples: tuple[str, ...], residual: Array) -> Document:
 def _left_out_document(distance_m: Array | None) -> Document | None:
     if distance_m is None:
         return None
-    return {"mean": float(distance_m.mean()) * 1e3, "max": float(distance_m.max()) * 1e3}
+    told = summarise(distance_m)
+    return {
+        "mean": told.mean_m * 1e3,
+        "rms": told.rms_m * 1e3,
+        "p95": told.p95_m * 1e3,
+        "max": told.max_m * 1e3,
+    }
