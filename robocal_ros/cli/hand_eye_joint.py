@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> Outcome:
     if args.check is not None and not checks:
         raise InputError(f"none of the folders holds the table of --check, {quoted(args.check)}")
     result = solve_joint(parts, settings, checks)
-    document: Document = {"held_out": None} | hand_eye_document(result)
+    document: Document = hand_eye_document(result)
     return Outcome(document, partial(show_mount, document=document))
 
 

@@ -52,7 +52,6 @@ def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = No
         _require_unused(args, judges, shots)
     result = solve_task(task, shots.data, args.method, settings)
     result = replace(result, rejected={**shots.rejected, **result.rejected})
-    result = replace(result, more={**result.more, "held_out": None})
     if judges is not None:
         if result.place is None:
             raise ValueError("a result of one target has its place")

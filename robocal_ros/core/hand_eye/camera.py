@@ -30,6 +30,7 @@ from robocal_ros.core.hand_eye.camera_quality import (
 from robocal_ros.core.hand_eye.camera_start import robust_start, score
 from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
 from robocal_ros.core.hand_eye.result import HandEyeResult
+from robocal_ros.core.hand_eye.sightings import same_pose
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -93,17 +94,29 @@ def calibrate_camera(
         When nothing fits them.
     """
     how = settings or CameraSettings()
-    sound = require_sound(pairs, rejected or {})
+    pairs, again = _first_of_each_pose(pairs)
+    rejected = {**(rejected or {}), **again}
+    sound = require_sound(pairs, rejected)
     fit = fit_pairs(pairs, how.noise, _start(pairs, how.method), sound)
     _require_no_mistake(fit)
     about = {"mount": pairs.mount} | _noise_document(fit, how.noise) | dict(more or {})
     result, state = (_classic if how.method == "classic" else _best)(fit, how)
     result = replace(
         result,
-        rejected={**(rejected or {}), **result.rejected},
-        more={**about, **result.more, "held_out": None},
+        rejected={**rejected, **result.rejected},
+        more=about | result.more,
     )
     return result if check is None else _judged(result, check, state)
+
+
+def _first_of_each_pose(pairs: PosePairs) -> tuple[PosePairs, dict[str, str]]:
+    """The first pair of each robot pose, and why others are left out."""
+    first = same_pose(pairs.T_base_flange)
+    again = np.flatnonzero(first != np.arange(len(pairs)))
+    return pairs.take(np.unique(first)), {
+        pairs.names[row]: f"from the pose of {pairs.names[first[row]]}, whose error it shares"
+        for row in again
+    }
 
 
 def require_sound(pairs: PosePairs, rejected: Mapping[str, str]) -> Placement:

@@ -137,6 +137,7 @@ def hand_eye_document(result: HandEyeResult) -> Document:
         "rejected": list(rejected),
         "rejected_because": rejected,
         "unobservable": list(result.unobservable),
+        "held_out": None,
         **result.more,
         "verdict": verdict_document(result.verdict),
     }

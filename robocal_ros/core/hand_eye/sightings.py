@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -58,8 +59,9 @@ def same_pose(T_base_flange: Array) -> Index:
     What errs in a pose is common to all that is seen from it, however often: only what the sensor
     itself errs by is drawn anew.
     """
-    apart = T_base_flange[:, None, :3] - T_base_flange[None, :, :3]
-    return np.asarray(np.argmax(np.all(np.abs(apart) < SAME, axis=(2, 3)), axis=1))
+    place = T_base_flange[:, :3].reshape(-1, 12)
+    near = cKDTree(place).query_ball_point(place, SAME, p=np.inf)
+    return np.array([min(rows) for rows in near], dtype=np.int64)
 
 
 def in_plane(value: Array) -> Array:
