@@ -61,8 +61,8 @@ def test_a_surface_that_falls_away_ends_within_a_column(mirrored):
         squares.append(square(fit, [at, 0.195]))
         errors.append(fit.point[0] - at)
     # Uniform over a column, and the noise of the last point along the slope t, in x NOISE_M t /
-    # (1 + t^2): 0.12 columns on average and 0.21 at most. So one in ten is beyond half a column (and
-    # 3.5 standard deviations of 100 such), and none, one point lost, beyond 0.5 + 4 x 0.21 + 1.
+    # (1 + t^2): 0.12 columns on average and 0.21 at most: one in ten is beyond half a column, and
+    # 3.5 standard deviations of 100 such; none, one point lost, is beyond 0.5 + 4 x 0.21 + 1.
     assert np.mean(np.abs(errors) <= 0.5 * COLUMN_M) > 0.9 - 3.5 * np.sqrt(0.9 * 0.1 / 100)
     assert np.max(np.abs(errors)) < 2.34 * COLUMN_M
     # The fit counts the uniform error, not that noise, which adds 0.21 of its variance. The square
