@@ -20,7 +20,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.mount_problem import PoseNoise
 from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
 from robocal_ros.core.hand_eye.planning import SensorRange, check_plan
-from robocal_ros.core.hand_eye.quality import HandEyeSettings, expected_error_m
+from robocal_ros.core.hand_eye.quality import HandEyeSettings, apart, expected_error_m
 from robocal_ros.core.hand_eye.result import at_origin
 from robocal_ros.core.hand_eye.solve import solve_sphere
 from robocal_ros.core.hand_eye.targets import SphereTarget, Staircase, StepTarget
@@ -87,7 +87,9 @@ def test_a_sphere_of_unknown_place_is_where_the_poses_see_it(seed, strays):
         result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", settings)
         covariance = at_origin(result.covariance, result.pivot)
         achieved_m = expected_error_m(covariance, SENSOR.field_points)
-        assert 1 / 1.5 < plan.working_error_m / achieved_m < 1.5
+        # The place is found to 3 mm, and how well a circle tells it grows with the 11 mm or so by
+        # which the laser planes pass the centre.
+        assert abs(np.log(plan.working_error_m / achieved_m)) < 3.0 / 11.0
 
 
 @pytest.mark.parametrize("kind", PLANNED)
@@ -189,8 +191,5 @@ def test_proposed_poses_do_what_they_promise(turned):
     result = solve_sphere(data_of(shots), SphereTarget(RADIUS_M), "best", HandEyeSettings())
     assert result.verdict.accept
     assert len(result.rejected) <= 1  # nothing that is proposed is out of view
-    field = SENSOR.field_points
-    away = field @ (result.T_flange_sensor - CELL.T_flange_sensor)[:3, :3].T
-    away += (result.T_flange_sensor - CELL.T_flange_sensor)[:3, 3]
-    achieved = np.sqrt(np.mean(np.sum(away**2, axis=1)))
-    assert achieved < 3.0 * plan.proposed_error_m
+    off_m = apart(result.T_flange_sensor, CELL.T_flange_sensor, SENSOR.field_points)
+    assert off_m < 3.0 * plan.proposed_error_m

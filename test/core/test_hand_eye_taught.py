@@ -5,8 +5,9 @@ import pytest
 from hand_eye_sets import CELL, STAIRS, T_BASE_USER, data_of, stairs_target
 
 from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.quality import HandEyeSettings
-from robocal_ros.core.hand_eye.solve import solve_step
+from robocal_ros.core.hand_eye.diagnosis import features, looked
+from robocal_ros.core.hand_eye.mount_fit import fit_mount
+from robocal_ros.core.hand_eye.step_task import StepTask
 from robocal_ros.sim.hand_eye_sets import step_shots
 
 SHIFT_M = 2e-3
@@ -18,7 +19,11 @@ def test_a_badly_taught_origin_shows_in_tilted_shots(axis):
     shots = step_shots(CELL, STAIRS, 12, np.random.default_rng(3))
     taught = T_BASE_USER @ frames.transform(np.eye(3), SHIFT_M * np.eye(3)[axis])
     target = stairs_target(taught, user_sigma_m=SHIFT_M, user_sigma_rad=1e-4)
-    found = solve_step(data_of(shots), target, "best", HandEyeSettings())
-    assert found.place is not None
-    off_m = np.abs((found.place - T_BASE_USER)[:3, 3])
-    assert np.all(off_m < 0.4 * SHIFT_M)  # what is left is the robot, not the teaching
+    task, data = StepTask(target), data_of(shots)
+    read = features(task, data)
+    fit = fit_mount((read.view,), looked(task, data, read))
+    off_m = (frames.invert(fit.state.places[0]) @ T_BASE_USER)[:3, 3]
+    covariance = fit.covariance[6:9, 6:9]
+    assert off_m @ np.linalg.solve(covariance, off_m) < 16.27  # chi-square of 3, once in 1000
+    # At least 15 of 16 parts of what is then known of it are the poses', not the teacher's.
+    assert np.sqrt(np.diag(covariance).max()) < SHIFT_M / 4.0

@@ -63,7 +63,8 @@ def test_the_error_is_near_the_bound():
         points, _ = arc_profile(truth, rng, half_angle=half_angle)
         e = error(fit_arc(points, ArcRule(R)), truth)
         ratios.append(e @ np.linalg.solve(bound(truth, NOISE_M, half_angle), e) / 3.0)
-    assert 0.9 < np.sqrt(np.mean(ratios)) < 1.05
+    # 3.5 standard deviations of the root of a mean of 3 x 500 squares
+    assert abs(np.sqrt(np.mean(ratios)) - 1.0) < 3.5 / np.sqrt(2.0 * 3 * 500)
 
 
 @pytest.mark.parametrize("noise", [5e-6, 1.2e-4])
@@ -88,11 +89,13 @@ def test_the_points_of_the_arc_are_told_from_others():
         clean = on[left] & (np.abs(points[:, 1] - arc_height(points, on[left])) < 5e-4)
         used = fit_arc(points, ArcRule(R)).used
         assert np.sum(used & ~clean) <= 2
-        assert np.sum(used & clean) > 0.93 * np.sum(clean)
+        # Lost: half a window of 13 columns at either rim, where the table begins, and spikes so
+        # small that they are called clean here, 0.6 of 410 points on average (Poisson: seldom 6).
+        assert np.sum(~used & clean) <= 2 * 6 + 5
 
 
 def arc_height(points, on):
-    """Heights (n,) of the arc from the median of five columns: simple, rough and independent."""
+    """Heights (n,) of the arc from the median of seven columns: simple, rough and independent."""
     from scipy.ndimage import median_filter
 
     return np.where(on, median_filter(points[:, 1], 7, mode="nearest"), np.inf)

@@ -70,7 +70,9 @@ def test_spikes_and_gaps():
         assert len(set(nearest)) == len(fit.points)
         assert np.array_equal(fit.convex, CONVEX[nearest])
         found += squares(fit, vertices[1:-1][nearest])
-    assert complete >= 36
+    # A surface of 80 columns or more outlasts two gaps of 25; all three hit one of the eight in one
+    # profile of 64, and so four of 40 profiles once in 250 such sets.
+    assert complete >= 37
     assert mean_squares_agree(np.array(found), 2)
 
 
@@ -181,6 +183,7 @@ def test_classic_errors_are_as_large_as_it_says():
         errors.append(fit.points - vertices[1:-1])
         sigmas.append(np.diagonal(fit.covariance, axis1=1, axis2=2))
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(sigmas))
+    # It says a column, as a rule of thumb: a median of five moves a corner by two at most.
     assert 0.5 < ratio < 2.0
 
 
