@@ -360,8 +360,22 @@ def test_too_little_is_refused() -> None:
     with pytest.raises(TooFewSamplesError, match=r"at least 3.*left out: x: dark"):
         calibrate_camera(pairs.take(np.arange(2)), rejected={"x": "dark"})
     still = np.repeat(pairs.T_base_flange[:1], 12, axis=0)
+    with pytest.raises(TooFewSamplesError, match=r"left out: s1: from the pose of s0"):
+        calibrate_camera(replace(pairs, T_base_flange=still))
+    still[:, :3, 3] = pairs.T_base_flange[:, :3, 3]
     with pytest.raises(RankDeficientError, match="turn the flange about two axes"):
         calibrate_camera(replace(pairs, T_base_flange=still))
+
+
+def test_a_pose_that_is_shown_again_counts_once() -> None:
+    _, pairs = measured(12, 14)
+    once = calibrate_camera(pairs)
+    again = calibrate_camera(replace(
+        pairs.take(np.tile(np.arange(12), 3)),
+        names=tuple(f"{name} {i}" for i in range(3) for name in pairs.names),
+    ))  # fmt: skip
+    assert again.working_error_m == once.working_error_m
+    assert len(again.rejected) == 24 + len(once.rejected)
 
 
 def test_three_poses_are_enough() -> None:
@@ -452,7 +466,7 @@ def test_check_pairs_judge_and_are_not_used() -> None:
     assert found.more["held_out"]["n"] == 10
     alone = calibrate_camera(some)
     assert np.array_equal(found.T_flange_sensor, alone.T_flange_sensor)
-    assert alone.more["held_out"] is None
+    assert "held_out" not in alone.more
     assert found.more["held_out"]["rejected_because"] == {"x": "dark"}
     expected = np.sqrt(np.sum(np.square([2e-4] * 3)) + np.sum(np.square([1e-4, 1e-4, 4e-4])))
     assert found.more["held_out"]["rms_mm"] == pytest.approx(1e3 * expected, rel=0.5)
