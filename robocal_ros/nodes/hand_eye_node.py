@@ -30,6 +30,7 @@ from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
 from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.sessions.decisions import named
 from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
@@ -136,26 +137,34 @@ class HandEyeNode(HouseNode):
 
         return take
 
-    def _ask_decision(self, command: Command) -> Any:
-        if command.name == ACCEPT and (fault := self._frame_fault(command)):
-            raise InputError(fault)
-        return self._desk.ask(command)
+    async def _ask_decision(self, command: Command) -> Outcome:
+        if command.name == ACCEPT and self._chosen(command) is not None:
+            await self._frames.heard()
+            if fault := self._frame_fault(command):
+                raise InputError(fault)
+        outcome: Outcome = await self._desk.ask(command)
+        return outcome
+
+    def _chosen(self, command: Command) -> Mapping[str, Any] | None:
+        """The sensor's place that a command would bring into force; None: it will be refused."""
+        history = self._history
+        if history is None or self._session is None:
+            return None
+        number = int(named(history, command, self._kind).arguments.get("id", 0))
+        model = history.model(number) if number else {}
+        return model if "parent" in model else None
 
     def _frame_fault(self, command: Command) -> str:
         """Why what a command would bring into force cannot stand on tf; empty when it can."""
-        history = self._history
-        if history is None or self._session is None:
-            return ""
-        pending = [entry.id for entry in history.pending(self._kind)]
-        chosen = [int(command.arguments["id"])] if "id" in command.arguments else pending[:1]
-        models = [history.model(one) for one in chosen]
-        return "".join(self._conflict(model) for model in models if "parent" in model)
+        model = self._chosen(command)
+        return "" if model is None else self._conflict(model)
 
     def _watch(self) -> None:
-        """A capture ends too when the joint states do."""
+        """A capture ends too when the joint states do; what is heard of tf is looked at in time."""
         session = self._session
         if session is None:
             return
+        self._frames.tick()
         silent_s = self._silence.look(time.monotonic())
         if (command := session.silent(silent_s)) is not None:
             self._desk.ask(command)
@@ -218,7 +227,10 @@ class HandEyeNode(HouseNode):
     def _show_transform(self, head: Head) -> None:
         """Put what is in force onto tf, once it is known that nobody else puts the frame there."""
         history, model = self._history, head.model
-        if history is None or self._on_tf == head.revision or not self._frames.settled:
+        if history is None or self._on_tf == head.revision:
+            return
+        self._frames.listen()
+        if not self._frames.settled:
             return
         if model is not None and self._conflict(model):
             return

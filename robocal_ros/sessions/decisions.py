@@ -26,8 +26,7 @@ def decide(
     RobocalError
         When the history refuses.
     """
-    if "choose" in command.arguments:
-        command = _named(history, command, kind)
+    command = named(history, command, kind)
     arguments = command.arguments
     if "refused" in arguments:
         return Outcome(command, Code.CONFLICT, str(arguments["refused"]))
@@ -60,8 +59,10 @@ def decide(
     return Outcome(command, Code.ACCEPT, message, None, chosen)
 
 
-def _named(history: History, command: Command, kind: str) -> Command:
-    """Put the candidate's id, or why there is none to choose, in place of ``choose``."""
+def named(history: History, command: Command, kind: str) -> Command:
+    """Put the candidate's id, or why there is none (``refused``), in place of ``choose``."""
+    if "choose" not in command.arguments:
+        return command
     arguments = dict(command.arguments)
     pending = [entry.id for entry in history.pending(kind)]
     choose = arguments.pop("choose")

@@ -10,11 +10,13 @@ from geometry_msgs.msg import Transform, TransformStamped
 from hand_eye_driver import FRAME
 from hand_eye_live import NAME, LiveSensor
 from robocal_msgs.srv import Decide
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.diagnostics import ERROR
+from robocal_ros.nodes.frame_watch import FRESH_S
 from robocal_ros.sessions.events import ACCEPT, Command
 
 
@@ -61,6 +63,69 @@ def test_the_joint_of_a_urdf_is_told_from_the_candidate(
     # Who comes later is told of too.
     urdf.publish(below("tool0", drawn))
     graph.spin_until(lambda: "out of the URDF" in error_of(sensor), "the diagnostics")
+
+
+def test_tf_is_listened_to_only_for_an_answer(graph: Any, tmp_path: Path) -> None:
+    """A robot's /tf is many messages; who puts the frame there late is heard all the same."""
+    transform = Transform()
+    transform.rotation.w = 1.0
+    told = below("base", transform)
+    told.transforms[0].child_frame_id = "gripper"
+    tf = graph.probe.create_publisher(TFMessage, "/tf", qos.own(qos.RELIABLE))
+    graph.probe.create_timer(0.05, lambda: tf.publish(told))
+    sensor = LiveSensor(graph, tmp_path)
+
+    def listens() -> int:
+        return int(graph.probe.count_subscribers("/tf"))
+
+    graph.spin_until(listens, "it listens")
+    sensor.sphere(8)
+    result = sensor.calibrate()
+    graph.spin_until(lambda: sensor.node._frames.settled and not listens(), "it has heard enough")
+    told = below("camera_rail", transform)
+    sensor.node._frames._ended -= FRESH_S  # as a while later
+    refused = graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me")
+    assert (refused.success, refused.status) == (False, Code.BAD_INPUT)
+    assert "'camera_rail'" in refused.message
+    graph.spin_until(lambda: not listens(), "it has heard enough again")
+
+
+def test_an_accept_waits_until_all_was_heard(
+    graph: Any, calibrated: tuple[LiveSensor, Any]
+) -> None:
+    sensor, result = calibrated
+    urdf = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    urdf.publish(below("camera_rail", result.sensor))
+    for step in ("deactivate", "activate"):
+        getattr(sensor.node, f"trigger_{step}")()
+    assert not sensor.node._frames.settled
+    early = graph.call(Decide, f"{NAME}/accept", id=result.candidate_id, by="me")
+    assert (early.success, early.status) == (False, Code.BAD_INPUT)
+    assert "'camera_rail'" in early.message
+    # One that waits while the node is deactivated is answered.
+    sensor.node._frames._listen_anew()
+    asked = graph._clients[f"{NAME}/accept"].call_async(
+        Decide.Request(id=result.candidate_id, by="me")
+    )
+    graph.spin_for(0.3)
+    assert not asked.done()
+    sensor.node.trigger_deactivate()
+    graph.spin_until(asked.done, "the answer")
+    assert (asked.result().success, asked.result().status) == (False, Code.CONFLICT)
+
+
+def test_the_twin_looks_at_the_candidate_that_it_would_accept(
+    graph: Any, calibrated: tuple[LiveSensor, Any]
+) -> None:
+    sensor, result = calibrated
+    assert sensor.calibrate().candidate_id > result.candidate_id
+    rail = graph.publisher(TFMessage, "/tf_static", qos.LATCHED)
+    rail.publish(below("camera_rail", result.sensor))
+    graph.spin_until(
+        lambda: sensor.node._frame_fault(Command(ACCEPT, {"id": result.candidate_id})), "it is seen"
+    )
+    twin = graph.call(Trigger, f"{NAME}/accept_trigger")
+    assert twin.message.startswith("0 CONFLICT exactly one fresh candidate must be pending")
 
 
 def test_a_frame_that_is_taken_at_the_start_is_not_published(

@@ -289,8 +289,12 @@ def test_what_another_process_accepts_is_not_put_below_two_parents(
     others = graph.publisher(TFMessage, "/tf", qos.RELIABLE)
     wrong = TransformStamped(child_frame_id=FRAME)
     wrong.header.frame_id = "camera_rail"
-    others.publish(TFMessage(transforms=[wrong]))
-    graph.spin_until(lambda: taken(sensor), "the transform is seen")
+
+    def seen() -> str:
+        others.publish(TFMessage(transforms=[wrong]))
+        return taken(sensor)
+
+    graph.spin_until(seen, "the transform is seen")
     # Accepted elsewhere it is in force, but not put onto tf, and that is said.
     graph.spin_until(lambda: sensor.node._frames.settled, "it would publish")
     tf = graph.collect(TFMessage, "/tf_static", qos.LATCHED)
