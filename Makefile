@@ -32,17 +32,25 @@ help:  ## this list
 demo: setup  ## a simulated shift through the live nodes, with a report in out/
 	$(ROS) python bags/demo.py
 
-# Two halves beside each other, on two cores; then the nodes, which are timed, alone.
+# Two halves beside each other, on two cores; then the nodes so, in two halves as well. What is
+# timed to milliseconds stands beside what mostly computes or waits.
 HALF := test/core test/sessions test/sim test/report
+REST := $(HALF:%=--ignore=%) --ignore=test/nodes
+TIMED := $(addprefix test/nodes/test_,base cell_sim_node joint_correction_node launch replay_node run \
+	tcf_node thermal_node tool_cell)
+TIMED := $(TIMED:%=%.py)
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
 	failed=0
-	$(ROS) python -m pytest $(HALF) >out/half_of_tests.txt 2>&1 & half=$$!
-	$(ROS) python -m pytest $(HALF:%=--ignore=%) --ignore=test/nodes || failed=1
-	wait $$half || failed=1
-	cat out/half_of_tests.txt
-	$(ROS) python -m pytest test/nodes || failed=1
+	beside() {
+		$(ROS) python -m pytest $$1 >out/beside.txt 2>&1 & local other=$$!
+		$(ROS) python -m pytest $$2 || failed=1
+		wait $$other || failed=1
+		cat out/beside.txt
+	}
+	beside "$(HALF)" "$(REST)"
+	beside "test/nodes $(TIMED:%=--ignore=%)" "$(TIMED)"
 	exit $$failed
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries
