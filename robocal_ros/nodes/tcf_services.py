@@ -161,9 +161,10 @@ class TcfServices:
     def _result(self, request: Any, response: Any) -> Any:
         outcome = self._runner.last()
         if outcome is None:
-            open_run = self._runner.is_open()
-            words = f"run {self._runner.step().run} is open" if open_run else "no run has ended yet"
-            response.message = trigger_text(0, Code.CONFLICT, words)
+            code, words = Code.CONFLICT, "no run has ended yet"
+            if self._runner.is_open():  # no code that ends a run, for a PLC that asks until then
+                code, words = Code.NONE, f"run {self._runner.step().run} is open"
+            response.message = trigger_text(0, code, words)
             return response
         return _trigger(response, outcome)
 

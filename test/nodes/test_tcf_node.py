@@ -119,7 +119,7 @@ def test_nothing_of_an_old_run_is_told_while_a_new_one_is_open(graph: Any, tmp_p
     assert kept.message == f"{first.candidate_id} ACCEPT {first.message}"
     cell.begin()
     told = graph.call(Trigger, "/tcf_node/result_trigger")
-    assert (told.success, told.message) == (False, "0 CONFLICT run 2 is open")
+    assert (told.success, told.message) == (False, "0 NONE run 2 is open")
 
 
 def test_a_tool_too_thick_for_the_circle_is_refused(graph: Any, cell: LiveCell) -> None:
