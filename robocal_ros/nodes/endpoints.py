@@ -85,7 +85,7 @@ class EndpointNode(LifecycleNode):
 
     def add_input(
         self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile
-    ) -> None:
+    ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid."""
         count = self.inputs.setdefault(topic, InputCount())
 
@@ -114,6 +114,7 @@ class EndpointNode(LifecycleNode):
         )
         self._takers.append((subscription, receive))
         self._release.append(lambda: self.destroy_subscription(subscription))
+        return subscription
 
     def take_waiting(self) -> None:
         """Take now what the inputs have received, in place of one message of each in its turn.
