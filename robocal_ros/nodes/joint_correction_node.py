@@ -1,31 +1,37 @@
 """The joint correction node: taught joints in, corrected ones out (docs/joint_correction.md)."""
 
 import time
-from array import array
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped
-from numpy.typing import NDArray
-from robocal_msgs.msg import KinematicModel
+from robocal_msgs.msg import CorrectionStatus as StatusMessage
+from robocal_msgs.msg import JointOffset, KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import load_kernels
+from robocal_ros.nodes import joint_correction_messages as messages
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
-from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
-from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
+from robocal_ros.nodes.command_sources import CommandSources
+from robocal_ros.nodes.diagnostics import Health
+from robocal_ros.nodes.joint_correction_health import CorrectionHealth
+from robocal_ros.nodes.joint_correction_settings import (
+    SETTINGS,
+    arms,
+    command_joints,
+    session_config,
+)
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     CorrectionStatus,
-    JointCommand,
-    Reason,
-    RefusedError,
     TrajectoryCommand,
     finite_command,
     joint_command,
@@ -36,9 +42,19 @@ from robocal_ros.sessions.correction import (
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
+COMMANDS = "joint_commands"
 STATES = "joint_states"
 MODEL = "kinematic_model"
 TOOL = "tool_frame"
+KINDS = {
+    TRAJECTORY: JointTrajectory,
+    TARGETS: JointState,
+    COMMANDS: Float64MultiArray,
+    STATES: JointState,
+}
+
+LOOK_S = 0.1  # between two looks at the clock: stale models, blends that go on, what changed
+TELL_S = 1.0  # the status goes out at least so often
 
 
 class JointCorrectionNode(HouseNode):
@@ -53,25 +69,47 @@ class JointCorrectionNode(HouseNode):
         nominal, reference = arms(self.settings)
         config = session_config(self.settings)
         serial = self.settings["serial"] or NO_SERIAL
+        self._names = command_joints(self.settings, nominal)
+        self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
         self._session.enable(self.settings["enable_on_start"])
-        self._refusals = 0
+        self._messages = messages.CorrectionMessages(
+            nominal, reference, self.settings["reference"], serial, self._shadow
+        )
+        self._judge = CorrectionHealth()
+        self._streams = CommandSources(config.stream_gap_s)
+        self._paths = CommandSources(config.stream_gap_s)
+        self._senders = {TARGETS: self._streams, COMMANDS: self._streams, TRAJECTORY: self._paths}
+        self._sources = {topic: SourceGuard(self, topic) for topic in KINDS}
+        self._commanded = False
+        self._told: tuple[CorrectionStatus, str] | None = None
+        self._told_s = 0.0
+        self._open_topics()
+
+    def _open_topics(self) -> None:
         self._outputs = {
             topic: self.add_output(kind, f"~/{topic}", qos.RELIABLE)
-            for topic, kind in ((TRAJECTORY, JointTrajectory), (TARGETS, JointState))
+            for topic, kind in KINDS.items()
         }
-        self._outputs[STATES] = self.add_output(JointState, f"~/{STATES}", qos.RELIABLE)
-        self._sources = {topic: SourceGuard(self, topic) for topic in self._outputs}
+        self._offsets = self.add_output(JointOffset, "~/correction", qos.RELIABLE)
+        self._statuses = self.add_output(StatusMessage, "~/status", qos.LATCHED)
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
-        self.add_input(TransformStamped, TOOL, self._on_tool, qos.LATCHED)
+        self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
         self.add_input(JointState, STATES, self._guarded(STATES, self._on_states), qos.SENSOR)
-        self.add_input(JointState, TARGETS, self._guarded(TARGETS, self._on_target), qos.RELIABLE)
-        self.add_input(
-            JointTrajectory, TRAJECTORY, self._guarded(TRAJECTORY, self._on_path), qos.RELIABLE
-        )
+        commands = {TARGETS: self._on_target, COMMANDS: self._on_array, TRAJECTORY: self._on_path}
+        for topic, act in commands.items():
+            receive = self._guarded(topic, act)
+            self._senders[topic].inputs[topic] = self.add_input(
+                KINDS[topic], topic, receive, qos.RELIABLE
+            )
         self.add_service(SetBool, "~/enable", self._on_enable)
-        self.add_timer(POLL_S, self._look, steady=True)
+        self.add_timer(POLL_S, self._look_at_graph, steady=True)
+        self.add_timer(LOOK_S, self._look, steady=True)
+
+    def activate(self) -> None:
+        """Tell at once what is done."""
+        self._tell()
 
     # ---- what decides about the correction ------------------------------------------------------
 
@@ -79,69 +117,125 @@ class JointCorrectionNode(HouseNode):
         build = self._session.counted
         self._session.offer_model(build(lambda: offered_model(message, KinematicModel.ACCEPTED)))
         self._made_for = self._session.status().serial
+        self._tell()
 
     def _on_tool(self, message: Any) -> None:
-        self._session.offer_tool(self._session.counted(lambda: offered_tool(message)))
+        build = self._session.counted
+        self._session.offer_tool(build(lambda: offered_tool(message, ToolFrame.ACCEPTED)))
+        self._tell()
 
     def _on_enable(self, request: Any, response: Any) -> Any:
         self._session.enable(request.data)
-        status = self._session.status()
         response.success = True
-        response.message = _in_words(status)
+        response.message = messages.in_words(self._session.status())
         self.get_logger().info(f"enable {request.data}: {response.message}")
+        self._tell()
         return response
 
     # ---- what is corrected ----------------------------------------------------------------------
 
     def _guarded(self, topic: str, act: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Refuse what a correction node publishes itself."""
+        """Refuse what a correction node publishes itself, and commands of several sources.
+
+        In shadow mode a message goes out as it came before anything else is done with it.
+        """
         guard = self._sources[topic]
+        senders = self._senders.get(topic)
 
         def receive(message: Any) -> None:
             stop = topic == TRAJECTORY and not message.points  # nothing may hold it up
             if guard.fault and not stop:
-                self._session.counted(lambda: _refuse(guard.fault))
+                self._refuse(Reason.OWN_OUTPUT, guard.fault)
+            if topic == STATES:
+                messages.drop_unknown_efforts(message)
+            if self._shadow and messages.is_finite(message):
+                self._outputs[topic].publish(message)
+            rivals = senders.hear(topic, time.monotonic()) if senders and not stop else ""
+            if rivals:
+                self._refuse(Reason.TWO_SOURCES, rivals)
             act(message)
 
         return receive
 
+    def _refuse(self, reason: Reason, detail: str) -> None:
+        def refuse() -> None:
+            raise RefusedError(reason, detail)
+
+        self._session.counted(refuse)
+
     def _on_target(self, message: Any) -> None:
         command = self._session.counted(lambda: finite_command(message))
-        self._put_out(TARGETS, message, self._session.target(command, time.monotonic()))
+        now = time.monotonic()
+        messages.fill_joints(message, self._session.target(command, now))
+        self._put_out(TARGETS, message)
+        self._tell_offset(JointOffset.STREAM, now)
+
+    def _on_array(self, message: Any) -> None:
+        command, now = messages.array_command(self._names, message), time.monotonic()
+        messages.fill_array(message, self._session.target(command, now))
+        self._put_out(COMMANDS, message)
+        self._tell_offset(JointOffset.STREAM, now)
 
     def _on_states(self, message: Any) -> None:
         command = self._session.counted(lambda: joint_command(message))
-        if not np.all(np.isfinite(message.effort)):
-            message.effort = _doubles(np.empty(0))  # many drivers have none: no NaN goes out
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
-        self._put_out(STATES, message, self._session.reading(command, time.monotonic(), age))
-
-    def _put_out(self, topic: str, message: Any, command: JointCommand) -> None:
-        """Publish the message with the command's values; what it did not change stays."""
-        message.header.frame_id = command.mark
-        message.position = _doubles(command.position)
-        if command.velocity is not None:
-            message.velocity = _doubles(command.velocity)
-        self._outputs[topic].publish(message)
+        messages.fill_joints(message, self._session.reading(command, time.monotonic(), age))
+        self._put_out(STATES, message)
 
     def _on_path(self, message: Any) -> None:
         now = time.monotonic()
         if not message.points:
-            self._outputs[TRAJECTORY].publish(message)
+            self._put_out(TRAJECTORY, message)
             self._session.trajectory(_STOP, now)
             return
         command = self._session.counted(lambda: trajectory_command(message))
         starts_in = (command.stamp_ns - self.now_ns()) * 1e-9 if command.stamp_ns else 0.0
         corrected = self._session.trajectory(command, now, starts_in)
         if corrected is not command:
-            _fill(message, corrected)
-        self._outputs[TRAJECTORY].publish(message)
+            messages.fill_path(message, corrected)
+        self._put_out(TRAJECTORY, message)
+        self._tell_offset(JointOffset.TRAJECTORY, now)
+
+    def _put_out(self, topic: str, message: Any) -> None:
+        if not self._shadow:
+            self._outputs[topic].publish(message)
 
     # ---- what is reported -----------------------------------------------------------------------
 
-    def _look(self) -> None:
+    def _tell_offset(self, cause: int, now_s: float) -> None:
+        self._commanded = True
+        offset = self._session.offset(now_s)
+        self._offsets.publish(self._messages.offset(offset, cause, self.now_ns()))
+
+    def _look_at_graph(self) -> None:
         for guard in self._sources.values():
             guard.look()
+        self._streams.look()
+
+    def _look(self) -> None:
+        """Let time pass, and tell what has changed."""
+        now = time.monotonic()
+        self._session.look(now, self.now_ns())
+        if self._commanded:
+            self._tell_offset(JointOffset.PERIODIC, now)
+        self._tell(only_news=True)
+
+    def _tell(self, *, only_news: bool = False) -> None:
+        """Publish the status; a figure of the last command alone is no news."""
+        status, now = self._session.status(), time.monotonic()
+        sources = "; ".join([*self._faults(), *self._rivals()])
+        told = (replace(status, tcp_shift_m=0.0, largest_shift=0.0, remaining_m=0.0), sources)
+        if only_news and told == self._told and now - self._told_s < TELL_S - 0.5 * LOOK_S:
+            return
+        self._told, self._told_s = told, now
+        self._statuses.publish(self._messages.status(status, sources, self.now_ns()))
+
+    def _faults(self) -> list[str]:
+        return [guard.fault for guard in self._sources.values() if guard.fault]
+
+    def _rivals(self) -> list[str]:
+        now = time.monotonic()
+        return [words for s in (self._streams, self._paths) if (words := s.words(now))]
 
     def _serial(self) -> str:
         """The robot's serial: as configured, else the model's, else the robot's name."""
@@ -149,79 +243,10 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        status, health = self._session.status(), Health()
-        refusals = sum(status.refused.values())
-        if refusals > self._refusals:
-            health.worsen(WARN, status.last_refusal)
-        self._refusals = refusals
-        for guard in self._sources.values():
-            if guard.fault:
-                health.worsen(ERROR, guard.fault)
-        if status.mismatch:
-            health.worsen(ERROR, f"{Reason.START_MISMATCH.value}: {status.mismatch}")
-        if status.waits:
-            health.worsen(WARN, f"the blend waits, {status.waits}")
-        if status.survey.beyond:
-            health.worsen(WARN, f"model revision {status.revision}: {status.survey}")
-        if status.waiting_revision is not None:
-            health.worsen(
-                WARN,
-                f"model revision {status.waiting_revision} was refused, ~/enable looks at it again",
-            )
-        if status.enabled and status.revision is None and not status.new_tool:
-            health.worsen(WARN, "enabled, but neither a model nor a tool was taken over")
-        health.values = {
-            "correction": _in_words(status),
-            "shift at the tool mm": f"{status.tcp_shift_m * 1e3:.4f}",
-            "largest joint shift deg": f"{np.degrees(status.largest_shift):.4f}",
-            "remaining error mm": f"{status.remaining_m * 1e3:.6f}",
-            "over the joint range": status.survey,
-            "start mismatch": status.mismatch,
-            "blend waits": status.waits,
-            "blend held": status.held,
-            "points corrected in part": status.reduced,
-        } | {f"refused, {reason.value}": count for reason, count in status.refused.items()}
-        return health
+        return self._judge.of(self._session.status(), self._faults(), self._rivals())
 
 
 _STOP = TrajectoryCommand((), np.empty((0, 0)), np.empty(0))
-
-
-def _refuse(detail: str) -> None:
-    raise RefusedError(Reason.OWN_OUTPUT, detail)
-
-
-def _fill(message: Any, command: TrajectoryCommand) -> None:
-    """Put corrected positions and rates into the message; times and efforts stay."""
-    message.header.frame_id = command.mark
-    changed = {
-        "positions": command.position,
-        "velocities": command.velocity,
-        "accelerations": command.acceleration,
-    }
-    for name, values in changed.items():
-        if values is not None:
-            for point, row in zip(message.points, values, strict=True):
-                setattr(point, name, _doubles(row))
-
-
-def _doubles(values: NDArray[np.float64]) -> "array[float]":
-    """The type that a message takes without looking at each number."""
-    return array("d", values.tobytes())
-
-
-def _in_words(status: CorrectionStatus) -> str:
-    """What the correction does now, in one line."""
-    if status.mismatch:
-        return f"nothing goes out, {Reason.START_MISMATCH.value}: {status.mismatch}"
-    if not status.enabled:
-        return "off, blending out with the next commands" if status.active else "off"
-    parts = [] if status.revision is None else [f"model revision {status.revision}"]
-    parts += ["new tool"] if status.new_tool else []
-    if not parts:
-        return "on, but there is no model and no tool yet"
-    settled = "on" if status.settled else "on, blending with the next commands"
-    return f"{settled}: {' and '.join(parts)}"
 
 
 def main() -> None:

@@ -6,12 +6,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig, ShiftBounds
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_description, load_robot
 
 NOMINAL = "nominal"
 
@@ -39,8 +41,53 @@ SETTINGS = (
         "zero: the tool of the robot file",
         check=_tool_fault,
     ),
-    Setting("flange_frame", "tool0", "Parent frame of the tool_frame input"),
-    Setting("tool_child_frame", "", "Child frame of the tool_frame input; empty: any"),
+    Setting(
+        "command_joints",
+        [""],
+        "Joints of joint_commands (Float64MultiArray), in its order; empty: all joints of the arm, "
+        "from base to flange",
+    ),
+    Setting(
+        "follow_joint_trajectory",
+        "",
+        "The controller's action that corrected goals are sent to; empty: no such goals are taken",
+    ),
+    Setting(
+        "shadow",
+        False,
+        "Compute everything and change nothing: outputs go out as the inputs came in",
+    ),
+    Setting(
+        "policy",
+        Policy.REFUSE.value,
+        "What becomes of a command whose correction exceeds a bound or leads beyond a limit: "
+        "refuse it, clamp the correction, or pass it while the correction is blended out",
+        choices=tuple(policy.value for policy in Policy),
+    ),
+    Setting(
+        "model_age_s",
+        0.0,
+        "A model whose stamp is older is no longer used; 0: it may be of any age",
+        unit="s",
+        low=0.0,
+        high=1e7,
+    ),
+    Setting(
+        "free_axis",
+        False,
+        "The tool may turn about its z axis (drill, sphere, torch): the joints move as little as "
+        "they can",
+    ),
+    Setting(
+        "velocity_limits",
+        [0.0],
+        "Largest speed of each joint after correction, rad/s (sliding: m/s), one number for each; "
+        "0: as the robot file says",
+        low=0.0,
+        high=1e3,
+    ),
+    Setting("flange_frame", "tool0", "Parent frame that tools of tool_frame must have"),
+    Setting("tool_child_frame", "", "Child frame that they must have; empty: any"),
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
     Setting(
         "thermal_tcp_mm",
@@ -152,8 +199,42 @@ def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
     return nominal, reference
 
 
+def command_joints(settings: Mapping[str, Any], arm: SerialArm) -> tuple[str, ...]:
+    """The joints of ``joint_commands``, in its order.
+
+    Raises
+    ------
+    InputError
+        When one of them is not the arm's, or is named twice.
+    """
+    names = tuple(settings["command_joints"]) or arm.joint_names
+    unknown = [name for name in names if name not in arm.joint_names]
+    if unknown or len(set(names)) != len(names):
+        fault = f"{', '.join(unknown)} unknown" if unknown else "a joint is named twice"
+        raise InputError(
+            f"command_joints = {', '.join(names)}: {fault}; the arm has "
+            f"{', '.join(arm.joint_names)}"
+        )
+    return names
+
+
+def _velocity_limits(settings: Mapping[str, Any]) -> NDArray[np.float64]:
+    """(n,) largest speeds, rad/s (prismatic: m/s); infinite where neither says one."""
+    robot = load_description(settings["robot"])
+    given, count = np.array(settings["velocity_limits"]), robot.arm.n
+    if len(given) != count and given.any():
+        raise InputError(f"velocity_limits has {len(given)} numbers, the arm {count} joints")
+    return np.where(given > 0.0, given, robot.max_velocity)
+
+
 def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
-    """Settings of the session, in SI."""
+    """Settings of the session, in SI.
+
+    Raises
+    ------
+    InputError
+        When the numbers of joints and of velocity limits differ.
+    """
 
     def bounds(what: str) -> ShiftBounds:
         degrees = (settings[f"{what}_{where}_deg"] for where in ("tcp", "joint"))
@@ -173,4 +254,8 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         joint_state_age_s=settings["joint_state_age_s"],
         flange_frame=settings["flange_frame"],
         tool_frame=settings["tool_child_frame"],
+        policy=Policy(settings["policy"]),
+        model_age_s=settings["model_age_s"],
+        free_axis=settings["free_axis"],
+        velocity_limits=_velocity_limits(settings),
     )
