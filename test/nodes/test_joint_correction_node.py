@@ -8,156 +8,37 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from builtin_interfaces.msg import Duration, Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import TransformStamped
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from joint_correction_live import (
+    HOME,
+    NAMES,
+    NODE,
+    NOMINAL,
+    Line,
+    distance,
+    drifted,
+    joints,
+    model_message,
+    tool_message,
+    trajectory,
+)
 from rclpy.node import Node
-from robocal_msgs.msg import KinematicModel
+from robocal_msgs.msg import KinematicModel, ToolFrame
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.documents import model_document
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.diagnostics import OK, WARN
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.joint_correction_settings import SETTINGS
-from robocal_ros.storage.robots import load_robot
 
-NOMINAL = load_robot("kr150_r3100")
-NAMES = list(NOMINAL.joint_names)
-HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
-NODE = "/joint_correction_node"
 BUSY = 2.0  # other work on the machine
-
-
-def drifted() -> SerialArm:
-    rng = np.random.default_rng(0)
-    chosen = NOMINAL.parameters
-    size = np.where(chosen.is_length, 1e-4, 5e-5)
-    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
-
-
-def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> KinematicModel:
-    fields = {
-        "serial": "s1",
-        "model_hash": NOMINAL.model_hash,
-        "revision": revision,
-        "state": KinematicModel.ACCEPTED,
-        "stamp": Header(frame_id="base"),
-    }
-    return conversions.kinematic_model(model_document(arm), **(fields | changes))
-
-
-def joints(q: Any, **fields: Any) -> JointState:
-    return JointState(name=NAMES, position=array("d", q), **fields)
-
-
-def trajectory(q: np.ndarray, times: np.ndarray, **fields: Any) -> JointTrajectory:
-    still = array("d", np.zeros(6))
-    points = [
-        JointTrajectoryPoint(
-            positions=array("d", row),
-            velocities=still,
-            accelerations=still,
-            effort=array("d", np.full(6, 7.0)),
-            time_from_start=Duration(sec=int(t), nanosec=round(t % 1 * 1e9)),
-        )
-        for row, t in zip(q, times, strict=True)
-    ]
-    return JointTrajectory(joint_names=NAMES, points=points, **fields)
-
-
-# Other work on the machine may hold readings up: they still tell where a robot at rest is.
-PATIENT = {"joint_state_age_s": 5.0}
-
-
-class Line:
-    """The node between a planner and a controller, both played by the probe.
-
-    The robot stands at ``at``, which is where the last target sent it.
-    """
-
-    def __init__(self, graph: Any, **parameters: Any) -> None:
-        self.graph = graph
-        self.at: Any = HOME
-        self.node = graph.add(JointCorrectionNode, {"serial": "s1"} | PATIENT | parameters)
-        self.targets = graph.collect(JointState, f"{NODE}/joint_targets")
-        self.paths = graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
-        self.states = graph.collect(JointState, f"{NODE}/joint_states")
-        self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
-        self.to_target = graph.publisher(JointState, "joint_targets")
-        self.to_path = graph.publisher(JointTrajectory, "joint_trajectory")
-        self.to_states = graph.publisher(JointState, "joint_states")
-        self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
-        self.to_tool = graph.publisher(TransformStamped, "tool_frame", qos.LATCHED)
-        outputs = (self.node._outputs[name] for name in ("joint_targets", "joint_states"))
-        graph.spin_until(
-            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
-        )
-
-    def wait(self, inbox: list[Any], count: int = 1) -> Any:
-        self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs")
-        return inbox[-1]
-
-    def stand(self, **fields: Any) -> None:
-        self.take(joints(self.at, **fields), self.to_states, "joint_states")
-
-    def target(self, q: Any = HOME, **fields: Any) -> JointState:
-        self.stand()
-        count = len(self.targets)
-        self.to_target.publish(joints(q, **fields))
-        out = self.wait(self.targets, count + 1)
-        self.at = out.position
-        return out
-
-    def report(self, level: bytes, words: str) -> DiagnosticStatus:
-        """The next diagnostics of this level that say so."""
-        self.diagnostics.clear()
-        found: list[DiagnosticStatus] = []
-
-        def look() -> bool:
-            every = [s for array in self.diagnostics for s in array.status]
-            found[:] = [s for s in every if s.level == level and words in s.message]
-            return bool(found)
-
-        self.graph.spin_until(look, f"'{words}' in the diagnostics")
-        return found[-1]
-
-    def enable(self, on: bool = True) -> str:
-        answer = self.graph.call(SetBool, f"{NODE}/enable", data=on)
-        assert answer.success
-        return str(answer.message)
-
-    def take(self, message: Any, publisher: Any, topic: str) -> None:
-        count = self.node.inputs[topic]
-        before = count.received
-        publisher.publish(message)
-        self.graph.spin_until(lambda: count.received > before, f"{topic} is received")
-
-    def refused(self, publisher: Any, message: Any, topic: str) -> None:
-        count = self.node.inputs[topic]
-        before = count.invalid
-        publisher.publish(message)
-        self.graph.spin_until(lambda: count.invalid > before, f"{topic} is refused")
-
-    def settle(self) -> JointState:
-        for _ in range(3000):
-            out = self.target()
-            if self.node._session.status().settled:
-                return out
-        pytest.fail("the blend does not end")
-
-
-def distance(actual: SerialArm, q: Any, reference: SerialArm = NOMINAL) -> float:
-    goal = reference.fk(HOME) @ reference.T_flange_tool
-    T = actual.fk(np.array(q)) @ actual.T_flange_tool
-    return float(np.linalg.norm((T - goal)[:3, 3]))
 
 
 def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:
@@ -207,20 +88,19 @@ def test_a_trajectory_keeps_its_times_and_a_stop_passes(graph: Any) -> None:
 def test_a_new_tool_and_a_taught_one(graph: Any) -> None:
     tool = [0.01, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
     line = Line(graph, enable_on_start=True, taught_tool=tool)
-    message = TransformStamped()
-    message.header.frame_id = "tool0"
-    t = message.transform.translation
-    t.x, t.y, t.z = 0.012, 0.0, 0.25
-    line.take(message, line.to_tool, "tool_frame")
-    q = line.settle()
     T = np.eye(4)
     T[:3, 3] = tool[:3]
     new = T.copy()
     new[0, 3] = 0.012
+    line.take(tool_message(new), line.to_tool, "tool_frame")
+    q = line.settle()
     miss = NOMINAL.fk(np.array(q.position)) @ new - NOMINAL.fk(HOME) @ T
     assert np.abs(miss).max() < 1e-9
-    message.transform.rotation.w = 0.5
-    line.refused(line.to_tool, message, "tool_frame")
+    turned = tool_message(new, 2)
+    turned.tool.rotation.w = 0.5
+    line.refused(line.to_tool, turned, "tool_frame")
+    for change in ({"serial": "s2"}, {"state": ToolFrame.CANDIDATE}, {"model_hash": "other"}):
+        line.refused(line.to_tool, tool_message(new, 2, **change), "tool_frame")
 
 
 def test_hostile_messages_are_refused_and_named(graph: Any) -> None:
@@ -384,8 +264,7 @@ def test_a_blend_that_waits_is_a_warning(graph: Any) -> None:
 
 def test_the_tool_of_another_frame_is_refused(graph: Any) -> None:
     line = Line(graph, tool_child_frame="gun")
-    message = TransformStamped(child_frame_id="gripper")
-    message.header.frame_id = "tool0"
+    message = tool_message(np.eye(4), child_frame_id="gripper")
     line.refused(line.to_tool, message, "tool_frame")
     message.child_frame_id = "gun"
     line.take(message, line.to_tool, "tool_frame")

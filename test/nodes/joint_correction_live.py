@@ -1,0 +1,182 @@
+"""A joint correction node between a planner and a controller, both played by the test."""
+
+from array import array
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Duration
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from robocal_msgs.msg import CorrectionStatus, JointOffset, KinematicModel, ToolFrame
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, Header
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = load_robot("kr150_r3100")
+NAMES = list(NOMINAL.joint_names)
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+NODE = "/joint_correction_node"
+
+
+def drifted() -> SerialArm:
+    rng = np.random.default_rng(0)
+    chosen = NOMINAL.parameters
+    size = np.where(chosen.is_length, 1e-4, 5e-5)
+    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
+
+
+def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> KinematicModel:
+    fields = {
+        "serial": "s1",
+        "model_hash": NOMINAL.model_hash,
+        "revision": revision,
+        "state": KinematicModel.ACCEPTED,
+        "stamp": Header(frame_id="base"),
+    }
+    return conversions.kinematic_model(model_document(arm), **(fields | changes))
+
+
+def tool_message(T: np.ndarray, revision: int = 1, **changes: Any) -> ToolFrame:
+    fields = {
+        "header": Header(frame_id="tool0"),
+        "child_frame_id": "tool",
+        "robot": NOMINAL.name,
+        "serial": "s1",
+        "model_hash": NOMINAL.model_hash,
+        "revision": revision,
+        "tool": conversions.transform_message(T),
+        "state": ToolFrame.ACCEPTED,
+    }
+    return ToolFrame(**(fields | changes))
+
+
+def joints(q: Any, **fields: Any) -> JointState:
+    return JointState(name=NAMES, position=array("d", q), **fields)
+
+
+def trajectory(q: np.ndarray, times: np.ndarray, **fields: Any) -> JointTrajectory:
+    still = array("d", np.zeros(6))
+    points = [
+        JointTrajectoryPoint(
+            positions=array("d", row),
+            velocities=still,
+            accelerations=still,
+            effort=array("d", np.full(6, 7.0)),
+            time_from_start=Duration(sec=int(t), nanosec=round(t % 1 * 1e9)),
+        )
+        for row, t in zip(q, times, strict=True)
+    ]
+    return JointTrajectory(joint_names=NAMES, points=points, **fields)
+
+
+# Other work on the machine may hold readings up: they still tell where a robot at rest is.
+PATIENT = {"joint_state_age_s": 5.0}
+
+
+class Line:
+    """The node between a planner and a controller, both played by the probe.
+
+    The robot stands at ``at``, which is where the last target sent it.
+    """
+
+    def __init__(self, graph: Any, **parameters: Any) -> None:
+        self.graph = graph
+        self.at: Any = HOME
+        self.node = graph.add(JointCorrectionNode, {"serial": "s1"} | PATIENT | parameters)
+        self.targets = graph.collect(JointState, f"{NODE}/joint_targets")
+        self.paths = graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
+        self.arrays = graph.collect(Float64MultiArray, f"{NODE}/joint_commands")
+        self.states = graph.collect(JointState, f"{NODE}/joint_states")
+        self.offsets = graph.collect(JointOffset, f"{NODE}/correction")
+        self.statuses = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
+        self.diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
+        self.to_target = graph.publisher(JointState, "joint_targets")
+        self.to_array = graph.publisher(Float64MultiArray, "joint_commands")
+        self.to_path = graph.publisher(JointTrajectory, "joint_trajectory")
+        self.to_states = graph.publisher(JointState, "joint_states")
+        self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+        self.to_tool = graph.publisher(ToolFrame, "tool_frame", qos.LATCHED)
+        outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
+        graph.spin_until(
+            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
+        )
+
+    def wait(self, inbox: list[Any], count: int = 1) -> Any:
+        self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs")
+        return inbox[-1]
+
+    def stand(self, **fields: Any) -> None:
+        self.take(joints(self.at, **fields), self.to_states, "joint_states")
+
+    def target(self, q: Any = HOME, **fields: Any) -> JointState:
+        self.stand()
+        count = len(self.targets)
+        self.to_target.publish(joints(q, **fields))
+        out = self.wait(self.targets, count + 1)
+        self.at = out.position
+        return out
+
+    def report(self, level: bytes, words: str) -> DiagnosticStatus:
+        """The next diagnostics of this level that say so."""
+        self.diagnostics.clear()
+        found: list[DiagnosticStatus] = []
+
+        def look() -> bool:
+            every = [s for array in self.diagnostics for s in array.status]
+            found[:] = [s for s in every if s.level == level and words in s.message]
+            return bool(found)
+
+        self.graph.spin_until(look, f"'{words}' in the diagnostics")
+        return found[-1]
+
+    def told(self, **fields: Any) -> CorrectionStatus:
+        """The next status that says so."""
+        found: list[CorrectionStatus] = []
+
+        def look() -> bool:
+            found[:] = [
+                status
+                for status in self.statuses
+                if all(getattr(status, name) == value for name, value in fields.items())
+            ]
+            return bool(found)
+
+        self.graph.spin_until(look, f"a status with {fields}")
+        return found[-1]
+
+    def enable(self, on: bool = True) -> str:
+        answer = self.graph.call(SetBool, f"{NODE}/enable", data=on)
+        assert answer.success
+        return str(answer.message)
+
+    def take(self, message: Any, publisher: Any, topic: str) -> None:
+        count = self.node.inputs[topic]
+        before = count.received
+        publisher.publish(message)
+        self.graph.spin_until(lambda: count.received > before, f"{topic} is received")
+
+    def refused(self, publisher: Any, message: Any, topic: str) -> None:
+        count = self.node.inputs[topic]
+        before = count.invalid
+        publisher.publish(message)
+        self.graph.spin_until(lambda: count.invalid > before, f"{topic} is refused")
+
+    def settle(self) -> JointState:
+        for _ in range(3000):
+            out = self.target()
+            if self.node._session.status().settled:
+                return out
+        pytest.fail("the blend does not end")
+
+
+def distance(actual: SerialArm, q: Any, reference: SerialArm = NOMINAL) -> float:
+    goal = reference.fk(HOME) @ reference.T_flange_tool
+    T = actual.fk(np.array(q)) @ actual.T_flange_tool
+    return float(np.linalg.norm((T - goal)[:3, 3]))
