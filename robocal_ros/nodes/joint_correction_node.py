@@ -6,9 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
-from robocal_msgs.msg import KinematicModel
+from robocal_msgs.msg import KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
@@ -64,7 +63,7 @@ class JointCorrectionNode(HouseNode):
         self._outputs[STATES] = self.add_output(JointState, f"~/{STATES}", qos.RELIABLE)
         self._sources = {topic: SourceGuard(self, topic) for topic in self._outputs}
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
-        self.add_input(TransformStamped, TOOL, self._on_tool, qos.LATCHED)
+        self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
         self.add_input(JointState, STATES, self._guarded(STATES, self._on_states), qos.SENSOR)
         self.add_input(JointState, TARGETS, self._guarded(TARGETS, self._on_target), qos.RELIABLE)
         self.add_input(
@@ -81,7 +80,8 @@ class JointCorrectionNode(HouseNode):
         self._made_for = self._session.status().serial
 
     def _on_tool(self, message: Any) -> None:
-        self._session.offer_tool(self._session.counted(lambda: offered_tool(message)))
+        build = self._session.counted
+        self._session.offer_tool(build(lambda: offered_tool(message, ToolFrame.ACCEPTED)))
 
     def _on_enable(self, request: Any, response: Any) -> Any:
         self._session.enable(request.data)
@@ -140,6 +140,7 @@ class JointCorrectionNode(HouseNode):
     # ---- what is reported -----------------------------------------------------------------------
 
     def _look(self) -> None:
+        self._session.look(time.monotonic(), self.now_ns())
         for guard in self._sources.values():
             guard.look()
 

@@ -1,5 +1,6 @@
 """The correction session: off until asked, never a jump, never beyond its bounds, never NaN."""
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -64,9 +65,23 @@ def offer(arm: SerialArm, revision: int = 1, **changes: Any) -> OfferedModel:
     return replace(model, **changes)
 
 
-def bent_tool(shift_m: float = 2e-3, turn_deg: float = 0.5) -> OfferedTool:
+REVISIONS = itertools.count(1)
+
+
+def bent_tool(shift_m: float = 2e-3, turn_deg: float = 0.5, **changes: Any) -> OfferedTool:
+    """Each one is a revision later than the one before."""
     change = frames.transform(frames.exp_rotation([0, np.radians(turn_deg), 0]), [shift_m, 0, 0])
-    return OfferedTool("tool0", NOMINAL.T_flange_tool @ change)
+    tool = OfferedTool(
+        parent="tool0",
+        T_flange_tool=NOMINAL.T_flange_tool @ change,
+        child="tcp",
+        robot=NOMINAL.name,
+        serial="s1",
+        model_hash=NOMINAL.model_hash,
+        revision=next(REVISIONS),
+        accepted=True,
+    )
+    return replace(tool, **changes)
 
 
 class Robot:
@@ -90,6 +105,17 @@ class Robot:
             if self.session.status().settled:
                 return out
         pytest.fail("the blend does not end")
+
+    def rest(self, seconds: float = 0.5) -> None:
+        """Nothing is commanded, and the robot stands."""
+        for _ in range(round(seconds / 0.05)):
+            self.now += 0.05
+            self.read(self.at)
+        self.session.look(self.now, 0)
+
+    def change_tool(self, tool: OfferedTool) -> None:
+        self.session.offer_tool(tool)
+        self.rest()
 
     def read(self, q: np.ndarray, **fields: Any) -> JointCommand:
         return self.session.reading(JointCommand(NAMES, np.array(q), **fields), self.now)
@@ -164,7 +190,7 @@ def test_reaches_the_taught_pose_and_goes_back(robot: Robot) -> None:
 
 def test_reaches_it_with_a_new_tool_too(warm: Robot) -> None:
     tool = bent_tool()
-    warm.session.offer_tool(tool)
+    warm.change_tool(tool)
     q = warm.settle()
     actual = replace(drifted(), T_flange_tool=tool.T_flange_tool)
     assert distance(pose(actual, q), pose(NOMINAL, HOME)) < 1e-9
@@ -228,9 +254,9 @@ def happen(robot: Robot, what: str, seed: int, revision: int) -> None:
     elif what == "nominal":
         session.offer_model(offer(NOMINAL, revision))
     elif what == "tool":
-        session.offer_tool(bent_tool(1e-3 * seed, 0.3 * seed))
+        robot.change_tool(bent_tool(1e-3 * seed, 0.3 * seed))
     elif what == "taught tool":
-        session.offer_tool(bent_tool(0.0, 0.0))
+        robot.change_tool(bent_tool(0.0, 0.0))
     elif what == "stop":
         empty = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
         assert session.trajectory(empty, robot.now) is empty
@@ -261,8 +287,8 @@ def test_a_moving_stream_steps_no_more_than_its_motion_and_the_blend(
     t, shift = 0.0, robot.stream() - HOME
     for revision, (what, seed, count) in enumerate(events, start=1):
         happen(robot, what, seed, revision)
-        for _ in range(count):
-            t += DT
+        for i in range(count):
+            t += DT * (i > 0)  # after a pause it goes on where it was
             q = HOME + 0.3 * np.sin(speed * t)
             now = robot.stream(q) - q
             # By the motion, a correction of some mrad changes by some mrad per rad moved.
@@ -942,7 +968,7 @@ def test_a_tool_beyond_its_bound_is_not_taken_over(robot: Robot) -> None:
     refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(11e-3, 0.0))
     refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(0.0, 3.1))
     robot.session.offer_tool(bent_tool(10e-3, 3.0))
-    wrong = replace(bent_tool(), parent="flange")
+    wrong = bent_tool(parent="flange")
     refused(Reason.BAD_TOOL, robot.session.offer_tool, wrong)
 
 
@@ -956,7 +982,7 @@ def test_near_a_singularity_a_drift_is_corrected_in_part_and_a_tool_not_at_all(
     assert warm.session.status().reduced > 0
     q[4] = 0.1
     last = warm.stream(q)
-    warm.session.offer_tool(bent_tool(2e-3, 2.0))
+    warm.change_tool(bent_tool(2e-3, 2.0))
     for _ in range(6000):
         out = warm.stream(q)
         assert np.abs(out - last).max() <= RATE * DT + ROUNDING
@@ -1077,7 +1103,7 @@ def test_a_history_that_began_again_waits_for_the_operator_without_a_newer_stamp
 
 def test_the_frames_of_a_tool_are_those_configured() -> None:
     robot = Robot(tool_frame="welding_gun")
-    named = replace(bent_tool(), child="welding_gun")
+    named = bent_tool(child="welding_gun")
     for wrong in (bent_tool(), replace(named, child="gripper"), replace(named, parent="base")):
         refused(Reason.BAD_TOOL, robot.session.offer_tool, wrong)
     assert not robot.session.status().new_tool
