@@ -4,7 +4,7 @@ Models are packed (see ``core.joint_correction.pack_model``) and compared by ide
 blend *is* the model that is wanted.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,49 +25,59 @@ class Commanded:
 
     Attributes
     ----------
-    start, end : packed models; a constant one has both the same.
+    start, end : packed models; a settled blend has both the same.
     begin_s : start of the trajectory on the session's clock.
-    times_s, s : (m,) blend along the trajectory; constant before and after.
+    times_s, s : (m,) blend along the trajectory; constant before and after, and in a stream.
     before : what is commanded until ``begin_s``, while a trajectory waits for its start.
     """
 
     start: Array
     end: Array
     begin_s: float = 0.0
-    times_s: Array | None = None
-    s: Array | None = None
+    times_s: Array = field(default_factory=lambda: np.zeros(1))
+    s: Array = field(default_factory=lambda: np.ones(1))
     before: "Commanded | None" = None
 
     def at(self, now_s: float) -> Array:
         """The packed model at an instant."""
-        if self.before is not None and now_s < self.begin_s:
-            return self.before.at(now_s)
-        if self.start is self.end or self.times_s is None or self.s is None:
-            return self.end
-        s = float(np.interp(now_s - self.begin_s, self.times_s, self.s))
+        latest = self.latest(now_s)
+        s = latest.progress(now_s)
         if s <= 0.0:
-            return self.start
-        return self.end if s >= 1.0 else blend_models(self.start, self.end, s)
+            return latest.start
+        return latest.end if s >= 1.0 else blend_models(latest.start, latest.end, s)
+
+    def latest(self, now_s: float) -> "Commanded":
+        """What is in the commands at an instant: this, or what was ``before``."""
+        if self.before is not None and now_s < self.begin_s:
+            return self.before.latest(now_s)
+        return self
+
+    def progress(self, now_s: float) -> float:
+        """How far the blend is, 0 to 1; 1 when settled."""
+        if self.start is self.end:
+            return 1.0
+        return float(np.interp(now_s - self.begin_s, self.times_s, self.s))
 
 
 def step_towards(
-    stage: StagedCorrection, q: Array, rates: Array, dt_s: float
+    stage: StagedCorrection, q: Array, begin: float, rates: Array, dt_s: float
 ) -> tuple[float, StagedResult]:
-    """How far a stream may blend within ``dt_s``, and the corrected point (1, n) there.
+    """How far a stream may blend from s = ``begin`` within ``dt_s``, and the point (1, n) there.
 
     No joint's correction at ``q`` (1, n) changes by more than ``rates`` (n,) times ``dt_s``.
     """
     allowed = rates * dt_s
-    here = stage.correct(q, np.zeros(1))
-    s = 1.0
+    here = stage.correct(q, np.array([begin]))
+    ds = 1.0 - begin
     for _ in range(MOST_TRIES):
+        s = begin + ds if ds < 1.0 - begin else 1.0
         there = stage.correct(q, np.array([s]))
         change = np.abs(there.q - here.q)[0]
         if np.all(change <= allowed):
             return s, there
         with np.errstate(divide="ignore"):
-            s *= 0.98 * float(np.min(np.where(change > 0.0, allowed / change, 1.0)))
-    return 0.0, here
+            ds *= 0.98 * float(np.min(np.where(change > 0.0, allowed / change, 1.0)))
+    return begin, here
 
 
 def blend_along(

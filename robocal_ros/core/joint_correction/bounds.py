@@ -1,6 +1,7 @@
 """Bounds of the joint correction, and what is checked against them."""
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,14 @@ def _degrees(value: float) -> float:
     return float(np.radians(value))
 
 
+class Policy(StrEnum):
+    """What is done with a command whose correction would exceed a bound or a limit."""
+
+    REFUSE = "refuse"
+    CLAMP = "clamp"
+    PASS = "pass"
+
+
 @dataclass(frozen=True)
 class CorrectionConfig:
     """Settings of a correction session.
@@ -59,6 +68,7 @@ class CorrectionConfig:
     start_rad, start_m : how far from where a command begins the robot may stand.
     joint_state_age_s : readings that are older do not tell where the robot is.
     flange_frame, tool_frame : parent and child of an acceptable tool frame; an empty child: any.
+    policy : what is done with a command whose correction would exceed a bound or a limit.
     """
 
     thermal: ShiftBounds = field(
@@ -76,6 +86,7 @@ class CorrectionConfig:
     joint_state_age_s: float = 0.2
     flange_frame: str = "tool0"
     tool_frame: str = ""
+    policy: Policy = Policy.REFUSE
 
     def blend_rates(self, arm: SerialArm) -> Array:
         """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""

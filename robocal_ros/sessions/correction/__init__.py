@@ -1,16 +1,20 @@
 """The joint correction's session: taught joints in, corrected ones out, and back.
 
 session     what the node drives: commands, readings, offers, status
-inputs      what comes in and the status, as types; how they are built from messages
+commands    targets and trajectories, corrected
+readings    joint states, un-corrected
+inputs      what comes in, as types; how they are built from messages
+status      what is said of it, as types
 incoming    joints by name, order in time, own output that comes back
-offers      which models and tools are taken over
-corrector   which model corrects at every instant, and where a correction may start
+offers      which models are taken over
+tools       which tools are taken over, and when
+starts      where a command may begin
+corrector   which model corrects at every instant
 """
 
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig, ShiftBounds
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.sessions.correction.inputs import (
-    CorrectionStatus,
     JointCommand,
     OfferedModel,
     OfferedTool,
@@ -22,6 +26,7 @@ from robocal_ros.sessions.correction.inputs import (
     trajectory_command,
 )
 from robocal_ros.sessions.correction.session import CorrectionSession
+from robocal_ros.sessions.correction.status import CorrectionStatus, Offset
 
 __all__ = [
     "CorrectionConfig",
@@ -30,6 +35,8 @@ __all__ = [
     "JointCommand",
     "OfferedModel",
     "OfferedTool",
+    "Offset",
+    "Policy",
     "Reason",
     "RefusedError",
     "ShiftBounds",

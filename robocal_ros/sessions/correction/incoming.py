@@ -63,6 +63,13 @@ class JointBook:
         age = now_s - self._read_s
         return Whereabouts(self._names, self.measured, travel, age, self._age_limit_s)
 
+    def at_rest(self, now_s: float, near: Array) -> bool:
+        """Whether the joints were read, and stayed within ``near`` (n,) for the response time."""
+        if not self._track or self._track[0][0] > now_s - RESPONSE_S:
+            return False
+        moved = max(float(np.max(np.abs(q - self.measured) / near)) for _, q in self._track)
+        return moved < 1.0 and bool(np.all(now_s - self._read_s <= self._age_limit_s))
+
     def complete(
         self, names: tuple[str, ...], position: Array, now_s: float
     ) -> tuple[Array, Index]:
@@ -107,10 +114,10 @@ class JointBook:
         out[:, index] = rates
         return out
 
-    def read(self, state: JointCommand, now_s: float, age_s: float) -> tuple[Index, Index]:
-        """Take over readings; numbers of the arm's joints in it, and their places in the message.
+    def find(self, state: JointCommand) -> tuple[Index, Index]:
+        """Numbers of the arm's joints in readings, and their places; they must be finite.
 
-        They are ``age_s`` old. Joints of others are left alone.
+        Joints of others are left alone.
         """
         _require_single(state.names)
         if len(state.position) != len(state.names):
@@ -124,11 +131,16 @@ class JointBook:
         if state.velocity is not None:
             speeds = state.velocity[places]
             require_finite(tuple(state.names[i] for i in place), speeds[None])
-        self.measured[index] = values
+        return index, places
+
+    def read(self, state: JointCommand, now_s: float, age_s: float) -> tuple[Index, Index]:
+        """Take over readings that are ``age_s`` old; returns what `find` does."""
+        index, places = self.find(state)
+        self.measured[index] = state.position[places]
         self._read_s[index] = now_s - max(age_s, 0.0)
         if not self._track or now_s - self._track[-1][0] >= TRACK_S:
             self._track.append((now_s, self.measured.copy()))
-            while self._track[0][0] < now_s - RESPONSE_S - TRACK_S:
+            while len(self._track) > 1 and self._track[1][0] <= now_s - RESPONSE_S:
                 self._track.popleft()
         return index, places
 

@@ -1,4 +1,4 @@
-"""What the correction session takes in, and what it says of itself.
+"""What the correction session takes in.
 
 The builders accept any object with the attributes of the ROS message.
 """
@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction.bounds import Survey
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.samples import stamp_ns
 
 Array = NDArray[np.float64]
+
+TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
 
 
 @dataclass(frozen=True)
@@ -70,56 +71,23 @@ class OfferedModel:
 
 @dataclass(frozen=True)
 class OfferedTool:
-    """A tool frame that somebody published: ``T_flange_tool`` (4, 4), and its frames' names."""
-
-    parent: str
-    T_flange_tool: Array
-    child: str = ""
-
-
-@dataclass(frozen=True)
-class CorrectionStatus:
-    """What a correction session does; the figures are of the last message that was put out.
+    """A measured tool that somebody published, absolute.
 
     Attributes
     ----------
-    enabled : asked for.
-    active : commands differ from what came in, or will.
-    settled : no blend is under way.
-    revision : of the model taken over, None without one.
-    serial : the one it was made for; empty without one.
-    survey : its correction over the joint range.
-    waiting_revision : of a model that was refused, and that enabling takes over; None without one.
-    new_tool : a tool other than the taught one was taken over.
-    tcp_shift_m : error at the tool that the drift would have made.
-    largest_shift : largest shift of a joint, rad (prismatic: m).
-    remaining_m : error that was left at the tool.
-    held : how often a blend waited because a bound would have been exceeded.
-    waits : why a blend waits now; empty when none does.
-    mismatch : why nothing is put out until the correction is enabled or disabled again; empty
-        when nothing is wrong.
-    reduced : how many points were corrected in part, near a singularity.
-    refused : how often, by reason.
-    last_refusal : in words; empty when there was none.
+    parent, child : its frames' names.
+    T_flange_tool : (4, 4); None: the taught tool again.
     """
 
-    enabled: bool
-    active: bool
-    settled: bool
-    revision: int | None
+    parent: str
+    T_flange_tool: Array | None
+    child: str
+    robot: str
     serial: str
-    survey: Survey
-    waiting_revision: int | None
-    new_tool: bool
-    tcp_shift_m: float
-    largest_shift: float
-    remaining_m: float
-    held: int
-    waits: str
-    mismatch: str
-    reduced: int
-    refused: dict[Reason, int]
-    last_refusal: str
+    model_hash: str
+    revision: int
+    accepted: bool
+    stamp_ns: int = 0
 
 
 def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:
@@ -245,14 +213,25 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
     )
 
 
-def offered_tool(message: Any) -> OfferedTool:
-    """Build from a ``geometry_msgs/TransformStamped``.
+def offered_tool(message: Any, accepted_state: int) -> OfferedTool:
+    """Build from a ``robocal_msgs/ToolFrame``; its state NONE says: the taught tool, as accepted.
 
     Raises
     ------
     RefusedError
         When a number is not finite or the quaternion is not of unit length.
     """
-    pose = message.transform
-    T = _pose(pose.translation, pose.rotation, Reason.BAD_TOOL)
-    return OfferedTool(str(message.header.frame_id), T, str(message.child_frame_id))
+    taught = int(message.state) == TAUGHT_TOOL
+    pose = message.tool
+    T = None if taught else _pose(pose.translation, pose.rotation, Reason.BAD_TOOL)
+    return OfferedTool(
+        parent=str(message.header.frame_id),
+        T_flange_tool=T,
+        child=str(message.child_frame_id),
+        robot=message.robot,
+        serial=message.serial,
+        model_hash=message.model_hash,
+        revision=int(message.revision),
+        accepted=taught or int(message.state) == accepted_state,
+        stamp_ns=stamp_ns(message.header.stamp),
+    )

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
 from robocal_ros.core.joint_correction import JointCorrection
-from robocal_ros.core.joint_correction.bounds import ROUNDING, CorrectionConfig, Survey, survey
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Survey, survey
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.inputs import OfferedModel, OfferedTool
+from robocal_ros.sessions.correction.tools import ToolGate
 
 Array = NDArray[np.float64]
 
@@ -23,6 +23,7 @@ class CorrectionGate:
     revision : of the model taken over, None before the first.
     survey : its correction over the joint range.
     waiting : a model that was refused but may be taken over when it is looked at again.
+    tools : the measured tools.
     """
 
     def __init__(
@@ -37,23 +38,17 @@ class CorrectionGate:
         self._serial = serial
         self._config = config
         self._model: OfferedModel | None = None
-        self._tool: Array | None = None
         self.revision: int | None = None
         self.survey = Survey(0.0, 0.0, 0.0)
         self.waiting: OfferedModel | None = None
+        self.tools = ToolGate(reference.T_flange_tool, config)
 
     @property
-    def new_tool(self) -> bool:
-        """Whether a tool other than the taught one is in use."""
-        return self._tool is not None
-
-    @property
-    def actual(self) -> SerialArm | None:
-        """The actual arm with its tool; None before a model or a tool was taken over."""
-        if self._model is None and self._tool is None:
-            return None
-        arm = self._arm_of(self._model) if self._model is not None else self._reference
-        return arm if self._tool is None else replace(arm, T_flange_tool=self._tool)
+    def actual(self) -> SerialArm:
+        """The actual arm with its tool, as far as they are known; else the reference's."""
+        arm = self._reference if self._model is None else self._arm_of(self._model)
+        tool = self.tools.T_flange_tool
+        return arm if tool is None else replace(arm, T_flange_tool=tool)
 
     def take_model(self, model: OfferedModel, places: Array, *, again: bool = False) -> None:
         """Take over a model; ``places`` (k, n) are where the robot is, and goes.
@@ -71,6 +66,9 @@ class CorrectionGate:
         if not model.accepted:
             raise RefusedError(Reason.NOT_ACCEPTED, f"revision {model.revision}")
         self._require_robot(model)
+        if model.joint_names != self._nominal.joint_names:
+            detail = f"joints {model.joint_names}, this has {self._nominal.joint_names}"
+            raise RefusedError(Reason.WRONG_ROBOT, detail)
         self.waiting = None
         if self._model is not None and not again:
             if _same(model, self._model):
@@ -99,12 +97,11 @@ class CorrectionGate:
         """Of the model in use; empty without one."""
         return "" if self._model is None else self._model.serial
 
-    def _require_robot(self, model: OfferedModel) -> None:
+    def _require_robot(self, offered: OfferedModel | OfferedTool) -> None:
         expected = {
-            "robot": (model.robot, self._nominal.name),
-            "serial": (model.serial, self._serial),
-            "nominal model's hash": (model.model_hash, self._nominal.model_hash),
-            "joints": (model.joint_names, self._nominal.joint_names),
+            "robot": (offered.robot, self._nominal.name),
+            "serial": (offered.serial, self._serial),
+            "nominal model's hash": (offered.model_hash, self._nominal.model_hash),
         }
         for what, (found, own) in expected.items():
             if found != own:
@@ -134,32 +131,15 @@ class CorrectionGate:
             )
 
     def take_tool(self, tool: OfferedTool) -> None:
-        """Take over a tool frame.
+        """Let a tool wait for its adoption.
 
         Raises
         ------
         RefusedError
-            When its frames are not the configured ones, or it is too far from the taught tool.
+            When it was made for another robot; else as `ToolGate.take`.
         """
-        wanted = self._config.tool_frame
-        if wanted and tool.child != wanted:
-            raise RefusedError(Reason.BAD_TOOL, f"child '{tool.child}', expected '{wanted}'")
-        if tool.parent != self._config.flange_frame:
-            detail = f"parent '{tool.parent}', expected '{self._config.flange_frame}'"
-            raise RefusedError(Reason.BAD_TOOL, detail)
-        taught = self._reference.T_flange_tool
-        shift = float(np.linalg.norm(tool.T_flange_tool[:3, 3] - taught[:3, 3]))
-        turn = float(
-            np.linalg.norm(frames.log_rotation(tool.T_flange_tool[:3, :3] @ taught[:3, :3].T))
-        )
-        bound = self._config.tool
-        if shift > bound.tcp_m + ROUNDING or turn > bound.tcp_rad + ROUNDING:
-            raise RefusedError(
-                Reason.TOOL_BOUND,
-                f"{shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg from the taught tool, "
-                f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
-            )
-        self._tool = tool.T_flange_tool
+        self._require_robot(tool)
+        self.tools.take(tool)
 
 
 def _same(a: OfferedModel, b: OfferedModel) -> bool:

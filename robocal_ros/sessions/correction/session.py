@@ -7,40 +7,30 @@ correct is refused with a reason, counted, and nothing is put out for it: `Refus
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.joint_correction.blending import blend_rates
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
-from robocal_ros.core.joint_correction.starting import INSTANTS, RESPONSE_S, Sent
+from robocal_ros.core.joint_correction.refusals import RefusedError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.sessions.correction.corrector import Corrected, Corrector
-from robocal_ros.sessions.correction.incoming import (
-    READING,
-    TARGET,
-    TRAJECTORY,
-    CorrectionGuard,
-    JointBook,
-    require_finite,
-)
+from robocal_ros.sessions.correction.commands import Commands
+from robocal_ros.sessions.correction.corrector import Corrector
+from robocal_ros.sessions.correction.incoming import CorrectionGuard, JointBook
 from robocal_ros.sessions.correction.inputs import (
-    CorrectionStatus,
     JointCommand,
     OfferedModel,
     OfferedTool,
     TrajectoryCommand,
 )
 from robocal_ros.sessions.correction.offers import CorrectionGate
+from robocal_ros.sessions.correction.readings import Readings
+from robocal_ros.sessions.correction.starts import Starts
+from robocal_ros.sessions.correction.status import CorrectionStatus, Offset
 
 Array = NDArray[np.float64]
 Answer = TypeVar("Answer")
-
-_AT_ONCE = np.zeros(1)
 
 
 class CorrectionSession:
@@ -64,14 +54,16 @@ class CorrectionSession:
         config: CorrectionConfig | None = None,
     ) -> None:
         config = config or CorrectionConfig()
+        self._reference = reference
         self._gate = CorrectionGate(nominal, reference, serial, config)
         self._guard = CorrectionGuard()
         self._config = config
         self._joints = JointBook(reference, config.joint_state_age_s)
         self._corrector = Corrector(reference, config)
         self._enabled = False
-        self._streamed_s: float | None = None
-        self._goal = np.full(reference.n, np.nan)
+        self._starts = Starts(reference, config, self._corrector)
+        self._commands = Commands(config, self._joints, self._guard, self._corrector, self._starts)
+        self._readings = Readings(self._joints, self._guard, self._corrector)
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
@@ -79,13 +71,14 @@ class CorrectionSession:
         """Ask for the correction, or for its end; either blends in.
 
         Time stamps start afresh; after a mismatch the next command may begin where the robot is;
-        a model that waits to be looked at is taken over, if it is not too large.
+        a model or a tool that waits to be looked at is taken over, if it is not too large.
         """
         self._enabled = on
         self._guard.forget_stamps()
-        self._corrector.restart()
-        with contextlib.suppress(RefusedError):  # counted, and in the status
-            self._guard.counted(lambda: self._gate.look_again(self._places()))
+        self._starts.restart()
+        for look in (lambda: self._gate.look_again(self._places()), self._gate.tools.look_again):
+            with contextlib.suppress(RefusedError):  # counted, and in the status
+                self._guard.counted(look)
         self._want()
 
     def offer_model(self, model: OfferedModel) -> None:
@@ -94,13 +87,33 @@ class CorrectionSession:
         self._want()
 
     def offer_tool(self, tool: OfferedTool) -> None:
-        """Take over a tool frame; refused ones change nothing."""
+        """Judge a measured tool; refused ones change nothing.
+
+        It is taken over when the robot stands (see `look`) or with the next trajectory, and at
+        once while nothing was commanded yet.
+        """
         self._guard.counted(lambda: self._gate.take_tool(tool))
+        if not self._starts.started:
+            self._adopt_tool()
+
+    def look(self, now_s: float, now_ns: int) -> None:
+        """To be called now and then: takes over what waits for a robot that stands."""
+        if self._gate.tools.waiting is not None and self._stands(now_s):
+            self._adopt_tool()
+
+    def _stands(self, now_s: float) -> bool:
+        """Whether nothing is commanded, and the robot has not moved for its response time."""
+        near = self._config.start_near(self._reference)
+        busy = self._commands.streams(now_s) or self._starts.under_way(now_s)
+        return not busy and self._joints.at_rest(now_s, near)
+
+    def _adopt_tool(self) -> None:
+        self._gate.tools.adopt()
         self._want()
 
     def _places(self) -> Array:
         """Taught joints (k, n) where the robot is, and where it was sent."""
-        places = np.stack([self._joints.taught, self._goal])
+        places = np.stack([self._joints.taught, self._commands.goal])
         return np.asarray(places[np.isfinite(places).all(axis=1)])
 
     def _want(self) -> None:
@@ -113,43 +126,7 @@ class CorrectionSession:
 
         The blend advances with ``now_s``, at most by the configured longest step.
         """
-        return self._guard.counted(lambda: self._target(command, now_s))
-
-    def _target(self, command: JointCommand, now_s: float) -> JointCommand:
-        self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s)
-        self._guard.require_not_own(TARGET, command.names, command.position)
-        q, index = self._joints.complete(command.names, command.position[None], now_s)
-        speeds = None if command.velocity is None else command.velocity[None]
-        require_finite(command.names, speeds)
-        corrected = command
-        pause = np.inf if self._streamed_s is None else now_s - self._streamed_s
-        if self._must_start(now_s) and pause > self._config.stream_gap_s:
-            self._corrector.start_at(q, self._joints.where(now_s), now_s)
-            pause = 0.0
-        if not self._corrector.passes(q, now_s):
-            whole = len(index) == self._joints.count
-            done = self._corrector.point(q, now_s, pause, whole)
-            velocity = None
-            if speeds is not None:
-                qd = self._joints.spread(speeds, index)
-                still = np.zeros_like(q)
-                rates = done.stage.rates(q, qd, still, done.s, np.zeros(1), done.result)
-                velocity = rates[0][0, index]
-            position = done.result.q[0, index]
-            corrected = replace(command, position=position, velocity=velocity, mark=CORRECTED)
-        self._streamed_s, self._goal = now_s, q[0]
-        self._guard.accept_order(TARGET, command.stamp_ns, now_s)
-        out = corrected.position
-        self._guard.note_output(TARGET, command.names, command.position, out)
-        sent = Sent(index, now_s, _AT_ONCE, command.position[None], out[None])
-        self._corrector.note_sent(sent, now_s)
-        return corrected
-
-    def _must_start(self, now_s: float) -> bool:
-        """Whether a command must begin where the robot is; refused after a mismatch."""
-        if self._corrector.mismatch:
-            raise RefusedError(Reason.START_MISMATCH, self._corrector.mismatch)
-        return self._corrector.must_start(now_s)
+        return self._guard.counted(lambda: self._commands.target(command, now_s))
 
     def trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float = 0.0
@@ -160,67 +137,18 @@ class CorrectionSession:
         that is under way. A trajectory without points is a stop: it passes as it came.
         """
         if len(command) == 0:
-            self._corrector.stop(now_s)
-            self._streamed_s = None
+            self._commands.stop(now_s)
             return command
-        return self._guard.counted(lambda: self._trajectory(command, now_s, starts_in_s))
-
-    def _trajectory(
-        self, command: TrajectoryCommand, now_s: float, starts_in_s: float
-    ) -> TrajectoryCommand:
-        # The stamp says when it begins, not when it was made: no order follows from it.
-        self._guard.require_order(TRAJECTORY, 0, command.mark, now_s)
-        times = command.time_from_start_s
-        if not np.all(np.isfinite(times)) or times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
-            raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
-        self._guard.require_not_own(TRAJECTORY, command.names, command.position)
-        q, index = self._joints.complete(command.names, command.position, now_s)
-        require_finite(command.names, command.velocity)
-        require_finite(command.names, command.acceleration)
-        corrected = command
-        if self._must_start(now_s):
-            self._start_path(q, index, times, now_s, starts_in_s)
-        if not self._corrector.passes(q, now_s):
-            whole = len(index) == self._joints.count
-            done = self._corrector.path(q, times, now_s, starts_in_s, whole)
-            position = done.result.q[:, index]
-            corrected = replace(command, position=position, mark=CORRECTED)
-            if command.velocity is not None:
-                corrected = self._with_rates(corrected, done, q, index)
-        self._guard.accept_order(TRAJECTORY, 0, now_s)
-        out = corrected.position
-        self._guard.note_output(TRAJECTORY, command.names, command.position, out)
-        begin = now_s + starts_in_s
-        self._corrector.note_sent(Sent(index, begin, times, command.position, out), now_s)
-        self._streamed_s, self._goal = None, q[-1]
-        return corrected
-
-    def _start_path(
-        self, q: Array, index: NDArray[np.int64], times: Array, now_s: float, starts_in_s: float
-    ) -> None:
-        """The robot must stand where a trajectory begins, or be led there in time."""
-        where, elapsed = self._joints.where(now_s), -starts_in_s
-        if elapsed < times[0]:
-            self._corrector.start_within(q[0], index, where, now_s, float(times[0] - elapsed))
-            return
-        lately = np.linspace(elapsed, elapsed - RESPONSE_S, INSTANTS)
-        begins = np.stack([np.interp(lately, times, column) for column in q.T], axis=1)
-        self._corrector.start_at(begins, where, now_s)
-
-    def _with_rates(
-        self, command: TrajectoryCommand, done: Corrected, q: Array, index: NDArray[np.int64]
-    ) -> TrajectoryCommand:
-        """Correct the velocities and accelerations of a command whose positions are corrected."""
-        zero = np.zeros_like(q)
-        given = (command.velocity, command.acceleration)
-        qd, qdd = (zero if x is None else self._joints.spread(x, index) for x in given)
-        speed = blend_rates(command.time_from_start_s, done.s)
-        velocity, acceleration = done.stage.rates(q, qd, qdd, done.s, speed, done.result)
-        return replace(
-            command,
-            velocity=velocity[:, index],
-            acceleration=None if command.acceleration is None else acceleration[:, index],
-        )
+        before, waiting = self._gate.tools.in_use, self._gate.tools.waiting
+        self._adopt_tool()
+        try:
+            return self._guard.counted(
+                lambda: self._commands.trajectory(command, now_s, starts_in_s)
+            )
+        except RefusedError:
+            self._gate.tools.in_use, self._gate.tools.waiting = before, waiting
+            self._want()
+            raise
 
     # ---- readings -------------------------------------------------------------------------------
 
@@ -230,30 +158,32 @@ class CorrectionSession:
         ``age_s``: how old they were on arrival, by their stamp.
         Joints of others pass as they are.
         """
-        return self._guard.counted(lambda: self._reading(state, now_s, age_s))
+        return self._guard.counted(lambda: self._readings.take(state, now_s, age_s))
 
-    def _reading(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
-        self._guard.require_order(READING, state.stamp_ns, state.mark, now_s)
-        index, place = self._joints.read(state, now_s, age_s)
-        self._guard.accept_order(READING, state.stamp_ns, now_s)
-        passed = replace(state, mark=TAUGHT)
-        stage = self._corrector.commanded(now_s)
-        if stage is None:
-            self._joints.taught = self._joints.measured.copy()
-            return passed
-        if len(place) == 0:
-            return passed
-        measured = self._joints.measured
-        taught = stage.uncorrect(measured[None], np.ones(1))
-        self._joints.taught = taught[0]
-        position = state.position.copy()
-        position[place] = taught[0, index]
-        velocity = state.velocity
-        if velocity is not None:
-            velocity = velocity.copy()
-            speed = self._joints.spread(velocity[None, place], index)
-            velocity[place] = stage.taught_velocity(taught, measured[None], speed)[0, index]
-        return replace(passed, position=position, velocity=velocity)
+    def taught(
+        self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float
+    ) -> tuple[Array, Array | None]:
+        """Un-correct joints (k,) of any joint state as `reading` does, and remember nothing.
+
+        Joints that are left out are where they were read last.
+
+        Raises
+        ------
+        RefusedError
+            When a value is not finite, a joint is named twice, or numbers differ.
+        """
+        return self._readings.taught(names, position, velocity, now_s)
+
+    def offset(self, now_s: float) -> Offset:
+        """What is added to the taught joints now, where the robot was read last."""
+        tool = self._gate.tools.in_use if self._enabled else None
+        return Offset(
+            names=self._reference.joint_names,
+            offset=self._readings.offset(now_s),
+            revision=self._gate.revision if self._enabled else None,
+            tool_revision=None if tool is None else tool.revision,
+            s=self._corrector.progress(now_s),
+        )
 
     def counted(self, act: Callable[[], Answer]) -> Answer:
         """Do something for this session; a refusal is counted with its own."""
@@ -261,7 +191,7 @@ class CorrectionSession:
 
     def status(self) -> CorrectionStatus:
         """What the session does."""
-        corrector, guard = self._corrector, self._guard
+        corrector, guard, tools = self._corrector, self._guard, self._gate.tools
         return CorrectionStatus(
             enabled=self._enabled,
             active=not corrector.idle,
@@ -270,14 +200,22 @@ class CorrectionSession:
             serial=self._gate.serial,
             survey=self._gate.survey,
             waiting_revision=None if self._gate.waiting is None else self._gate.waiting.revision,
-            new_tool=self._gate.new_tool,
+            new_tool=tools.T_flange_tool is not None,
+            tool_revision=None if tools.in_use is None else tools.in_use.revision,
+            waiting_tool=None if tools.waiting is None else tools.waiting.revision,
+            stale="",
             tcp_shift_m=corrector.figures[0],
             largest_shift=corrector.figures[1],
             remaining_m=corrector.figures[2],
             held=corrector.held,
             waits=corrector.waits,
-            mismatch=corrector.mismatch,
+            mismatch=self._starts.mismatch,
             reduced=corrector.reduced,
+            clamped={},
+            passed={},
+            policy=self._config.policy,
+            reference=f"{self._reference.name} {self._reference.model_hash}",
+            shadow=False,
             refused=dict(guard.refused),
             last_refusal=guard.last_refusal,
         )

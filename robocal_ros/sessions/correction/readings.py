@@ -1,0 +1,71 @@
+"""Joint states, un-corrected with what is being commanded."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.samples import TAUGHT
+from robocal_ros.sessions.correction.corrector import Corrector
+from robocal_ros.sessions.correction.incoming import READING, CorrectionGuard, JointBook
+from robocal_ros.sessions.correction.inputs import JointCommand
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Readings:
+    """From corrected joints to taught ones."""
+
+    def __init__(self, joints: JointBook, guard: CorrectionGuard, corrector: Corrector) -> None:
+        self._joints, self._guard, self._corrector = joints, guard, corrector
+
+    def take(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
+        """Remember readings that are ``age_s`` old, and un-correct them."""
+        self._guard.require_order(READING, state.stamp_ns, state.mark, now_s)
+        index, place = self._joints.read(state, now_s, age_s)
+        self._guard.accept_order(READING, state.stamp_ns, now_s)
+        taught, position, velocity = self._un_corrected(state, index, place, now_s)
+        self._joints.taught = taught
+        return replace(state, position=position, velocity=velocity, mark=TAUGHT)
+
+    def taught(
+        self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float
+    ) -> tuple[Array, Array | None]:
+        """Un-correct joints (k,) of the arm as `take` does, and remember nothing.
+
+        Joints that are left out are where they were read last.
+
+        Raises
+        ------
+        RefusedError
+            When a value is not finite, a joint is named twice, or numbers differ.
+        """
+        state = JointCommand(names, position, velocity)
+        index, place = self._joints.find(state)
+        return self._un_corrected(state, index, place, now_s)[1:]
+
+    def _un_corrected(
+        self, state: JointCommand, index: Index, place: Index, now_s: float
+    ) -> tuple[Array, Array, Array | None]:
+        """All taught joints (n,), and the state's positions and velocities, un-corrected."""
+        measured = self._joints.measured.copy()
+        measured[index] = state.position[place]
+        stage = self._corrector.commanded(now_s)
+        if stage is None:
+            return measured, state.position, state.velocity
+        taught = stage.uncorrect(measured[None], np.ones(1))
+        position, velocity = state.position.copy(), state.velocity
+        position[place] = taught[0, index]
+        if velocity is not None and len(place):
+            velocity = velocity.copy()
+            speed = self._joints.spread(velocity[None, place], index)
+            velocity[place] = stage.taught_velocity(taught, measured[None], speed)[0, index]
+        return taught[0], position, velocity
+
+    def offset(self, now_s: float) -> Array:
+        """What the commands add to the taught joints now (n,), where the robot was read last."""
+        stage, measured = self._corrector.commanded(now_s), self._joints.measured
+        if stage is None:
+            return np.zeros(self._joints.count)
+        return np.asarray(measured - stage.uncorrect(measured[None], np.ones(1))[0])

@@ -1,0 +1,130 @@
+"""Where a command may begin: the robot is compared with what was put out last."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.core.joint_correction.starting import (
+    RESPONSE_S,
+    Follows,
+    Sent,
+    Whereabouts,
+    follows,
+    nearest_start,
+)
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.correction.corrector import Corrector
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+class Starts:
+    """Lets a command begin only where no step can come of it.
+
+    Attributes
+    ----------
+    started : whether anything was put out since the start or a mismatch.
+    mismatch : why nothing is put out until `restart`; empty when nothing is wrong.
+    """
+
+    def __init__(self, arm: SerialArm, config: CorrectionConfig, corrector: Corrector) -> None:
+        self._arm, self._config, self._corrector = arm, config, corrector
+        self._sent: Sent | None = None
+        self.started = False
+        self.mismatch = ""
+
+    def under_way(self, now_s: float) -> bool:
+        """True while the robot may be moving by what was put out last."""
+        return self._sent is not None and self._sent.live(now_s)
+
+    def stop(self, now_s: float) -> None:
+        """What was put out last ends."""
+        if self._sent is not None and self._sent.stopped_s > now_s:
+            self._sent = replace(self._sent, stopped_s=now_s)
+
+    def restart(self) -> None:
+        """After a mismatch: the next command may begin where the robot stands."""
+        if self.mismatch:
+            self.mismatch, self.started, self._sent = "", False, None
+
+    def must_start(self, now_s: float) -> bool:
+        """Whether a command must begin where the robot stands: not when passed on as it came.
+
+        Raises
+        ------
+        RefusedError
+            After a mismatch.
+        """
+        if self.mismatch:
+            raise RefusedError(Reason.START_MISMATCH, self.mismatch)
+        return not (self.started and self._corrector.passing(now_s))
+
+    def start_at(self, begins: Array, where: Whereabouts, now_s: float) -> None:
+        """A command begins at once, at where it should be now or was lately, ``begins`` (r, n).
+
+        The correction goes on from the one that the robot shows: that which is commanded, none,
+        or (before the first command) that which is known. Only a commanded robot may lag.
+        """
+        where.require_fresh(np.arange(self._arm.n))
+        near, commanded = self._config.start_near(self._arm), self._corrector.model(now_s)
+        models = [
+            commanded,
+            self._corrector.reference,
+            *([] if self.started else [self._corrector.known]),
+        ]
+        lag = where.travel if self.started else 0.0
+        starts = [
+            (self._corrector.shifted(begins, m), near + lag * (m is commanded)) for m in models
+        ]
+        chosen = nearest_start(where.measured, starts)
+        if chosen is None:
+            far = int(np.argmax(np.abs(begins[0] - where.measured)))
+            raise self._refuse_start(
+                f"{self._arm.joint_names[far]} is at {where.measured[far]:.6f}, the command "
+                f"begins at {begins[0, far]:.6f}"
+            )
+        self._corrector.go_on_from(models[chosen], now_s)
+        self.started = True
+
+    def start_within(
+        self, first: Array, index: Index, where: Whereabouts, now_s: float, lead_s: float
+    ) -> None:
+        """A command leads in ``lead_s`` to its ``first`` taught joints (n,).
+
+        The correction goes on from the one that the robot shows; where that cannot be told, it
+        must be small enough to be made within that time.
+        """
+        where.require_known(index)
+        commanded, shows = self._corrector.model(now_s), Follows.UNKNOWN
+        near = self._config.start_near(self._arm)
+        if self._sent is not None:
+            shows = follows(self._sent, where, near, now_s)
+        if shows is Follows.UNKNOWN:
+            made = lead_s * self._config.blend_rates(self._arm)[index]
+            for model in (commanded, self._corrector.known):
+                shift = np.abs(self._corrector.shifted(first[None], model)[0] - first)[index]
+                far = int(np.argmax(shift / made))
+                if shift[far] > made[far]:
+                    name = self._arm.joint_names[index[far]]
+                    detail = f"a correction of {name} by {shift[far]:.6f} needs over {lead_s:g} s"
+                    raise self._refuse_start(f"the robot is not where it was sent, and {detail}")
+        if shows is Follows.NONE:
+            self._corrector.go_on_from(self._corrector.reference, now_s)
+        self.started = True
+
+    def _refuse_start(self, detail: str) -> RefusedError:
+        self.mismatch = f"{detail}; call ~/enable when it may begin there"
+        return RefusedError(Reason.START_MISMATCH, self.mismatch)
+
+    def note_sent(self, sent: Sent, now_s: float) -> None:
+        """Remember what was put out."""
+        earlier = self._sent
+        if len(sent.times_s) > 1 or sent.times_s[0] > 0.0:
+            same = earlier is not None and np.array_equal(earlier.index, sent.index)
+            if earlier is not None and same:
+                sent = replace(sent, before=earlier.since(now_s - RESPONSE_S))
+        self._sent = sent

@@ -1,0 +1,133 @@
+"""A robot, its models and its tools, for the tests of the joint correction's session."""
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.correction import (
+    CorrectionSession,
+    JointCommand,
+    OfferedModel,
+    OfferedTool,
+    Reason,
+    RefusedError,
+    TrajectoryCommand,
+)
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = replace(
+    load_robot("kr150_r3100"),
+    T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2]),
+)
+NAMES = NOMINAL.joint_names
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+RATE = np.radians(0.5)
+DT = 0.002
+ROUNDING = 1e-12
+NOT_STRAIGHT = np.radians(2.0) ** 2 / 8  # rad: second order of the longest blend below, 4 s long
+
+
+def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:
+    """A drift of about 0.12 mm times ``size`` at the tool."""
+    rng = np.random.default_rng(seed)
+    chosen = NOMINAL.parameters
+    change = rng.standard_normal(len(chosen)) * np.where(chosen.is_length, 8e-5, 4e-5)
+    mdh = NOMINAL.mdh.copy()
+    for (joint, column), x in zip(chosen.index, change, strict=True):
+        mdh[joint, column] += size * x
+    return NOMINAL.with_mdh(mdh)
+
+
+def offer(arm: SerialArm, revision: int = 1, **changes: Any) -> OfferedModel:
+    model = OfferedModel(
+        robot=NOMINAL.name,
+        serial="s1",
+        model_hash=NOMINAL.model_hash,
+        revision=revision,
+        accepted=True,
+        joint_names=NAMES,
+        mdh=arm.mdh,
+    )
+    return replace(model, **changes)
+
+
+REVISIONS = itertools.count(1)
+
+
+def bent_tool(shift_m: float = 2e-3, turn_deg: float = 0.5, **changes: Any) -> OfferedTool:
+    """Each one is a revision later than the one before."""
+    change = frames.transform(frames.exp_rotation([0, np.radians(turn_deg), 0]), [shift_m, 0, 0])
+    tool = OfferedTool(
+        parent="tool0",
+        T_flange_tool=NOMINAL.T_flange_tool @ change,
+        child="tcp",
+        robot=NOMINAL.name,
+        serial="s1",
+        model_hash=NOMINAL.model_hash,
+        revision=next(REVISIONS),
+        accepted=True,
+    )
+    return replace(tool, **changes)
+
+
+class Robot:
+    """A session, the time in which it is used, and a robot that goes where it is sent."""
+
+    def __init__(self, **config: Any) -> None:
+        self.session = CorrectionSession(NOMINAL, NOMINAL, "s1", CorrectionConfig(**config))
+        self.now = 100.0
+        self.at = HOME
+
+    def stream(self, q: np.ndarray = HOME, dt: float = DT, **fields: Any) -> np.ndarray:
+        self.now += dt
+        self.read(self.at)
+        self.at = self.session.target(JointCommand(NAMES, np.array(q), **fields), self.now).position
+        return self.at
+
+    def settle(self) -> np.ndarray:
+        out = self.stream()
+        for _ in range(5000):
+            out = self.stream()
+            if self.session.status().settled:
+                return out
+        pytest.fail("the blend does not end")
+
+    def rest(self, seconds: float = 0.5) -> None:
+        """Nothing is commanded, and the robot stands."""
+        for _ in range(round(seconds / 0.05)):
+            self.now += 0.05
+            self.read(self.at)
+        self.session.look(self.now, 0)
+
+    def change_tool(self, tool: OfferedTool) -> None:
+        self.session.offer_tool(tool)
+        self.rest()
+
+    def read(self, q: np.ndarray, **fields: Any) -> JointCommand:
+        return self.session.reading(JointCommand(NAMES, np.array(q), **fields), self.now)
+
+
+def pose(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    return arm.fk(q) @ arm.T_flange_tool
+
+
+def distance(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm((a - b)[..., :3, 3], axis=-1).max())
+
+
+def refused(reason: Reason, act: Any, *arguments: Any, **fields: Any) -> str:
+    with pytest.raises(RefusedError) as caught:
+        act(*arguments, **fields)
+    assert caught.value.reason is reason
+    return str(caught.value)
+
+
+def still(q: np.ndarray = HOME, first_s: float = 0.0, seconds: float = 20.0) -> TrajectoryCommand:
+    times = np.linspace(first_s, first_s + seconds, 41)
+    return TrajectoryCommand(NAMES, np.tile(q, (41, 1)), times)
