@@ -64,11 +64,15 @@ class CorrectionConfig:
     thermal, tool : bounds of the arm's drift and of the tool's change.
     blend_rad_s, blend_m_s : fastest change of a joint's correction (prismatic: m/s).
     longest_step_s : a pause in a stream advances the blend by no more than this.
-    stream_gap_s : after a longer pause a stream begins anew, where the robot stands.
+    stream_gap_s : after a pause that is longer than this, and than two of its periods, a stream
+        begins anew, where the robot stands.
     start_rad, start_m : how far from where a command begins the robot may stand.
     joint_state_age_s : readings that are older do not tell where the robot is.
     flange_frame, tool_frame : parent and child of an acceptable tool frame; an empty child: any.
     policy : what is done with a command whose correction would exceed a bound or a limit.
+    model_age_s : a model with an older stamp is not corrected with; 0: any age.
+    velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none; None: no joint has one.
+    shadow : commands and readings pass as they came; the correction is only shown.
     """
 
     thermal: ShiftBounds = field(
@@ -87,6 +91,9 @@ class CorrectionConfig:
     flange_frame: str = "tool0"
     tool_frame: str = ""
     policy: Policy = Policy.REFUSE
+    model_age_s: float = 0.0
+    velocity_limits: Array | None = field(default=None, compare=False)
+    shadow: bool = False
 
     def blend_rates(self, arm: SerialArm) -> Array:
         """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""

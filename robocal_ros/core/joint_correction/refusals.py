@@ -19,7 +19,11 @@ class Reason(StrEnum):
     START_MISMATCH = "START_MISMATCH, the robot does not stand where the command begins"
     TIME_BACKWARDS = "time goes backwards"
     OWN_OUTPUT = "comes from a joint correction already"
+    DEGREES = "positions look like degrees"
+    BURST = "too many points"
+    TWO_SOURCES = "two publishers at once"
     JOINT_LIMIT = "a joint limit is exceeded"
+    VELOCITY_LIMIT = "a velocity limit is exceeded"
     TCP_BOUND = "the arm's correction at the tool exceeds its bound"
     JOINT_BOUND = "the correction of a joint exceeds its bound"
     NOT_SOLVED = "no solution near the taught joints"
@@ -32,6 +36,7 @@ class Reason(StrEnum):
 
 _CODES = {
     Reason.JOINT_LIMIT: Code.LIMIT_EXCEEDED,
+    Reason.VELOCITY_LIMIT: Code.LIMIT_EXCEEDED,
     Reason.TCP_BOUND: Code.LIMIT_EXCEEDED,
     Reason.JOINT_BOUND: Code.LIMIT_EXCEEDED,
     Reason.NOT_SOLVED: Code.LIMIT_EXCEEDED,
@@ -40,6 +45,7 @@ _CODES = {
     Reason.OLD_REVISION: Code.STALE,
     Reason.STALE_JOINTS: Code.STALE,
     Reason.START_MISMATCH: Code.CONFLICT,
+    Reason.TWO_SOURCES: Code.CONFLICT,
 }
 
 

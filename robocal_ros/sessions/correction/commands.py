@@ -19,6 +19,7 @@ from robocal_ros.sessions.correction.incoming import (
     require_finite,
 )
 from robocal_ros.sessions.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.sessions.correction.periods import StreamPeriod
 from robocal_ros.sessions.correction.starts import Starts
 
 Array = NDArray[np.float64]
@@ -45,20 +46,18 @@ class Commands:
     ) -> None:
         self._config, self._joints, self._guard = config, joints, guard
         self._corrector, self._starts = corrector, starts
-        self._streamed_s: float | None = None
+        self._stream = StreamPeriod(config.stream_gap_s)
         self.goal = np.full(joints.count, np.nan)
 
     def streams(self, now_s: float) -> bool:
         """Whether a stream of targets is under way."""
-        return (
-            self._streamed_s is not None and now_s - self._streamed_s <= self._config.stream_gap_s
-        )
+        return self._stream.goes_on(now_s)
 
     def stop(self, now_s: float) -> None:
         """What is under way ends."""
         self._corrector.stop(now_s)
         self._starts.stop(now_s)
-        self._streamed_s = None
+        self._stream.end()
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream; the blend advances with ``now_s``."""
@@ -68,8 +67,9 @@ class Commands:
         speeds = None if command.velocity is None else command.velocity[None]
         require_finite(command.names, speeds)
         corrected = command
-        pause = np.inf if self._streamed_s is None else now_s - self._streamed_s
-        if self._starts.must_start(now_s) and pause > self._config.stream_gap_s:
+        last = self._stream.last_s
+        pause = 0.0 if last is None else now_s - last
+        if self._starts.must_start(now_s) and not self._stream.goes_on(now_s):
             self._starts.start_at(q, self._joints.where(now_s), now_s)
             pause = 0.0
         if not self._corrector.passes(q, now_s):
@@ -83,7 +83,8 @@ class Commands:
                 velocity = rates[0][0, index]
             position = done.result.q[0, index]
             corrected = replace(command, position=position, velocity=velocity, mark=CORRECTED)
-        self._streamed_s, self.goal = now_s, q[0]
+        self._stream.note(now_s)
+        self.goal = q[0]
         self._guard.accept_order(TARGET, command.stamp_ns, now_s)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
@@ -119,7 +120,8 @@ class Commands:
         self._guard.note_output(TRAJECTORY, command.names, command.position, out)
         begin = now_s + starts_in_s
         self._starts.note_sent(Sent(index, begin, times, command.position, out), now_s)
-        self._streamed_s, self.goal = None, q[-1]
+        self._stream.end()
+        self.goal = q[-1]
         return corrected
 
     def _start_path(

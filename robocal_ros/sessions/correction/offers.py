@@ -23,6 +23,7 @@ class CorrectionGate:
     revision : of the model taken over, None before the first.
     survey : its correction over the joint range.
     waiting : a model that was refused but may be taken over when it is looked at again.
+    stale : why the model is too old to be used, in words; empty when it is not.
     tools : the measured tools.
     """
 
@@ -41,12 +42,15 @@ class CorrectionGate:
         self.revision: int | None = None
         self.survey = Survey(0.0, 0.0, 0.0)
         self.waiting: OfferedModel | None = None
+        self.stale = ""
         self.tools = ToolGate(reference.T_flange_tool, config)
 
     @property
     def actual(self) -> SerialArm:
         """The actual arm with its tool, as far as they are known; else the reference's."""
-        arm = self._reference if self._model is None else self._arm_of(self._model)
+        arm = self._reference
+        if self._model is not None and not self.stale:
+            arm = self._arm_of(self._model)
         tool = self.tools.T_flange_tool
         return arm if tool is None else replace(arm, T_flange_tool=tool)
 
@@ -86,6 +90,17 @@ class CorrectionGate:
             self._require_small(model, arm, places)
         self._model, self.revision = model, model.revision
         self.survey = survey(self._reference, arm, self._config.thermal)
+
+    def watch_age(self, now_ns: int) -> bool:
+        """Compare the model's stamp with the clock; returns whether it became stale, or fresh."""
+        was, limit_s = bool(self.stale), self._config.model_age_s
+        self.stale = ""
+        if self._model is not None and limit_s > 0.0:
+            age_ns = now_ns - self._model.stamp_ns
+            if age_ns > limit_s * 1e9:
+                named = f"model revision {self._model.revision}"
+                self.stale = f"{named} is {age_ns * 1e-9:.1f} s old, allowed {limit_s:g} s"
+        return was != bool(self.stale)
 
     def look_again(self, places: Array) -> None:
         """Take over the model that waits for it, if there is one; raises as `take_model`."""

@@ -97,7 +97,12 @@ class CorrectionSession:
             self._adopt_tool()
 
     def look(self, now_s: float, now_ns: int) -> None:
-        """To be called now and then: takes over what waits for a robot that stands."""
+        """To be called now and then: a tool waits for a robot that stands, a model grows old.
+
+        ``now_ns`` is the clock that stamps the models; what it does moves no blend.
+        """
+        if self._gate.watch_age(now_ns):
+            self._want()
         if self._gate.tools.waiting is not None and self._stands(now_s):
             self._adopt_tool()
 
@@ -180,7 +185,7 @@ class CorrectionSession:
         return Offset(
             names=self._reference.joint_names,
             offset=self._readings.offset(now_s),
-            revision=self._gate.revision if self._enabled else None,
+            revision=self._gate.revision if self._enabled and not self._gate.stale else None,
             tool_revision=None if tool is None else tool.revision,
             s=self._corrector.progress(now_s),
         )
@@ -203,7 +208,7 @@ class CorrectionSession:
             new_tool=tools.T_flange_tool is not None,
             tool_revision=None if tools.in_use is None else tools.in_use.revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
-            stale="",
+            stale=self._gate.stale,
             tcp_shift_m=corrector.figures[0],
             largest_shift=corrector.figures[1],
             remaining_m=corrector.figures[2],
@@ -215,7 +220,7 @@ class CorrectionSession:
             passed={},
             policy=self._config.policy,
             reference=f"{self._reference.name} {self._reference.model_hash}",
-            shadow=False,
+            shadow=self._config.shadow,
             refused=dict(guard.refused),
             last_refusal=guard.last_refusal,
         )
