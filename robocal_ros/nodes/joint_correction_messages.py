@@ -93,12 +93,12 @@ class CorrectionMessages:
     def __init__(
         self, nominal: SerialArm, reference: SerialArm, name: str, serial: str, shadow: bool
     ) -> None:
+        self._name = name
         self._shadow = shadow
         self._own = {
             "robot": nominal.name,
             "serial": serial,
             "model_hash": nominal.model_hash,
-            "reference": name,
             "taught_tool": transform_message(reference.T_flange_tool),
             "shadow": shadow,
         }
@@ -123,6 +123,7 @@ class CorrectionMessages:
             **self._own,
             state=_state(status),
             reason=in_words(status),
+            reference=f"{self._name}: {status.reference}",
             enabled=status.enabled,
             policy=getattr(StatusMessage, status.policy.name),
             model_revision=status.revision or 0,
