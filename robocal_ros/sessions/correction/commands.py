@@ -51,7 +51,8 @@ class Commands:
         self._config, self._joints, self._guard = config, joints, guard
         self._corrector, self._starts = corrector, starts
         self._stream = StreamPeriod(config.stream_gap_s)
-        self._out = np.full(joints.count, np.nan)  # the stream's last joints
+        self._out = np.full(joints.count, np.nan)  # of the last target
+        self._out_s = -np.inf
         self.goal = np.full(joints.count, np.nan)
 
     def streams(self, now_s: float) -> bool:
@@ -63,7 +64,6 @@ class Commands:
         self._corrector.stop(now_s)
         self._starts.stop(now_s)
         self._stream.end()
-        self._out[:] = np.nan
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream; the blend advances with ``now_s``."""
@@ -82,7 +82,7 @@ class Commands:
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
         self._out[:] = np.nan
-        self._out[index] = out
+        self._out[index], self._out_s = out, now_s
         sent = Sent(index, now_s, _AT_ONCE, command.position[None], out[None])
         self._starts.note_sent(sent, now_s)
         return corrected
@@ -94,10 +94,10 @@ class Commands:
         pause = 0.0 if last is None else now_s - last
         # two messages may come at once after a delay: each has the stream's own period
         period = self._stream.period_s or self._config.longest_step_s
-        motion = replace(motion, dt_s=np.array([max(pause, period)]))
+        motion = replace(motion, dt_s=np.array([max(now_s - self._out_s, period)]))
         if self._starts.must_start(now_s) and not self._stream.goes_on(now_s):
             self._starts.start_at(motion.q, self._joints.where(now_s), now_s)
-            motion, pause = replace(motion, before=np.full_like(motion.before, np.nan)), 0.0
+            pause = 0.0
         if self._corrector.passing(now_s):
             self._corrector.pass_on(motion, now_s)
             return command
