@@ -60,7 +60,8 @@ class Commands:
         return self._stream.goes_on(now_s)
 
     def stop(self, now_s: float) -> None:
-        """What is under way ends."""
+        """What is under way ends, also by a clock that went back."""
+        now_s = self._guard.not_before(now_s)
         self._corrector.stop(now_s)
         self._starts.stop(now_s)
         self._stream.end()

@@ -198,6 +198,10 @@ class CorrectionGuard:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
             raise RefusedError(Reason.TIME_BACKWARDS, detail)
 
+    def not_before(self, now_s: float) -> float:
+        """The clock's time, or the last one where it went back."""
+        return now_s if now_s >= self._clock_s else self._clock_s
+
     def accept_order(self, kind: str, stamp: int, now_s: float) -> None:
         """Remember the time of what was acted on."""
         self._clock_s = now_s
