@@ -1,5 +1,6 @@
 """The correction session: off until asked, never a jump, never beyond its bounds, never NaN."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -33,6 +34,7 @@ from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     JointCommand,
+    OfferedTool,
     Reason,
     TrajectoryCommand,
     finite_command,
@@ -150,7 +152,9 @@ EVENTS = st.lists(
 )
 
 
-def happen(robot: Robot, what: str, seed: int, revision: int) -> None:
+def happen(
+    robot: Robot, what: str, seed: int, revision: int, change_tool: Callable[[OfferedTool], None]
+) -> None:
     session = robot.session
     if what in ("on", "off"):
         session.enable(what == "on")
@@ -159,9 +163,9 @@ def happen(robot: Robot, what: str, seed: int, revision: int) -> None:
     elif what == "nominal":
         session.offer_model(offer(NOMINAL, revision))
     elif what == "tool":
-        robot.change_tool(bent_tool(1e-3 * seed, 0.3 * seed))
+        change_tool(bent_tool(1e-3 * seed, 0.3 * seed))
     elif what == "taught tool":
-        robot.change_tool(bent_tool(0.0, 0.0))
+        change_tool(bent_tool(0.0, 0.0))
     elif what == "stop":
         empty = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
         assert session.trajectory(empty, robot.now) is empty
@@ -174,7 +178,7 @@ def test_no_sequence_of_events_makes_a_stream_jump(events: list[tuple[str, int, 
     robot = Robot(thermal=CorrectionConfig().tool)
     last = robot.stream()
     for revision, (what, seed, count) in enumerate(events, start=1):
-        happen(robot, what, seed, revision)
+        happen(robot, what, seed, revision, robot.change_tool)
         for _ in range(count):
             q = robot.stream()
             assert np.all(np.isfinite(q))
@@ -191,7 +195,7 @@ def test_a_moving_stream_steps_no_more_than_its_motion_and_the_blend(
     robot = Robot(thermal=CorrectionConfig().tool)
     t, shift = 0.0, robot.stream() - HOME
     for revision, (what, seed, count) in enumerate(events, start=1):
-        happen(robot, what, seed, revision)
+        happen(robot, what, seed, revision, robot.change_tool)
         for i in range(count):
             t += DT * (i > 0)  # after a pause it goes on where it was
             q = HOME + 0.3 * np.sin(speed * t)
@@ -214,7 +218,7 @@ def test_trajectories_start_where_the_last_command_was_and_never_jump(
     last = np.zeros(6)
     robot.read(HOME)
     for revision, (what, seed, count) in enumerate(events, start=1):
-        happen(robot, what, seed, revision)
+        happen(robot, what, seed, revision, robot.session.offer_tool)
         command = TrajectoryCommand(NAMES, points, times, np.zeros((m, 6)), np.zeros((m, 6)))
         out = robot.session.trajectory(command, robot.now)
         assert np.array_equal(out.time_from_start_s, times)

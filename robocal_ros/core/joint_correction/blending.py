@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 # A controller's quintic between two points moves at most this much faster than their mean rate.
 SPLINE_PEAK = 1.875
 MOST_TRIES = 6
+UNEVEN = 1.02
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ def blend_along(
     """Blend (m,) at the points of a trajectory ``q`` (m, n), never faster than ``rates`` (n,).
 
     It begins at s = 0 when ``elapsed_s`` of the trajectory have passed (0 for one that begins
-    now) and runs along the time from start.
+    now) and runs along the time from start. Where the correction does not change evenly with s (a
+    bound holds on a part of the way), all of it is slower; 0 where it cannot be slow enough.
     """
     m = len(q)
     whole = np.abs(stage.correct(q, np.ones(m)).q - stage.correct(q, np.zeros(m)).q)
@@ -97,7 +100,15 @@ def blend_along(
     dt = np.diff(time, prepend=max(elapsed_s, 0.0))
     with np.errstate(invalid="ignore"):
         ds = np.where(dt > 0.0, dt * np.minimum(slowest, before), 0.0)
-    return np.asarray(np.minimum(np.cumsum(ds), 1.0))
+    for _ in range(MOST_TRIES):
+        s = np.minimum(np.cumsum(ds), 1.0)
+        change = stage.correct(q, s).q - stage.correct(q, np.append(0.0, s[:-1])).q
+        allowed = np.maximum(rates * dt[:, None] / SPLINE_PEAK, ROUNDING)
+        excess = float(np.max(np.abs(change) / allowed))
+        if excess <= UNEVEN:
+            return np.asarray(s)
+        ds = ds / excess
+    return np.zeros(m)
 
 
 def blend_rates(times_s: Array, s: Array) -> Array:

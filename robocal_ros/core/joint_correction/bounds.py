@@ -139,20 +139,6 @@ def survey(reference: SerialArm, actual: SerialArm, bounds: ShiftBounds) -> Surv
     )
 
 
-def fault_of(
-    result: StagedResult, config: CorrectionConfig | None, arm: SerialArm
-) -> RefusedError | None:
-    """What is wrong with corrected joints; None as ``config``: a correction has no bounds."""
-    try:
-        require_limits(result.q, arm)
-        require_solved(result)
-        if config is not None:
-            require_within(result, config, arm)
-    except RefusedError as error:
-        return error
-    return None
-
-
 def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialArm) -> None:
     """Refuse a correction that is beyond its bounds; names the first point that is.
 
@@ -192,6 +178,18 @@ def require_limits(q: Array, arm: SerialArm) -> None:
             Reason.JOINT_LIMIT,
             f"{arm.joint_names[joint]} would be at {q[point, joint]:.6f}, allowed "
             f"{arm.lower[joint]:.6f} to {arm.upper[joint]:.6f} (point {point + 1})",
+        )
+
+
+def require_speeds(velocity: Array, limits: Array, arm: SerialArm) -> None:
+    """Refuse velocities (m, n) beyond their limits (n,), rad/s (prismatic: m/s)."""
+    over = np.abs(velocity) > limits * (1.0 + ROUNDING)
+    if np.any(over):
+        point, joint = np.argwhere(over)[0]
+        raise RefusedError(
+            Reason.VELOCITY_LIMIT,
+            f"{arm.joint_names[joint]} would move at {velocity[point, joint]:.6f}, allowed "
+            f"{limits[joint]:.6f} (point {point + 1})",
         )
 
 

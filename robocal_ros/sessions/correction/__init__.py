@@ -9,6 +9,7 @@ incoming    joints by name, order in time, own output that comes back
 offers      which models are taken over
 tools       which tools are taken over, and when
 starts      where a command may begin
+proposals   what could be put out, on the way to a model
 corrector   which model corrects at every instant
 """
 

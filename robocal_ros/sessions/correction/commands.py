@@ -1,16 +1,18 @@
 """Joint targets and trajectories, corrected."""
 
+import contextlib
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.joint_correction.blending import blend_rates
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.starting import INSTANTS, RESPONSE_S, Sent
 from robocal_ros.core.samples import CORRECTED
-from robocal_ros.sessions.correction.corrector import Corrected, Corrector
+from robocal_ros.sessions.correction.corrector import Corrector
 from robocal_ros.sessions.correction.incoming import (
     TARGET,
     TRAJECTORY,
@@ -18,12 +20,14 @@ from robocal_ros.sessions.correction.incoming import (
     JointBook,
     require_finite,
 )
-from robocal_ros.sessions.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.sessions.correction.inputs import JointCommand, TrajectoryCommand, require_few
 from robocal_ros.sessions.correction.periods import StreamPeriod
+from robocal_ros.sessions.correction.proposals import Motion
 from robocal_ros.sessions.correction.starts import Starts
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Command = TypeVar("Command", JointCommand, TrajectoryCommand)
 
 _AT_ONCE = np.zeros(1)
 
@@ -47,6 +51,8 @@ class Commands:
         self._config, self._joints, self._guard = config, joints, guard
         self._corrector, self._starts = corrector, starts
         self._stream = StreamPeriod(config.stream_gap_s)
+        self._out = np.full(joints.count, np.nan)  # of the last target
+        self._out_s = -np.inf
         self.goal = np.full(joints.count, np.nan)
 
     def streams(self, now_s: float) -> bool:
@@ -54,7 +60,8 @@ class Commands:
         return self._stream.goes_on(now_s)
 
     def stop(self, now_s: float) -> None:
-        """What is under way ends."""
+        """What is under way ends, also by a clock that went back."""
+        now_s = self._guard.not_before(now_s)
         self._corrector.stop(now_s)
         self._starts.stop(now_s)
         self._stream.end()
@@ -66,36 +73,65 @@ class Commands:
         q, index = self._joints.complete(command.names, command.position[None], now_s)
         speeds = None if command.velocity is None else command.velocity[None]
         require_finite(command.names, speeds)
-        corrected = command
-        last = self._stream.last_s
-        pause = 0.0 if last is None else now_s - last
-        if self._starts.must_start(now_s) and not self._stream.goes_on(now_s):
-            self._starts.start_at(q, self._joints.where(now_s), now_s)
-            pause = 0.0
-        if not self._corrector.passes(q, now_s):
-            whole = len(index) == self._joints.count
-            done = self._corrector.point(q, now_s, pause, whole)
-            velocity = None
-            if speeds is not None:
-                qd = self._joints.spread(speeds, index)
-                still = np.zeros_like(q)
-                rates = done.stage.rates(q, qd, still, done.s, np.zeros(1), done.result)
-                velocity = rates[0][0, index]
-            position = done.result.q[0, index]
-            corrected = replace(command, position=position, velocity=velocity, mark=CORRECTED)
+        corrected = self._or_as_it_came(
+            command,
+            lambda: self._correct_target(command, self._motion(q, index, speeds), index, now_s),
+        )
         self._stream.note(now_s)
         self.goal = q[0]
         self._guard.accept_order(TARGET, command.stamp_ns, now_s)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
+        self._out[:] = np.nan
+        self._out[index], self._out_s = out, now_s
         sent = Sent(index, now_s, _AT_ONCE, command.position[None], out[None])
         self._starts.note_sent(sent, now_s)
         return corrected
+
+    def _correct_target(
+        self, command: JointCommand, motion: Motion, index: Index, now_s: float
+    ) -> JointCommand:
+        last = self._stream.last_s
+        pause = 0.0 if last is None else now_s - last
+        # two messages may come at once after a delay: each has the stream's own period
+        period = self._stream.period_s or self._config.longest_step_s
+        motion = replace(motion, dt_s=np.array([max(now_s - self._out_s, period)]))
+        if self._starts.must_start(now_s) and not self._stream.goes_on(now_s):
+            self._starts.start_at(motion.q, self._joints.where(now_s), now_s)
+            pause = 0.0
+        if self._corrector.passing(now_s):
+            self._corrector.pass_on(motion, now_s)
+            return command
+        done = self._corrector.point(motion, now_s, pause)
+        velocity = None if done.velocity is None else done.velocity[0, index]
+        position = done.result.q[0, index]
+        return replace(command, position=position, velocity=velocity, mark=CORRECTED)
+
+    def _motion(
+        self, q: Array, index: Index, velocity: Array | None, acceleration: Array | None = None
+    ) -> Motion:
+        """A command with all joints, of which nothing else is known yet."""
+        qd, qdd = (
+            None if x is None else self._joints.spread(x, index) for x in (velocity, acceleration)
+        )
+        before = np.full(self._joints.count, np.nan)
+        before[index] = self._out[index]
+        whole = len(index) == self._joints.count
+        return Motion(q, qd, qdd, whole, before, np.full(len(q), np.inf))
+
+    def _or_as_it_came(self, command: Command, correct: Callable[[], Command]) -> Command:
+        """Correct a command; in shadow mode that is only tried, and the command passes."""
+        if not self._config.shadow:
+            return correct()
+        with contextlib.suppress(RefusedError):  # counted, and in the status
+            self._guard.counted(correct)
+        return command
 
     def trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float
     ) -> TrajectoryCommand:
         """Correct a whole trajectory of at least one point."""
+        require_few(len(command))
         # The stamp says when it begins, not when it was made: no order follows from it.
         self._guard.require_order(TRAJECTORY, 0, command.mark, now_s)
         times = command.time_from_start_s
@@ -105,24 +141,43 @@ class Commands:
         q, index = self._joints.complete(command.names, command.position, now_s)
         require_finite(command.names, command.velocity)
         require_finite(command.names, command.acceleration)
-        corrected = command
-        if self._starts.must_start(now_s):
-            self._start_path(q, index, times, now_s, starts_in_s)
-        if not self._corrector.passes(q, now_s):
-            whole = len(index) == self._joints.count
-            done = self._corrector.path(q, times, now_s, starts_in_s, whole)
-            position = done.result.q[:, index]
-            corrected = replace(command, position=position, mark=CORRECTED)
-            if command.velocity is not None:
-                corrected = self._with_rates(corrected, done, q, index)
+        motion = self._motion(q, index, command.velocity, command.acceleration)
+        motion.dt_s[1:] = np.diff(times)
+        corrected = self._or_as_it_came(
+            command, lambda: self._correct_path(command, motion, index, now_s, starts_in_s)
+        )
         self._guard.accept_order(TRAJECTORY, 0, now_s)
         out = corrected.position
         self._guard.note_output(TRAJECTORY, command.names, command.position, out)
         begin = now_s + starts_in_s
         self._starts.note_sent(Sent(index, begin, times, command.position, out), now_s)
         self._stream.end()
+        self._out[:] = np.nan
         self.goal = q[-1]
         return corrected
+
+    def _correct_path(
+        self,
+        command: TrajectoryCommand,
+        motion: Motion,
+        index: Index,
+        now_s: float,
+        starts_in_s: float,
+    ) -> TrajectoryCommand:
+        times = command.time_from_start_s
+        if self._starts.must_start(now_s):
+            self._start_path(motion.q, index, times, now_s, starts_in_s)
+        if self._corrector.passing(now_s):
+            self._corrector.pass_on(motion, now_s)
+            return command
+        done = self._corrector.path(motion, times, now_s, starts_in_s)
+        return replace(
+            command,
+            position=done.result.q[:, index],
+            velocity=None if done.velocity is None else done.velocity[:, index],
+            acceleration=None if done.acceleration is None else done.acceleration[:, index],
+            mark=CORRECTED,
+        )
 
     def _start_path(
         self, q: Array, index: Index, times: Array, now_s: float, starts_in_s: float
@@ -135,18 +190,3 @@ class Commands:
         lately = np.linspace(elapsed, elapsed - RESPONSE_S, INSTANTS)
         begins = np.stack([np.interp(lately, times, column) for column in q.T], axis=1)
         self._starts.start_at(begins, where, now_s)
-
-    def _with_rates(
-        self, command: TrajectoryCommand, done: Corrected, q: Array, index: Index
-    ) -> TrajectoryCommand:
-        """Correct the velocities and accelerations of a command whose positions are corrected."""
-        zero = np.zeros_like(q)
-        given = (command.velocity, command.acceleration)
-        qd, qdd = (zero if x is None else self._joints.spread(x, index) for x in given)
-        speed = blend_rates(command.time_from_start_s, done.s)
-        velocity, acceleration = done.stage.rates(q, qd, qdd, done.s, speed, done.result)
-        return replace(
-            command,
-            velocity=velocity[:, index],
-            acceleration=None if command.acceleration is None else acceleration[:, index],
-        )

@@ -1,38 +1,29 @@
 """Which model corrects the commands at every instant, and the corrected joints themselves."""
 
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction import pack_model
-from robocal_ros.core.joint_correction.blending import (
-    Commanded,
-    blend_along,
-    step_towards,
-)
+from robocal_ros.core.joint_correction.blending import Commanded
 from robocal_ros.core.joint_correction.bounds import (
-    FADES_FROM,
     CorrectionConfig,
-    fault_of,
+    Policy,
     require_limits,
+    require_solved,
+    require_speeds,
+    require_within,
 )
-from robocal_ros.core.joint_correction.refusals import RefusedError
+from robocal_ros.core.joint_correction.clamping import ClampedResult
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sessions.correction.proposals import Motion, Proposal, Proposer
 
 Array = NDArray[np.float64]
-
-PARTIAL = "only a part of the joints is commanded"
-
-
-@dataclass(frozen=True)
-class Corrected:
-    """Corrected joints (m, n), at blends s (m,) of a stage."""
-
-    stage: StagedCorrection
-    s: Array
-    result: StagedResult
 
 
 class Corrector:
@@ -44,7 +35,9 @@ class Corrector:
     known : packed model that is wanted, or would be if the correction were on.
     held : how often a blend waited because a bound would have been exceeded.
     waits : why the blend waits now; empty when it does not.
-    reduced : how many points were corrected in part, near a singularity.
+    reduced : how many points were corrected in part, near a singularity or by a bound.
+    clamped, passed : how many messages were corrected in part, or on the way to not at all, for
+        what bound.
     figures : of the last joints put out: error at the tool without correction, m; largest shift
         of a joint; error that remains, m.
     """
@@ -56,10 +49,12 @@ class Corrector:
         self._wanted = self.reference
         self.known = self.reference
         self._commanded = Commanded(self.reference, self.reference)
-        self._stage: tuple[Array, Array, StagedCorrection] | None = None
+        self._proposer = Proposer(self.reference, reference, config)
         self.held = 0
         self.waits = ""
         self.reduced = 0
+        self.clamped: Counter[Reason] = Counter()
+        self.passed: Counter[Reason] = Counter()
         self.figures = (0.0, 0.0, 0.0)
 
     def want(self, arm: SerialArm, on: bool) -> None:
@@ -111,111 +106,103 @@ class Corrector:
         """Joints (m, n), corrected with a packed model."""
         if model is self.reference:
             return q
-        return self._stage_between(model, model).correct(q, np.ones(len(q))).q
-
-    # ---- corrected joints -----------------------------------------------------------------------
-
-    def passes(self, q: Array, now_s: float) -> bool:
-        """True when joints (m, n) need no correction; they are still held to the limits."""
-        if self._commanded.at(now_s) is not self.reference or self._wanted is not self.reference:
-            return False
-        require_limits(q, self._arm)
-        self.stop(now_s)
-        self.waits = ""
-        self.figures = (0.0, 0.0, 0.0)
-        return True
-
-    def point(self, q: Array, now_s: float, pause_s: float, whole: bool = True) -> Corrected:
-        """Correct one point (1, n) of a stream, ``pause_s`` after the one before.
-
-        The blend waits while the stream is not ``whole``: it would move joints that are not in
-        the commands, and the next whole command would make up for it in one step.
-        """
-        blend = self._commanded.latest(now_s)
-        begin = blend.progress(now_s)
-        if blend.end is not self._wanted:
-            blend, begin = Commanded(self._commanded.at(now_s), self._wanted), 0.0
-        stage = self._stage_between(blend.start, blend.end)
-        waits = "" if whole or blend.start is blend.end else PARTIAL
-        s, result = begin, stage.correct(q, np.array([begin]))
-        if begin < 1.0 and whole:
-            dt = min(pause_s, self._config.longest_step_s)
-            s, there = step_towards(stage, q, begin, self._config.blend_rates(self._arm), dt)
-            fault = self._fault(there) if s > begin else None
-            if fault is not None:
-                s, waits = begin, f"{fault.reason.value}: {fault.detail}"
-                self.held += 1
-            else:
-                result = there
-                waits = "the correction changes too fast here" if s == begin and dt > 0.0 else ""
-        self._require(result)
-        self.waits = waits
-        settled = s >= 1.0
-        start = blend.end if settled else blend.start
-        self._commanded = Commanded(start, blend.end, s=np.array([s]))
-        self._note(q, result)
-        return Corrected(stage, np.array([s]), result)
-
-    def path(
-        self, q: Array, times_s: Array, now_s: float, starts_in_s: float, whole: bool = True
-    ) -> Corrected:
-        """Correct the points (m, n) of a trajectory, from what is commanded when it begins.
-
-        The blend waits while the commands are not ``whole``, as in `point`.
-        """
-        model = self._commanded.at(now_s + max(0.0, starts_in_s))
-        stage = self._stage_between(model, self._wanted)
-        s = np.ones(len(q))
-        if model is not self._wanted and not whole:
-            s = np.zeros(len(q))
-        elif model is not self._wanted:
-            rates = self._config.blend_rates(self._arm)
-            s = blend_along(stage, q, times_s, -starts_in_s, rates)
-        result = stage.correct(q, s)
-        self._require(result)
-        self.waits = "" if whole or model is self._wanted else PARTIAL
-        first = max(0.0, -starts_in_s)
-        self._commanded = Commanded(
-            model,
-            self._wanted,
-            now_s + starts_in_s,
-            np.append(first, np.maximum(times_s, first)),
-            np.append(0.0, s),
-            self._running(now_s) if starts_in_s > 0.0 else None,
-        )
-        self._note(q, result)
-        return Corrected(stage, s, result)
-
-    def _running(self, now_s: float) -> Commanded:
-        """What is under way: a trajectory that still waits for its start is replaced."""
-        return replace(self._commanded.latest(now_s), before=None)
+        return self._proposer.stage(model, model).correct(q, np.ones(len(q))).q
 
     def commanded(self, now_s: float) -> StagedCorrection | None:
         """The correction in the commands at an instant, at blend 1; None when there is none."""
         model = self._commanded.at(now_s)
-        return None if model is self.reference else self._stage_between(model, model)
+        return None if model is self.reference else self._proposer.stage(model, model)
 
-    def _stage_between(self, start: Array, end: Array) -> StagedCorrection:
-        if self._stage is None or self._stage[0] is not start or self._stage[1] is not end:
-            stage = StagedCorrection(
-                self.reference,
-                start,
-                end,
-                FADES_FROM * self._config.thermal.of_joints(self._arm),
-                self._config.tool.of_joints(self._arm),
+    # ---- corrected joints -----------------------------------------------------------------------
+
+    def pass_on(self, motion: Motion, now_s: float) -> None:
+        """Nothing is added to a motion; it is held to the limits all the same."""
+        require_limits(motion.q, self._arm)
+        self._require_speeds(motion, motion.q, motion.velocity)
+        self.stop(now_s)
+        self.waits = ""
+        self.figures = (0.0, 0.0, 0.0)
+
+    def point(self, motion: Motion, now_s: float, pause_s: float) -> Proposal:
+        """Correct one point of a stream, ``pause_s`` after the one before.
+
+        Where a fault bars the way the blend waits.
+        """
+
+        def towards(goal: Array, dt_s: float) -> Proposal:
+            proposal = self._proposer.point(motion, self._commanded, goal, now_s, dt_s)
+            self._require(motion, proposal, goal)
+            return proposal
+
+        def step(goal: Array) -> Proposal:
+            try:
+                return towards(goal, pause_s)
+            except RefusedError as fault:
+                proposal = towards(goal, 0.0)
+                self.held += 1
+                return replace(proposal, waits=f"{fault.reason.value}: {fault.detail}")
+
+        return self._take(motion, step)
+
+    def path(self, motion: Motion, times_s: Array, now_s: float, starts_in_s: float) -> Proposal:
+        """Correct a trajectory, from what is commanded when it begins."""
+
+        def towards(goal: Array) -> Proposal:
+            proposal = self._proposer.path(
+                motion, self._commanded, goal, times_s, now_s, starts_in_s
             )
-            self._stage = (start, end, stage)
-        return self._stage[2]
+            self._require(motion, proposal, goal)
+            return proposal
 
-    def _fault(self, result: StagedResult) -> RefusedError | None:
+        return self._take(motion, towards)
+
+    def _take(self, motion: Motion, towards: Callable[[Array], Proposal]) -> Proposal:
+        """What the policy makes of a motion; raises where that is a refusal."""
+        goal, why = self._wanted, self._passes_for(motion)
+        if why is not None:
+            goal = self.reference
+        try:
+            proposal = towards(goal)
+        except RefusedError as fault:
+            too_fast = fault.reason is Reason.VELOCITY_LIMIT
+            if self._config.policy is Policy.REFUSE or not too_fast or goal is self.reference:
+                raise
+            why, proposal = fault.reason, towards(self.reference)
+        self._commanded, self.waits = proposal.commanded, proposal.waits
+        result = proposal.result
+        bound = result.reason if isinstance(result, ClampedResult) else None
+        if why is not None and self._config.policy is Policy.PASS:
+            self.passed[why] += 1
+        elif (reason := why or bound) is not None:
+            self.clamped[reason] += 1
+        self._note(motion.q, result)
+        return proposal
+
+    def _passes_for(self, motion: Motion) -> Reason | None:
+        """The bound for which a motion is not to be corrected at all; None: it is."""
+        if self._config.policy is not Policy.PASS or self._wanted is self.reference:
+            return None
+        stage = self._proposer.stage(self._wanted, self._wanted)
+        result = stage.correct(motion.q, np.ones(len(motion.q)))
+        return result.reason if isinstance(result, ClampedResult) else None
+
+    def _require(self, motion: Motion, proposal: Proposal, goal: Array) -> None:
+        result = proposal.result
+        require_limits(result.q, self._arm)
+        require_solved(result)
         # The way back to no correction is never barred by the bounds of a correction.
-        bounded = self._wanted is not self.reference
-        return fault_of(result, self._config if bounded else None, self._arm)
+        if self._config.policy is Policy.REFUSE and goal is not self.reference:
+            require_within(result, self._config, self._arm)
+        self._require_speeds(motion, result.q, proposal.velocity)
 
-    def _require(self, result: StagedResult) -> None:
-        fault = self._fault(result)
-        if fault is not None:
-            raise fault
+    def _require_speeds(self, motion: Motion, q: Array, velocity: Array | None) -> None:
+        limits = self._config.velocity_limits
+        if limits is None:
+            return
+        mean = np.diff(q, axis=0, prepend=motion.before[None]) / motion.dt_s[:, None]
+        require_speeds(np.where(np.isfinite(mean), mean, 0.0), limits, self._arm)
+        if velocity is not None:
+            require_speeds(velocity, limits, self._arm)
 
     def _note(self, q: Array, result: StagedResult) -> None:
         self.reduced += int(np.sum(~result.whole))

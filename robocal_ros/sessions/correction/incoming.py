@@ -29,6 +29,7 @@ ROUNDED = 1e-6
 OF_SHIFT = 0.25
 SHIFTED = 1e-9
 ECHOES = 64  # a loop brings one of so many outputs back
+MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 TRACK_S = 0.01  # between the places that tell how far the robot moved
 
 
@@ -48,6 +49,9 @@ class JointBook:
         self._track: deque[tuple[float, Array]] = deque()
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
+        limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
+        turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), MOST_TURNS)
+        self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
         self.measured = np.full(arm.n, np.nan)
         self.taught = np.full(arm.n, np.nan)
 
@@ -86,6 +90,7 @@ class JointBook:
             detail = f"{len(names)} names but {position.shape[1]} positions"
             raise RefusedError(Reason.WRONG_SIZE, detail)
         require_finite(names, position)
+        self._require_radians(index, position)
         if len(names) == len(self._names):
             q = np.empty_like(position)
         else:
@@ -99,6 +104,16 @@ class JointBook:
             q = np.tile(self.taught, (len(position), 1))
         q[:, index] = position
         return q, index
+
+    def _require_radians(self, index: Index, position: Array) -> None:
+        """Refuse positions (m, k) that can only be degrees, or millimetres."""
+        size = np.abs(position)
+        if np.any(size > self._turns[index]):
+            point, column = np.argwhere(size > self._turns[index])[0]
+            detail = f"{self._names[index[column]]} at {position[point, column]:g} rad"
+            raise RefusedError(Reason.DEGREES, detail)
+        if len(index) and np.any(np.all(size > self._tenfold[index], axis=1)):
+            raise RefusedError(Reason.DEGREES, "all joints are beyond ten times their limits")
 
     def _index(self, names: tuple[str, ...]) -> Index:
         unknown = [name for name in names if name not in self._number]
@@ -128,6 +143,7 @@ class JointBook:
         places = np.array(place, dtype=np.int64)
         values = state.position[places]
         require_finite(tuple(state.names[i] for i in place), values[None])
+        self._require_radians(index, values[None])
         if state.velocity is not None:
             speeds = state.velocity[places]
             require_finite(tuple(state.names[i] for i in place), speeds[None])
@@ -181,6 +197,10 @@ class CorrectionGuard:
         if stamp and stamp < last and not reset:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
             raise RefusedError(Reason.TIME_BACKWARDS, detail)
+
+    def not_before(self, now_s: float) -> float:
+        """The clock's time, or the last one where it went back."""
+        return now_s if now_s >= self._clock_s else self._clock_s
 
     def accept_order(self, kind: str, stamp: int, now_s: float) -> None:
         """Remember the time of what was acted on."""

@@ -15,6 +15,7 @@ from robocal_ros.core.samples import stamp_ns
 
 Array = NDArray[np.float64]
 
+MOST_POINTS = 100_000  # of a trajectory; tens of thousands are corrected in well under a second
 TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
 
 
@@ -131,16 +132,24 @@ def _require_finite(values: Any, what: str) -> None:
         raise RefusedError(Reason.NOT_FINITE, f"{what}: {list(values)}")
 
 
+def require_few(points: int) -> None:
+    """Refuse a trajectory of so many points that nothing else would be heard meanwhile."""
+    if points > MOST_POINTS:
+        raise RefusedError(Reason.BURST, f"{points}, allowed {MOST_POINTS}")
+
+
 def trajectory_command(message: Any) -> TrajectoryCommand:
     """Build from a ``trajectory_msgs/JointTrajectory``; one without points is a stop.
 
     Raises
     ------
     RefusedError
-        When numbers differ, a point has no positions, or only some points have a rate.
+        When numbers differ, a point has no positions, only some points have a rate, or there are
+        too many points.
     """
     names = tuple(message.joint_names)
     points = message.points
+    require_few(len(points))
     for point in points:
         _require_finite(point.effort, "an effort")
     rows = {

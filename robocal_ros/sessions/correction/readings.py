@@ -17,8 +17,11 @@ Index = NDArray[np.int64]
 class Readings:
     """From corrected joints to taught ones."""
 
-    def __init__(self, joints: JointBook, guard: CorrectionGuard, corrector: Corrector) -> None:
+    def __init__(
+        self, joints: JointBook, guard: CorrectionGuard, corrector: Corrector, shadow: bool
+    ) -> None:
         self._joints, self._guard, self._corrector = joints, guard, corrector
+        self._shadow = shadow
 
     def take(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
         """Remember readings that are ``age_s`` old, and un-correct them."""
@@ -51,7 +54,7 @@ class Readings:
         """All taught joints (n,), and the state's positions and velocities, un-corrected."""
         measured = self._joints.measured.copy()
         measured[index] = state.position[place]
-        stage = self._corrector.commanded(now_s)
+        stage = None if self._shadow else self._corrector.commanded(now_s)
         if stage is None:
             return measured, state.position, state.velocity
         taught = stage.uncorrect(measured[None], np.ones(1))
@@ -68,4 +71,6 @@ class Readings:
         stage, measured = self._corrector.commanded(now_s), self._joints.measured
         if stage is None:
             return np.zeros(self._joints.count)
+        if self._shadow:  # the robot stands where it was taught
+            return np.asarray(stage.correct(measured[None], np.ones(1)).q[0] - measured)
         return np.asarray(measured - stage.uncorrect(measured[None], np.ones(1))[0])

@@ -63,7 +63,7 @@ class CorrectionSession:
         self._enabled = False
         self._starts = Starts(reference, config, self._corrector)
         self._commands = Commands(config, self._joints, self._guard, self._corrector, self._starts)
-        self._readings = Readings(self._joints, self._guard, self._corrector)
+        self._readings = Readings(self._joints, self._guard, self._corrector, config.shadow)
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
@@ -216,8 +216,8 @@ class CorrectionSession:
             waits=corrector.waits,
             mismatch=self._starts.mismatch,
             reduced=corrector.reduced,
-            clamped={},
-            passed={},
+            clamped=dict(corrector.clamped),
+            passed=dict(corrector.passed),
             policy=self._config.policy,
             reference=f"{self._reference.name} {self._reference.model_hash}",
             shadow=self._config.shadow,

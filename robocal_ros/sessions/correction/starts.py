@@ -59,6 +59,9 @@ class Starts:
         RefusedError
             After a mismatch.
         """
+        if self._config.shadow:  # nothing is added that could be a step
+            self.started = True
+            return False
         if self.mismatch:
             raise RefusedError(Reason.START_MISMATCH, self.mismatch)
         return not (self.started and self._corrector.passing(now_s))

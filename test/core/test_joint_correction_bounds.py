@@ -1,0 +1,157 @@
+"""A clamped correction: within its bounds everywhere, continuous, and to be undone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robocal_ros.core import frames
+from robocal_ros.core.joint_correction import pack_model
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy
+from robocal_ros.core.joint_correction.clamping import (
+    FADES_WITHIN,
+    ClampedCorrection,
+    correction_between,
+)
+from robocal_ros.core.joint_correction.refusals import Reason
+from robocal_ros.core.joint_correction.staged import StagedCorrection
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = replace(
+    load_robot("kr150_r3100"), T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2])
+)
+CONFIG = CorrectionConfig(policy=Policy.CLAMP)
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+
+
+def drifted(size: float, seed: int = 0) -> SerialArm:
+    """About 0.12 mm times ``size`` at the tool."""
+    rng = np.random.default_rng(seed)
+    chosen = NOMINAL.parameters
+    change = rng.standard_normal(len(chosen)) * np.where(chosen.is_length, 8e-5, 4e-5)
+    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * change))
+
+
+def bent(arm: SerialArm) -> SerialArm:
+    change = frames.transform(frames.exp_rotation([0.0, np.radians(1.0), 0.0]), [3e-3, 0.0, 0.0])
+    return replace(arm, T_flange_tool=arm.T_flange_tool @ change)
+
+
+def clamped(arm: SerialArm) -> ClampedCorrection:
+    reference, actual = pack_model(NOMINAL), pack_model(arm)
+    stage = correction_between(reference, actual, actual, NOMINAL, CONFIG)
+    assert isinstance(stage, ClampedCorrection)
+    return stage
+
+
+def path_through(middle: np.ndarray, reach: float = 0.4, m: int = 4001) -> np.ndarray:
+    along = np.random.default_rng(2).uniform(-1.0, 1.0, 6)
+    return middle + np.linspace(-reach, reach, m)[:, None] * along / np.abs(along).max()
+
+
+def near_limits() -> np.ndarray:
+    """Up to the upper limit of joint 2 and back, while the others move on."""
+    q = path_through(HOME)
+    q[:, 1] = NOMINAL.upper[1] - np.abs(np.linspace(-0.05, 0.05, len(q)))
+    return q
+
+
+def through_the_wrist() -> np.ndarray:
+    q = path_through(HOME)
+    q[:, 4] = np.linspace(-0.05, 0.05, len(q))
+    return q
+
+
+PATHS = {
+    "free": path_through(HOME),
+    "limit": near_limits(),
+    "wrist": through_the_wrist(),
+}
+ARMS = {
+    "small": drifted(1.0),
+    "large": drifted(15.0, seed=3),
+    "small, bent": bent(drifted(1.0)),
+    "large, bent": bent(drifted(15.0, seed=3)),
+}
+
+
+@pytest.fixture(params=PATHS)
+def q(request: pytest.FixtureRequest) -> np.ndarray:
+    return PATHS[request.param]
+
+
+@pytest.fixture(params=ARMS)
+def arm(request: pytest.FixtureRequest) -> SerialArm:
+    return ARMS[request.param]
+
+
+def test_no_bound_is_exceeded(q: np.ndarray, arm: SerialArm) -> None:
+    result = clamped(arm).correct(q, np.ones(len(q)))
+    shift = np.abs(result.q - q)
+    assert np.all(shift <= CONFIG.thermal.joint_rad + CONFIG.tool.joint_rad)
+    # beyond a limit by rounding only, and at the limit not at all
+    assert np.all(result.q <= NOMINAL.upper + 1e-12)
+    assert np.all(result.q >= NOMINAL.lower - 1e-12)
+    if result.tool is None:
+        assert np.all(shift <= CONFIG.thermal.joint_rad + 1e-12)
+        moved = arm.fk(result.q) @ arm.T_flange_tool
+        stood = arm.fk(q) @ arm.T_flange_tool
+        step = np.linalg.norm((moved - stood)[:, :3, 3], axis=1)
+        # a share of the joints' shift moves the tool by it up to the second order: 0.3 deg / 2
+        assert step.max() <= CONFIG.thermal.tcp_m * (1.0 + np.radians(0.15))
+
+
+def test_it_is_continuous(q: np.ndarray, arm: SerialArm) -> None:
+    """Ten times as near, ten times as small a step: a jump would stay as large."""
+    stage = clamped(arm)
+    fine = np.linspace(q[:-1], q[1:], 10, endpoint=False).swapaxes(0, 1).reshape(-1, 6)
+    largest = []
+    for points in (q, fine):
+        shift = stage.correct(points, np.ones(len(points))).q - points
+        largest.append(np.abs(np.diff(shift, axis=0)).max())
+    assert largest[1] < 0.2 * largest[0]
+
+
+def test_taught_joints_follow_from_corrected_ones(q: np.ndarray, arm: SerialArm) -> None:
+    """Through the wrist as near as it gets: within what an encoder resolves (20 bits)."""
+    exact = 1e-9 if q is not PATHS["wrist"] else 2.0 * np.pi / 2**20
+    stage, ones = clamped(arm), np.ones(len(q[::40]))
+    result = stage.correct(q[::40], ones)
+    taught = stage.uncorrect(result.q, ones)
+    again = stage.correct(taught, ones).q
+    assert np.abs(again - result.q).max() < exact
+
+
+def test_what_bounds_it_is_named() -> None:
+    one = np.ones(1)
+    assert clamped(drifted(1.0)).correct(HOME[None], one).reason is None
+    assert clamped(drifted(15.0, seed=3)).correct(HOME[None], one).reason is Reason.TCP_BOUND
+    at_limit = HOME.copy()
+    at_limit[1] = NOMINAL.upper[1]
+    result = clamped(drifted(1.0)).correct(at_limit[None], one)
+    assert result.reason is Reason.JOINT_LIMIT
+    assert np.array_equal(result.q[0], at_limit)
+    assert not result.whole[0]
+    assert result.remaining_m[0] >= 0.99 * result.arm.tcp_shift_m[0]
+
+
+def test_where_no_bound_is_near_it_is_the_whole_correction() -> None:
+    q, ones = path_through(HOME, m=50), np.ones(50)
+    arm = bent(drifted(1.0))
+    config = replace(CONFIG, policy=Policy.REFUSE)
+    packed = pack_model(arm)
+    plain = correction_between(pack_model(NOMINAL), packed, packed, NOMINAL, config)
+    assert type(plain) is StagedCorrection
+    result = clamped(arm).correct(q, ones)
+    assert np.array_equal(result.q, plain.correct(q, ones).q)
+    assert np.all(result.whole)
+
+
+def test_towards_a_limit_it_fades_within_a_few_times_its_size() -> None:
+    stage, q = clamped(drifted(1.0)), np.tile(HOME, (2, 1))
+    size = np.abs(stage.correct(HOME[None], np.ones(1)).q - HOME).max()
+    q[:, 1] = NOMINAL.upper[1] - np.array([1.5, 0.5]) * FADES_WITHIN * size
+    kept = stage.correct(q, np.ones(2)).kept
+    assert kept[0] == 1.0
+    assert kept[1] == pytest.approx(0.5, abs=0.2)
