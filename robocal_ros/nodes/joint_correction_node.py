@@ -127,7 +127,7 @@ class JointCorrectionNode(HouseNode):
     def _on_enable(self, request: Any, response: Any) -> Any:
         self._session.enable(request.data)
         response.success = True
-        response.message = messages.in_words(self._status())
+        response.message = messages.in_words(self._session.status())
         self.get_logger().info(f"enable {request.data}: {response.message}")
         self._tell()
         return response
@@ -222,16 +222,13 @@ class JointCorrectionNode(HouseNode):
 
     def _tell(self, *, only_news: bool = False) -> None:
         """Publish the status; a figure of the last command alone is no news."""
-        status, now = self._status(), time.monotonic()
+        status, now = self._session.status(), time.monotonic()
         sources = "; ".join([*self._faults(), *self._rivals()])
         told = (replace(status, tcp_shift_m=0.0, largest_shift=0.0, remaining_m=0.0), sources)
         if only_news and told == self._told and now - self._told_s < TELL_S - 0.5 * LOOK_S:
             return
         self._told, self._told_s = told, now
         self._statuses.publish(self._messages.status(status, sources, self.now_ns()))
-
-    def _status(self) -> CorrectionStatus:
-        return replace(self._session.status(), shadow=self._shadow)
 
     def _faults(self) -> list[str]:
         return [guard.fault for guard in self._sources.values() if guard.fault]
@@ -246,7 +243,7 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        return self._judge.of(self._status(), self._faults(), self._rivals())
+        return self._judge.of(self._session.status(), self._faults(), self._rivals())
 
 
 _STOP = TrajectoryCommand((), np.empty((0, 0)), np.empty(0))

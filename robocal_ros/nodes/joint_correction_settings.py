@@ -258,4 +258,5 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         model_age_s=settings["model_age_s"],
         free_axis=settings["free_axis"],
         velocity_limits=_velocity_limits(settings),
+        shadow=settings["shadow"],
     )
