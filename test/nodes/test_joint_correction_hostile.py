@@ -188,9 +188,7 @@ class Attacked(Line):
         if what == "enable":
             self.enable(message)
         elif what == "flood":
-            for _ in range(50):
-                self.into[self.stream].publish(message)
-            self.command(self.stream, message)
+            self.command(self.stream, message, copies=50)
         elif what == "taught":
             self.command(self.stream, self.good(message))
         else:
@@ -201,24 +199,38 @@ class Attacked(Line):
             return joints(q)
         return Float64MultiArray(data=array("d", q))
 
-    def command(self, topic: str, message: Any) -> int:
+    def command(self, topic: str, message: Any, copies: int = 1) -> int:
         """Send it; what comes out is noted, and the robot goes there."""
         self.stand()
-        before = time.monotonic()
-        self.take(message, self.into[topic], topic)
-        self.graph.spin_for(0.005)
+        before, taken, accepted = time.monotonic(), *self.counts(topic)
+        for _ in range(copies):
+            self.into[topic].publish(message)
+        self.graph.spin_until(lambda: self.counts(topic)[0] == taken + copies, f"{topic} is taken")
+        count = self.counts(topic)[1] - accepted
+        inbox = {
+            "joint_targets": self.targets,
+            "joint_commands": self.arrays,
+            "joint_trajectory": self.paths,
+        }.get(topic)
+        if inbox is not None:
+            self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs of {topic}")
         after = time.monotonic()
-        count = len(self.targets) + len(self.arrays)
         for out in self.targets:
             index = [NAMES.index(name) for name in out.name]
             self.went(before, after, index, message.position, out.position)
         for out in self.arrays:
             self.went(before, after, list(range(6)), message.data, out.data)
-        for path in self.paths:
+        paths = list(self.paths)
+        for box in (self.targets, self.arrays, self.paths):
+            box.clear()
+        for path in paths:
             self.follow(path)
-        for inbox in (self.targets, self.arrays, self.paths):
-            inbox.clear()
         return count
+
+    def counts(self, topic: str) -> tuple[int, int]:
+        """How many messages were received, and how many of them were not refused."""
+        count = self.node.inputs[topic]
+        return count.received, count.received - count.invalid
 
     def went(self, before: float, after: float, index: list[int], taught: Any, out: Any) -> None:
         self.taught[index], self.at[index] = taught, out
@@ -230,7 +242,7 @@ class Attacked(Line):
             rows = (point.positions, point.velocities, point.accelerations, point.effort)
             assert all(np.all(np.isfinite(row)) for row in rows)
         if path.points:
-            self.to_path.publish(JointTrajectory(joint_names=NAMES))
+            self.command("joint_trajectory", JointTrajectory(joint_names=NAMES))
 
 
 @pytest.mark.parametrize("stream", STREAMS)
