@@ -1,0 +1,176 @@
+"""Whoever is killed and started anew, in whatever order: the robot's commands go on without a step.
+
+All three nodes are processes; planner and robot are played by the test. The robot does exactly
+what it is told; the planner waits while nothing comes back.
+"""
+
+import itertools
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from joint_correction_live import HOME, NAMES, NODE, NOMINAL, drifted, joints
+from robocal_msgs.msg import CorrectionStatus
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+from tool_driver import noisy_cell
+
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.proposals import THERMAL, TOOL
+from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.nodes import qos
+from robocal_ros.sessions.seeding import bring_into_force
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.laser_files import LaserFile, write_laser
+
+PERIOD_S = 0.02
+SPEED_RAD_S, SWING_RAD = 0.05, 0.1
+BLEND_RAD_S = np.radians(0.5)  # as the node has it by default
+START_RAD = np.radians(0.02)  # how far from where it stands a command may begin
+LONGEST_S = 0.1  # what a pause counts for at most, in a stream that goes on
+TAUGHT_M = [0.01, 0.0, 0.25]
+
+
+class Cell:
+    """Planner, robot, and the three nodes as processes."""
+
+    def __init__(self, graph: Any, folder: Path) -> None:
+        self.graph = graph
+        self._laser = folder / "laser.yaml"
+        laser = LaserFile(noisy_cell().laser, "north", NOMINAL.name, NOMINAL.model_hash)
+        write_laser(self._laser, laser)
+        self._seed()
+        self.robot = HOME.copy()
+        self.taught: dict[int, np.ndarray] = {}
+        self.sent: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self._phase, self._heard = 0.0, 0.0
+        self.status: list[CorrectionStatus] = graph.collect(
+            CorrectionStatus, f"{NODE}/status", qos.LATCHED
+        )
+        probe = graph.probe
+        probe.create_subscription(
+            JointState, f"{NODE}/joint_targets", self._obey, qos.own(qos.RELIABLE)
+        )
+        self._targets = probe.create_publisher(JointState, "joint_targets", 10)
+        self._states = probe.create_publisher(JointState, "joint_states", 10)
+        self.nodes: dict[str, Any] = {}
+        for name in ("thermal_node", "tcf_node", "joint_correction_node"):
+            self.start(name)
+        probe.create_timer(PERIOD_S, self._tick)
+
+    def _seed(self) -> None:
+        tool = np.eye(4)
+        tool[:3, 3] = [TAUGHT_M[0] + 0.001, *TAUGHT_M[1:]]
+        found = KnownTool(tool).document() | {"thermal_revision": 0}
+        with CalibrationHistory.open(
+            "s1", model_hash=NOMINAL.model_hash, state_dir=self.graph.state
+        ) as history:
+            bring_into_force(history, THERMAL, NOMINAL, model_document(drifted()), "test")
+            bring_into_force(history, TOOL, NOMINAL, found, "test")
+
+    def start(self, name: str) -> None:
+        """Start a node, or start it anew."""
+        tool = {"taught_xyz_mm": f"[{', '.join(str(1e3 * x) for x in TAUGHT_M)}]"}
+        parameters: dict[str, Any] = {"serial": "s1", "robot": "kr150_r3100"}
+        parameters |= {
+            "thermal_node": {},
+            "tcf_node": tool | {"laser": self._laser},
+            "joint_correction_node": {"taught_tool": [*TAUGHT_M, 0.0, 0.0, 0.0, 1.0]},
+        }[name]
+        remap = {"kinematic_model": "/thermal_node/model", "tool_frame": "/tcf_node/tool"}
+        mine = remap if name == "joint_correction_node" else None
+        self.nodes[name] = self.graph.start(name, parameters, mine)
+
+    def kill(self, name: str) -> None:
+        """As a power cut would."""
+        self.nodes[name].kill()
+
+    def _tick(self) -> None:
+        """The robot tells where it is; the planner goes on where it is answered."""
+        now = time.time_ns()
+        state = joints(self.robot)
+        state.header.stamp.sec, state.header.stamp.nanosec = divmod(now, 10**9)
+        self._states.publish(state)
+        if time.monotonic() - self._heard < 3 * PERIOD_S:
+            self._phase += PERIOD_S * SPEED_RAD_S / SWING_RAD
+        q = HOME + SWING_RAD * np.sin(self._phase)
+        target = joints(q)
+        target.header.stamp.sec, target.header.stamp.nanosec = divmod(now, 10**9)
+        self.taught[now] = q
+        self._targets.publish(target)
+
+    def _obey(self, message: JointState) -> None:
+        stamp = message.header.stamp
+        taught = self.taught[stamp.sec * 10**9 + stamp.nanosec]
+        assert list(message.name) == NAMES
+        out, now = np.array(message.position), time.monotonic()
+        self.sent.append((now, taught, out))
+        self.robot, self._heard = out, now
+
+    def goes_on(self) -> None:
+        """Commands come again; after a mismatch the planner asks for it."""
+        count = len(self.sent)
+
+        def again() -> bool:
+            return len(self.sent) > count + 10
+
+        deadline = time.monotonic() + 10.0
+        while not again() and time.monotonic() < deadline:
+            self.graph.spin_for(0.5)
+            if not again():
+                self.graph.call(SetBool, f"{NODE}/enable", data=True)
+        assert again(), "no commands come any more"
+
+    def enable(self) -> None:
+        """Ask for the correction and wait until all of it is made."""
+        assert self.graph.call(SetBool, f"{NODE}/enable", data=True).success
+        self.status.clear()
+        self.graph.spin_until(
+            lambda: any(s.settled and s.enabled and s.thermal_revision for s in self.status),
+            "the correction is on",
+            15.0,
+        )
+
+    def largest_step(self) -> float:
+        """How much more the commands moved than the path, the blend and a new begin allow."""
+        over = []
+        for (t0, taught0, out0), (t1, taught1, out1) in itertools.pairwise(self.sent):
+            dt = min(t1 - t0, LONGEST_S) + PERIOD_S  # and what the messages' way differs by
+            step = np.abs(out1 - out0).max()
+            over.append(step - np.abs(taught1 - taught0).max() - BLEND_RAD_S * dt)
+        return float(np.max(over))
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        ("thermal_node", "tcf_node", "joint_correction_node"),
+        ("joint_correction_node", "tcf_node", "thermal_node"),
+        ("tcf_node", "joint_correction_node", "thermal_node"),
+    ],
+    ids=lambda order: order[0],
+)
+def test_no_step_whoever_is_killed(graph: Any, tmp_path: Path, order: tuple[str, ...]) -> None:
+    cell = Cell(graph, tmp_path)
+    cell.goes_on()
+    cell.enable()
+    offset = cell.sent[-1][2] - cell.sent[-1][1]
+    assert np.abs(offset).max() > 10.0 * START_RAD  # the tool is a millimetre off
+    for name in order:  # each alone
+        cell.kill(name)
+        graph.spin_for(0.3)
+        cell.start(name)
+        cell.goes_on()
+    cell.enable()
+    for name in order:  # all together, in turn
+        cell.kill(name)
+    for name in reversed(order):
+        graph.spin_for(0.2)
+        cell.start(name)
+    cell.goes_on()
+    cell.enable()
+    assert cell.largest_step() < START_RAD
+    after = cell.sent[-1][2] - cell.sent[-1][1]
+    assert np.abs(after - offset).max() < 0.1 * np.abs(offset).max()  # what was, is again
