@@ -25,10 +25,10 @@ HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
 NODE = "/joint_correction_node"
 
 
-def drifted() -> SerialArm:
+def drifted(times: float = 1.0) -> SerialArm:
     rng = np.random.default_rng(0)
     chosen = NOMINAL.parameters
-    size = np.where(chosen.is_length, 1e-4, 5e-5)
+    size = times * np.where(chosen.is_length, 1e-4, 5e-5)
     return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
 
 

@@ -34,13 +34,21 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 
-BLEND_RAD_S = np.radians(0.5)
 LONGEST_STEP_S = 0.02
-THERMAL_RAD = np.radians(0.3)
-ACTUAL = drifted()
+# A drift of some millimetres that blends in slowly, so that most commands meet a blend.
+PARAMETERS = {
+    "enable_on_start": True,
+    "stream_gap_s": 2.0,
+    "blend_deg_s": 0.05,
+    "thermal_tcp_mm": 20.0,
+    "thermal_tcp_deg": 2.0,
+    "thermal_joint_deg": 3.0,
+}
+BLEND_RAD_S = np.radians(PARAMETERS["blend_deg_s"])
+THERMAL_RAD = np.radians(PARAMETERS["thermal_joint_deg"])
+ACTUAL = drifted(times=10.0)
 FULL = JointCorrection.between(NOMINAL, ACTUAL)
-# A blend is straight in the parameters, not quite in the joints: second order of its 1e-4 rad,
-# with the condition of the Jacobian at these postures (below 1e2).
+# A blend is straight in the parameters, not quite in the joints: second order of its 1e-3 rad.
 CURVED = 1e-6
 
 
@@ -87,8 +95,13 @@ NEAR = st.lists(st.floats(-0.02, 0.02), min_size=6, max_size=6).map(lambda d: HO
 FAR = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(lambda d: HOME + np.array(d))
 
 
-def numbers(most: int = 8) -> st.SearchStrategy[Any]:
-    return st.lists(NUMBERS, max_size=most).map(lambda values: array("d", values))
+def numbers() -> st.SearchStrategy[Any]:
+    """As many as there are joints, now and then more or fewer; one of them bad, or all."""
+    spoilt = st.builds(
+        lambda q, i, x: [*q[:i], x, *q[i + 1 :]], NEAR.map(list), st.integers(0, 5), NUMBERS
+    )
+    values = st.one_of(spoilt, st.lists(NUMBERS, min_size=6, max_size=6), st.lists(NUMBERS))
+    return values.map(lambda row: array("d", row))
 
 
 GARBAGE_JOINTS = st.builds(
@@ -169,7 +182,7 @@ class Attacked(Line):
     """A line whose robot stands where it was sent last."""
 
     def __init__(self, graph: Any, stream: str) -> None:
-        super().__init__(graph, enable_on_start=True, stream_gap_s=2.0)
+        super().__init__(graph, **PARAMETERS)
         self.take(model_message(ACTUAL), self.to_model, "kinematic_model")
         self.stream = stream
         self.into = {
