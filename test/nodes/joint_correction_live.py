@@ -172,6 +172,7 @@ class Line:
         for _ in range(3000):
             out = self.target()
             if self.node._session.status().settled:
+                self.stand()
                 return out
         pytest.fail("the blend does not end")
 
