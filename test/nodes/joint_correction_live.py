@@ -15,8 +15,10 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.nodes.tool_messages import ToolMessages
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = load_robot("kr150_r3100")
@@ -44,17 +46,12 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
 
 
 def tool_message(T: np.ndarray, revision: int = 1, **changes: Any) -> ToolFrame:
-    fields = {
-        "header": Header(frame_id="tool0"),
-        "child_frame_id": "tool",
-        "robot": NOMINAL.name,
-        "serial": "s1",
-        "model_hash": NOMINAL.model_hash,
-        "revision": revision,
-        "tool": conversions.transform_message(T),
-        "state": ToolFrame.ACCEPTED,
-    }
-    return ToolFrame(**(fields | changes))
+    """As tcf_node makes it."""
+    build = ToolMessages(NOMINAL, "s1", "tool0", "tool")
+    message = build.frame(KnownTool(T), revision, 0, ToolFrame.ACCEPTED, 0)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
 
 
 def joints(q: Any, **fields: Any) -> JointState:

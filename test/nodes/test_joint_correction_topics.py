@@ -237,6 +237,21 @@ def test_an_old_model_blends_out_and_the_status_says_so(graph: Any) -> None:
     assert list(line.settle().position) == HOME.tolist()
 
 
+def test_what_exceeds_a_bound_is_clamped_and_counted(graph: Any) -> None:
+    line = Line(graph, enable_on_start=True, policy="clamp", thermal_tcp_mm=0.1)
+    actual = drifted()  # taken over before it is known where the robot is: no place is too far
+    line.take(model_message(actual), line.to_model, "kinematic_model")
+    drift = distance(actual, HOME)
+    assert drift > 1.2e-4
+    corrected = distance(actual, line.settle().position)
+    # the correction made is the bound, up to the curvature of a shift of 0.1 mm
+    assert drift - corrected == pytest.approx(1e-4, rel=1e-2)
+    told = line.told(clamped_reasons=["the arm's correction at the tool exceeds its bound"])
+    assert told.clamped[0] > 0
+    assert list(told.refused) == []
+    assert "clamped, " in " ".join(line.node._full_health().values)
+
+
 def test_a_stop_goes_out_when_nothing_else_does(graph: Any) -> None:
     line = Line(graph, enable_on_start=True)
     other = graph.probe.create_publisher(JointTrajectory, "joint_trajectory", 10)
