@@ -40,11 +40,13 @@ LONGEST_STEP_S = 0.02
 PARAMETERS = {
     "stream_gap_s": 2.0,
     "blend_deg_s": 0.05,
+    "start_deg": 0.02,
     "thermal_tcp_mm": 20.0,
     "thermal_tcp_deg": 2.0,
     "thermal_joint_deg": 3.0,
 }
 BLEND_RAD_S = np.radians(PARAMETERS["blend_deg_s"])
+START_RAD = np.radians(PARAMETERS["start_deg"])
 THERMAL_RAD = np.radians(PARAMETERS["thermal_joint_deg"])
 ACTUAL = drifted(times=10.0)
 FULL = JointCorrection.between(NOMINAL, ACTUAL)
@@ -54,11 +56,15 @@ CURVED = 1e-6
 
 @dataclass
 class Step:
-    """Taught and commanded joints, and the time that the blend had since the step before."""
+    """Taught and commanded joints, and the time that the blend had since the step before.
+
+    ``begins``: anew, where the robot stands within ``start_deg``.
+    """
 
     taught: np.ndarray
     out: np.ndarray
     blends_s: float
+    begins: bool
 
 
 class Log:
@@ -67,8 +73,8 @@ class Log:
     def __init__(self) -> None:
         self.steps: list[Step] = []
 
-    def add(self, taught: Any, out: Any, blends_s: float) -> None:
-        self.steps.append(Step(np.array(taught), np.array(out), blends_s))
+    def add(self, taught: Any, out: Any, blends_s: float, begins: bool = False) -> None:
+        self.steps.append(Step(np.array(taught), np.array(out), blends_s, begins))
 
     def check(self) -> None:
         """Check what came since the last time."""
@@ -79,7 +85,7 @@ class Log:
         for earlier, later in itertools.pairwise(self.steps):
             posture = np.abs(shift(later.taught) - shift(earlier.taught))
             change = np.abs((later.out - later.taught) - (earlier.out - earlier.taught))
-            allowed = BLEND_RAD_S * later.blends_s + posture + CURVED
+            allowed = BLEND_RAD_S * later.blends_s + START_RAD * later.begins + posture + CURVED
             assert np.all(change <= allowed), (change, allowed)
         del self.steps[:-1]
 
@@ -272,7 +278,7 @@ class Attacked(Line):
         """A target went out, and the robot there; ``before`` it the clock showed this."""
         self.taught[index], self.at[index] = taught, out
         pause = min(time.monotonic() - self.since_s, self.longest_s)
-        self.log.add(self.taught, self.at, pause)
+        self.log.add(self.taught, self.at, pause, self.longest_s == np.inf)
         self.since_s, self.longest_s = before, LONGEST_STEP_S
 
     def follow(self, path: JointTrajectory, taught: JointTrajectory, before: float) -> None:

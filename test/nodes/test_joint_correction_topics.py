@@ -19,7 +19,7 @@ from joint_correction_live import (
     tool_message,
     trajectory,
 )
-from robocal_msgs.msg import CorrectionStatus, JointOffset, ToolFrame
+from robocal_msgs.msg import CorrectionStatus, JointOffset, KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 from trajectory_msgs.msg import JointTrajectory
@@ -49,6 +49,40 @@ def test_joint_commands_reach_the_taught_pose(graph: Any) -> None:
     for bad in ([*HOME[:5], np.nan], HOME[:5], []):
         line.refused(line.to_array, Float64MultiArray(data=array("d", bad)), "joint_commands")
     assert len(line.arrays) == i
+
+
+def test_wired_by_remapping_before_a_forward_command_controller(graph: Any) -> None:
+    order = NAMES[::-1]
+    corrected = "/forward_position_controller/commands"
+    process = graph.start(
+        "joint_correction_node",
+        {"serial": "s1", "enable_on_start": "true", "command_joints": f"[{','.join(order)}]"},
+        {
+            "kinematic_model": "/thermal_node/model",
+            "tool_frame": "/tcf_node/tool",
+            "joint_commands": "/servo/commands",
+            "~/joint_commands": corrected,
+        },
+    )
+    actual = drifted()
+    outputs = graph.collect(Float64MultiArray, corrected)
+    model = graph.publisher(KinematicModel, "/thermal_node/model", qos.LATCHED)
+    state = graph.publisher(JointState, "joint_states")
+    command = graph.publisher(Float64MultiArray, "/servo/commands")
+    model.publish(model_message(actual))
+
+    def reaches() -> bool:
+        at = outputs[-1].data[::-1] if outputs else HOME
+        state.publish(joints(at))
+        command.publish(Float64MultiArray(data=array("d", HOME[::-1])))
+        graph.spin_for(0.01)
+        return distance(actual, at) < 1e-9
+
+    graph.spin_until(reaches, "the taught pose is reached")
+    q = np.array([out.data for out in outputs])
+    assert np.abs(np.diff(q, axis=0)).max() <= BLEND_RAD_S * 0.02 + 1e-12
+    assert process.stop() == 0
+    assert "Traceback" not in process.output
 
 
 def test_joint_commands_in_an_order_of_their_own(graph: Any) -> None:
