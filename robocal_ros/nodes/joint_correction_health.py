@@ -52,7 +52,7 @@ def _warnings(status: CorrectionStatus) -> list[str]:
 
 def _figures(status: CorrectionStatus) -> dict[str, object]:
     counts = {"refused": status.refused, "clamped": status.clamped, "passed": status.passed}
-    return {
+    figures: dict[str, object] = {
         "correction": in_words(status),
         "reference": status.reference,
         "policy": status.policy.value,
@@ -65,4 +65,7 @@ def _figures(status: CorrectionStatus) -> dict[str, object]:
         "blend waits": status.waits,
         "blend held": status.held,
         "points corrected in part": status.reduced,
-    } | {f"{what}, {r.value}": n for what, found in counts.items() for r, n in found.items()}
+    }
+    for what, found in counts.items():
+        figures |= {f"{what}, {reason.value}": count for reason, count in found.items()}
+    return figures

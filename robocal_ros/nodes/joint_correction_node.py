@@ -145,19 +145,19 @@ class JointCorrectionNode(HouseNode):
         def receive(message: Any) -> None:
             stop = topic == TRAJECTORY and not message.points  # nothing may hold it up
             if guard.fault and not stop:
-                self._refuse(Reason.OWN_OUTPUT, guard.fault)
+                self._bar(Reason.OWN_OUTPUT, guard.fault)
             if topic == STATES:
                 messages.drop_unknown_efforts(message)
             if self._shadow and messages.is_finite(message):
                 self._outputs[topic].publish(message)
             rivals = senders.hear(topic, time.monotonic()) if senders and not stop else ""
             if rivals:
-                self._refuse(Reason.TWO_SOURCES, rivals)
+                self._bar(Reason.TWO_SOURCES, rivals)
             act(message)
 
         return receive
 
-    def _refuse(self, reason: Reason, detail: str) -> None:
+    def _bar(self, reason: Reason, detail: str) -> None:
         def refuse() -> None:
             raise RefusedError(reason, detail)
 
@@ -183,18 +183,24 @@ class JointCorrectionNode(HouseNode):
         self._put_out(STATES, message)
 
     def _on_path(self, message: Any) -> None:
-        now = time.monotonic()
-        if not message.points:
+        if message.points:
+            self._put_out(TRAJECTORY, self._corrected(message))
+            self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
+        else:
             self._put_out(TRAJECTORY, message)
-            self._session.trajectory(_STOP, now)
-            return
+            self._stop()
+
+    def _corrected(self, message: Any) -> Any:
+        """The message, with corrected points."""
         command = self._session.counted(lambda: trajectory_command(message))
         starts_in = (command.stamp_ns - self.now_ns()) * 1e-9 if command.stamp_ns else 0.0
-        corrected = self._session.trajectory(command, now, starts_in)
+        corrected = self._session.trajectory(command, time.monotonic(), starts_in)
         if corrected is not command:
             messages.fill_path(message, corrected)
-        self._put_out(TRAJECTORY, message)
-        self._tell_offset(JointOffset.TRAJECTORY, now)
+        return message
+
+    def _stop(self) -> None:
+        self._session.trajectory(_STOP, time.monotonic())
 
     def _put_out(self, topic: str, message: Any) -> None:
         if not self._shadow:

@@ -48,11 +48,6 @@ SETTINGS = (
         "from base to flange",
     ),
     Setting(
-        "follow_joint_trajectory",
-        "",
-        "The controller's action that corrected goals are sent to; empty: no such goals are taken",
-    ),
-    Setting(
         "shadow",
         False,
         "Compute everything and change nothing: outputs go out as the inputs came in",

@@ -15,8 +15,10 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.nodes.tool_messages import ToolMessages
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = load_robot("kr150_r3100")
@@ -25,10 +27,10 @@ HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
 NODE = "/joint_correction_node"
 
 
-def drifted() -> SerialArm:
+def drifted(times: float = 1.0) -> SerialArm:
     rng = np.random.default_rng(0)
     chosen = NOMINAL.parameters
-    size = np.where(chosen.is_length, 1e-4, 5e-5)
+    size = times * np.where(chosen.is_length, 1e-4, 5e-5)
     return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
 
 
@@ -44,17 +46,12 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
 
 
 def tool_message(T: np.ndarray, revision: int = 1, **changes: Any) -> ToolFrame:
-    fields = {
-        "header": Header(frame_id="tool0"),
-        "child_frame_id": "tool",
-        "robot": NOMINAL.name,
-        "serial": "s1",
-        "model_hash": NOMINAL.model_hash,
-        "revision": revision,
-        "tool": conversions.transform_message(T),
-        "state": ToolFrame.ACCEPTED,
-    }
-    return ToolFrame(**(fields | changes))
+    """As tcf_node makes it."""
+    build = ToolMessages(NOMINAL, "s1", "tool0", "tool")
+    message = build.frame(KnownTool(T), revision, 0, ToolFrame.ACCEPTED, 0)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
 
 
 def joints(q: Any, **fields: Any) -> JointState:
@@ -172,6 +169,7 @@ class Line:
         for _ in range(3000):
             out = self.target()
             if self.node._session.status().settled:
+                self.stand()
                 return out
         pytest.fail("the blend does not end")
 

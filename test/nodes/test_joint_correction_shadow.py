@@ -80,12 +80,13 @@ def test_it_tells_what_it_would_do(shadow: Line) -> None:
 
 
 def test_what_would_be_refused_goes_out_and_is_counted(shadow: Line) -> None:
-    """Without joint states nothing may begin, and this planner's joint is not the arm's."""
-    for count, message in enumerate((joints(HOME), JointState(name=["x"], position=[0.5])), 1):
+    """A joint that is not the arm's, and a command that is marked as corrected already."""
+    marked = joints(HOME, header=Header(frame_id=CORRECTED))
+    for count, message in enumerate((marked, JointState(name=["x"], position=[0.5])), 1):
         shadow.refused(shadow.to_target, message, "joint_targets")
         assert shadow.wait(shadow.targets, count) == message
     told = shadow.told(
-        shadow=True, refused_reasons=["joint states are missing or too old", "a joint is unknown"]
+        shadow=True, refused_reasons=["comes from a joint correction already", "a joint is unknown"]
     )
     assert list(told.refused) == [1, 1]
 

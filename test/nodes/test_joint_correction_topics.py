@@ -19,7 +19,7 @@ from joint_correction_live import (
     tool_message,
     trajectory,
 )
-from robocal_msgs.msg import CorrectionStatus, JointOffset, ToolFrame
+from robocal_msgs.msg import CorrectionStatus, JointOffset, KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
 from trajectory_msgs.msg import JointTrajectory
@@ -49,6 +49,40 @@ def test_joint_commands_reach_the_taught_pose(graph: Any) -> None:
     for bad in ([*HOME[:5], np.nan], HOME[:5], []):
         line.refused(line.to_array, Float64MultiArray(data=array("d", bad)), "joint_commands")
     assert len(line.arrays) == i
+
+
+def test_wired_by_remapping_before_a_forward_command_controller(graph: Any) -> None:
+    order = NAMES[::-1]
+    corrected = "/forward_position_controller/commands"
+    process = graph.start(
+        "joint_correction_node",
+        {"serial": "s1", "enable_on_start": "true", "command_joints": f"[{','.join(order)}]"},
+        {
+            "kinematic_model": "/thermal_node/model",
+            "tool_frame": "/tcf_node/tool",
+            "joint_commands": "/servo/commands",
+            "~/joint_commands": corrected,
+        },
+    )
+    actual = drifted()
+    outputs = graph.collect(Float64MultiArray, corrected)
+    model = graph.publisher(KinematicModel, "/thermal_node/model", qos.LATCHED)
+    state = graph.publisher(JointState, "joint_states")
+    command = graph.publisher(Float64MultiArray, "/servo/commands")
+    model.publish(model_message(actual))
+
+    def reaches() -> bool:
+        at = outputs[-1].data[::-1] if outputs else HOME
+        state.publish(joints(at))
+        command.publish(Float64MultiArray(data=array("d", HOME[::-1])))
+        graph.spin_for(0.01)
+        return distance(actual, at) < 1e-9
+
+    graph.spin_until(reaches, "the taught pose is reached")
+    q = np.array([out.data for out in outputs])
+    assert np.abs(np.diff(q, axis=0)).max() <= BLEND_RAD_S * 0.02 + 1e-12
+    assert process.stop() == 0
+    assert "Traceback" not in process.output
 
 
 def test_joint_commands_in_an_order_of_their_own(graph: Any) -> None:
@@ -235,6 +269,21 @@ def test_an_old_model_blends_out_and_the_status_says_so(graph: Any) -> None:
 
     graph.spin_until(stale, "the model is stale")
     assert list(line.settle().position) == HOME.tolist()
+
+
+def test_what_exceeds_a_bound_is_clamped_and_counted(graph: Any) -> None:
+    line = Line(graph, enable_on_start=True, policy="clamp", thermal_tcp_mm=0.1)
+    actual = drifted()  # taken over before it is known where the robot is: no place is too far
+    line.take(model_message(actual), line.to_model, "kinematic_model")
+    drift = distance(actual, HOME)
+    assert drift > 1.2e-4
+    corrected = distance(actual, line.settle().position)
+    # the correction made is the bound, up to the curvature of a shift of 0.1 mm
+    assert drift - corrected == pytest.approx(1e-4, rel=1e-2)
+    told = line.told(clamped_reasons=["the arm's correction at the tool exceeds its bound"])
+    assert told.clamped[0] > 0
+    assert list(told.refused) == []
+    assert "clamped, " in " ".join(line.node._full_health().values)
 
 
 def test_a_stop_goes_out_when_nothing_else_does(graph: Any) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
+from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction import (
@@ -90,10 +91,10 @@ class Robot:
         self.at = self.session.target(JointCommand(NAMES, np.array(q), **fields), self.now).position
         return self.at
 
-    def settle(self) -> np.ndarray:
-        out = self.stream()
+    def settle(self, q: np.ndarray = HOME) -> np.ndarray:
+        out = self.stream(q)
         for _ in range(5000):
-            out = self.stream()
+            out = self.stream(q)
             if self.session.status().settled:
                 return out
         pytest.fail("the blend does not end")
@@ -131,3 +132,15 @@ def refused(reason: Reason, act: Any, *arguments: Any, **fields: Any) -> str:
 def still(q: np.ndarray = HOME, first_s: float = 0.0, seconds: float = 20.0) -> TrajectoryCommand:
     times = np.linspace(first_s, first_s + seconds, 41)
     return TrajectoryCommand(NAMES, np.tile(q, (41, 1)), times)
+
+
+def good_here_only() -> tuple[SerialArm, np.ndarray]:
+    """A drift that is within the bounds at home, and a posture where it is not."""
+    far = HOME + np.array([1.0, 0.6, -0.8, 1.0, 0.6, 1.0])
+    bounds = CorrectionConfig().thermal
+    for seed in range(400):
+        arm = drifted(6.0, seed)
+        here, there = (JointCorrection.between(NOMINAL, arm).correct(q) for q in (HOME, far))
+        if bounds.hold(here).all() and there.tcp_shift_m > 1.05e-3:
+            return arm, far
+    pytest.fail("no such drift")

@@ -19,6 +19,7 @@ from correction_robot import (
     bent_tool,
     distance,
     drifted,
+    good_here_only,
     offer,
     pose,
     refused,
@@ -29,7 +30,6 @@ from hypothesis import strategies as st
 
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction import (
     CorrectionSession,
@@ -924,18 +924,6 @@ def test_revisions_only_grow(warm: Robot) -> None:
     warm.session.offer_model(offer(drifted(0.5), 3))
     refused(Reason.OLD_REVISION, warm.session.offer_model, offer(drifted(), 2))
     assert warm.session.status().revision == 3
-
-
-def good_here_only() -> tuple[SerialArm, np.ndarray]:
-    """A drift that is within the bounds at home, and a posture where it is not."""
-    far = HOME + np.array([1.0, 0.6, -0.8, 1.0, 0.6, 1.0])
-    bounds = CorrectionConfig().thermal
-    for seed in range(400):
-        arm = drifted(6.0, seed)
-        here, there = (JointCorrection.between(NOMINAL, arm).correct(q) for q in (HOME, far))
-        if bounds.hold(here).all() and there.tcp_shift_m > 1.05e-3:
-            return arm, far
-    pytest.fail("no such drift")
 
 
 def test_a_model_that_is_too_large_elsewhere_is_announced(robot: Robot) -> None:

@@ -9,7 +9,6 @@ from correction_robot import (
     HOME,
     NAMES,
     NOMINAL,
-    NOT_STRAIGHT,
     RATE,
     Robot,
     bent_tool,
@@ -120,7 +119,8 @@ class Cell:
             return
         assert np.array_equal(out.time_from_start_s, t)
         added = out.position - path.position
-        assert np.abs(added[0] - shift).max() <= NOT_STRAIGHT
+        # the robot may have stopped by itself: it begins with a correction within the tolerance
+        assert np.abs(added[0] - shift).max() <= NEAR
         motion = np.abs(np.diff(path.position, axis=0)).max(axis=1)
         steps = np.abs(np.diff(added, axis=0)).max(axis=1)
         assert np.all(steps <= RATE * np.diff(t) + BY_MOTION * motion + EXACT)

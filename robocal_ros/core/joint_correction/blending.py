@@ -16,7 +16,9 @@ Array = NDArray[np.float64]
 
 # A controller's quintic between two points moves at most this much faster than their mean rate.
 SPLINE_PEAK = 1.875
-MOST_TRIES = 6
+# What a step of the blend is multiplied with at least, try by try, while it is too long: the
+# first is right where the correction changes evenly with s, else it is halved.
+SHRINK = (1.0, *(0.5,) * 11)
 UNEVEN = 1.02
 ROUNDING = 1e-12
 
@@ -71,14 +73,15 @@ def step_towards(
     allowed = rates * dt_s
     here = stage.correct(q, np.array([begin]))
     ds = 1.0 - begin
-    for _ in range(MOST_TRIES):
+    for shrink in SHRINK:
         s = begin + ds if ds < 1.0 - begin else 1.0
         there = stage.correct(q, np.array([s]))
         change = np.abs(there.q - here.q)[0]
         if np.all(change <= allowed):
             return s, there
         with np.errstate(divide="ignore"):
-            ds *= 0.98 * float(np.min(np.where(change > 0.0, allowed / change, 1.0)))
+            least = float(np.min(np.where(change > 0.0, allowed / change, 1.0)))
+        ds *= min(shrink, 0.98 * least)
     return begin, here
 
 
@@ -100,14 +103,14 @@ def blend_along(
     dt = np.diff(time, prepend=max(elapsed_s, 0.0))
     with np.errstate(invalid="ignore"):
         ds = np.where(dt > 0.0, dt * np.minimum(slowest, before), 0.0)
-    for _ in range(MOST_TRIES):
+    for shrink in SHRINK:
         s = np.minimum(np.cumsum(ds), 1.0)
         change = stage.correct(q, s).q - stage.correct(q, np.append(0.0, s[:-1])).q
         allowed = np.maximum(rates * dt[:, None] / SPLINE_PEAK, ROUNDING)
         excess = float(np.max(np.abs(change) / allowed))
         if excess <= UNEVEN:
             return np.asarray(s)
-        ds = ds / excess
+        ds = ds * min(shrink, 1.0 / excess)
     return np.zeros(m)
 
 

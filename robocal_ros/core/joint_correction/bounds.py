@@ -72,6 +72,7 @@ class CorrectionConfig:
     policy : what is done with a command whose correction would exceed a bound or a limit.
     model_age_s : a model with an older stamp is not corrected with; 0: any age.
     velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none; None: no joint has one.
+    free_axis : the tool may turn about its z.
     shadow : commands and readings pass as they came; the correction is only shown.
     """
 
@@ -93,6 +94,7 @@ class CorrectionConfig:
     policy: Policy = Policy.REFUSE
     model_age_s: float = 0.0
     velocity_limits: Array | None = field(default=None, compare=False)
+    free_axis: bool = False
     shadow: bool = False
 
     def blend_rates(self, arm: SerialArm) -> Array:

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 FADES_WITHIN = 3.0
 TINY = 1e-300
+EXACT = 1e-13  # rad, m
+MOST_STEPS = 60
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class ClampedCorrection(StagedCorrection):
         self, reference: Array, start: Array, end: Array, arm: SerialArm, config: CorrectionConfig
     ) -> None:
         thermal, tool = config.thermal.of_joints(arm), config.tool.of_joints(arm)
-        super().__init__(reference, start, end, FADES_FROM * thermal, tool)
+        super().__init__(reference, start, end, FADES_FROM * thermal, tool, **_freedom(config))
         self._thermal, self._joint_bounds = config.thermal, (thermal, tool)
         self._lower, self._upper = arm.lower, arm.upper
 
@@ -68,6 +70,27 @@ class ClampedCorrection(StagedCorrection):
         made = np.where((kept == 1.0)[:, None], full.q, part)
         reason = worst if np.any(kept < 1.0) else None
         return ClampedResult(made, full.arm, full.tool, kept, reason)
+
+    def uncorrect(self, corrected: Array, s: Array) -> Array:
+        """Taught joints (m, n) of corrected ones: the inverse of `correct`.
+
+        Where a bound holds or a singularity is near, by plain steps until it is exact or as near
+        as it gets: the inverse of the whole correction would lead astray.
+        """
+        made = self.correct(corrected, s)
+        if np.all(made.whole):
+            return super().uncorrect(corrected, s)
+        q, answer, best = corrected, corrected, np.full(len(corrected), np.inf)
+        for _ in range(MOST_STEPS):
+            miss = corrected - made.q
+            size = np.max(np.abs(miss), axis=1)
+            answer = np.where((size < best)[:, None], q, answer)
+            best = np.minimum(best, size)
+            if np.all(best < EXACT):
+                break
+            q = q + miss
+            made = self.correct(q, s)
+        return answer
 
     def _shares(self, q: Array, full: StagedResult) -> dict[Reason, Array]:
         """Largest share (m,) of the shift by each bound; equation 1."""
@@ -99,4 +122,9 @@ def correction_between(
         end,
         FADES_FROM * config.thermal.of_joints(arm),
         config.tool.of_joints(arm),
+        **_freedom(config),
     )
+
+
+def _freedom(config: CorrectionConfig) -> dict[str, bool]:
+    return {"free_axis": True} if config.free_axis else {}
