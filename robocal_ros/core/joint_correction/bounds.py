@@ -149,13 +149,14 @@ def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialAr
     """
     drift = result.arm
     bound = config.thermal
-    _require(
-        bound.hold(drift),
-        Reason.TCP_BOUND,
-        f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
-        f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "
-        f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
-    )
+    fine = bound.hold(drift)
+    if not np.all(fine):
+        detail = (
+            f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
+            f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "
+            f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg"
+        )
+        _require(fine, Reason.TCP_BOUND, detail)
     _require_joints(drift.joint_shift, bound.of_joints(arm), arm)
     if result.tool is not None:
         detail = "a singularity is too near to make up for the tool's change"
@@ -172,10 +173,10 @@ def require_solved(result: StagedResult) -> None:
 
 
 def require_limits(q: Array, arm: SerialArm) -> None:
-    """Refuse joints (m, n) beyond the arm's limits."""
-    outside = (q < arm.lower - ROUNDING) | (q > arm.upper + ROUNDING)
-    if np.any(outside):
-        point, joint = np.argwhere(outside)[0]
+    """Refuse joints (m, n) beyond the arm's limits, and what is no number."""
+    inside = (q >= arm.lower - ROUNDING) & (q <= arm.upper + ROUNDING)
+    if not np.all(inside):
+        point, joint = np.argwhere(~inside)[0]
         raise RefusedError(
             Reason.JOINT_LIMIT,
             f"{arm.joint_names[joint]} would be at {q[point, joint]:.6f}, allowed "
@@ -185,9 +186,9 @@ def require_limits(q: Array, arm: SerialArm) -> None:
 
 def require_speeds(velocity: Array, limits: Array, arm: SerialArm) -> None:
     """Refuse velocities (m, n) beyond their limits (n,), rad/s (prismatic: m/s)."""
-    over = np.abs(velocity) > limits * (1.0 + ROUNDING)
-    if np.any(over):
-        point, joint = np.argwhere(over)[0]
+    within = np.abs(velocity) <= limits * (1.0 + ROUNDING)
+    if not np.all(within):
+        point, joint = np.argwhere(~within)[0]
         raise RefusedError(
             Reason.VELOCITY_LIMIT,
             f"{arm.joint_names[joint]} would move at {velocity[point, joint]:.6f}, allowed "

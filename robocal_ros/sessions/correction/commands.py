@@ -73,9 +73,12 @@ class Commands:
         q, index = self._joints.complete(command.names, command.position[None], now_s)
         speeds = None if command.velocity is None else command.velocity[None]
         require_finite(command.names, speeds)
+        # two messages may come at once after a delay: each has the stream's own period
+        period = self._stream.period_s or self._config.longest_step_s
+        dt_s = np.array([max(now_s - self._out_s, period)])
+        motion = self._motion(q, index, dt_s, speeds)
         corrected = self._or_as_it_came(
-            command,
-            lambda: self._correct_target(command, self._motion(q, index, speeds), index, now_s),
+            command, lambda: self._correct_target(command, motion, index, now_s)
         )
         self._stream.note(now_s)
         self.goal = q[0]
@@ -93,9 +96,6 @@ class Commands:
     ) -> JointCommand:
         last = self._stream.last_s
         pause = 0.0 if last is None else now_s - last
-        # two messages may come at once after a delay: each has the stream's own period
-        period = self._stream.period_s or self._config.longest_step_s
-        motion = replace(motion, dt_s=np.array([max(now_s - self._out_s, period)]))
         if self._starts.must_start(now_s) and not self._stream.goes_on(now_s):
             self._starts.start_at(motion.q, self._joints.where(now_s), now_s)
             pause = 0.0
@@ -108,16 +108,21 @@ class Commands:
         return replace(command, position=position, velocity=velocity, mark=CORRECTED)
 
     def _motion(
-        self, q: Array, index: Index, velocity: Array | None, acceleration: Array | None = None
+        self,
+        q: Array,
+        index: Index,
+        dt_s: Array,
+        velocity: Array | None,
+        acceleration: Array | None = None,
     ) -> Motion:
-        """A command with all joints, of which nothing else is known yet."""
-        qd, qdd = (
-            None if x is None else self._joints.spread(x, index) for x in (velocity, acceleration)
-        )
-        before = np.full(self._joints.count, np.nan)
-        before[index] = self._out[index]
-        whole = len(index) == self._joints.count
-        return Motion(q, qd, qdd, whole, before, np.full(len(q), np.inf))
+        """A command with all joints, and the target before it."""
+        qd = None if velocity is None else self._joints.spread(velocity, index)
+        qdd = None if acceleration is None else self._joints.spread(acceleration, index)
+        whole, before = len(index) == self._joints.count, self._out
+        if not whole:
+            before = np.full(self._joints.count, np.nan)
+            before[index] = self._out[index]
+        return Motion(q, qd, qdd, whole, before, dt_s)
 
     def _or_as_it_came(self, command: Command, correct: Callable[[], Command]) -> Command:
         """Correct a command; in shadow mode that is only tried, and the command passes."""
@@ -141,8 +146,8 @@ class Commands:
         q, index = self._joints.complete(command.names, command.position, now_s)
         require_finite(command.names, command.velocity)
         require_finite(command.names, command.acceleration)
-        motion = self._motion(q, index, command.velocity, command.acceleration)
-        motion.dt_s[1:] = np.diff(times)
+        dt_s = np.append(np.inf, np.diff(times))
+        motion = self._motion(q, index, dt_s, command.velocity, command.acceleration)
         corrected = self._or_as_it_came(
             command, lambda: self._correct_path(command, motion, index, now_s, starts_in_s)
         )

@@ -52,6 +52,7 @@ class JointBook:
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), MOST_TURNS)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
+        self._doubtful = np.minimum(self._turns, self._tenfold)
         self.measured = np.full(arm.n, np.nan)
         self.taught = np.full(arm.n, np.nan)
 
@@ -108,11 +109,13 @@ class JointBook:
     def _require_radians(self, index: Index, position: Array) -> None:
         """Refuse positions (m, k) that can only be degrees, or millimetres."""
         size = np.abs(position)
+        if not np.any(size > self._doubtful[index]):
+            return
         if np.any(size > self._turns[index]):
             point, column = np.argwhere(size > self._turns[index])[0]
             detail = f"{self._names[index[column]]} at {position[point, column]:g} rad"
             raise RefusedError(Reason.DEGREES, detail)
-        if len(index) and np.any(np.all(size > self._tenfold[index], axis=1)):
+        if np.any(np.all(size > self._tenfold[index], axis=1)):
             raise RefusedError(Reason.DEGREES, "all joints are beyond ten times their limits")
 
     def _index(self, names: tuple[str, ...]) -> Index:

@@ -144,14 +144,23 @@ class CorrectionSession:
         if len(command) == 0:
             self._commands.stop(now_s)
             return command
-        before, waiting = self._gate.tools.in_use, self._gate.tools.waiting
-        self._adopt_tool()
-        try:
-            return self._guard.counted(
+        return self._guard.counted(
+            lambda: self._with_waiting_tool(
                 lambda: self._commands.trajectory(command, now_s, starts_in_s)
             )
+        )
+
+    def _with_waiting_tool(self, act: Callable[[], Answer]) -> Answer:
+        """Begin something with the tool that waits, if there is one; a refusal lets it wait on."""
+        tools = self._gate.tools
+        before, waiting = tools.in_use, tools.waiting
+        if waiting is None:
+            return act()
+        self._adopt_tool()
+        try:
+            return act()
         except RefusedError:
-            self._gate.tools.in_use, self._gate.tools.waiting = before, waiting
+            tools.in_use, tools.waiting = before, waiting
             self._want()
             raise
 
