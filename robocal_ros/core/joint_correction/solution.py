@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel
+from robocal_ros.core.joint_correction import equations
 from robocal_ros.core.joint_correction import kernels as k
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
@@ -32,7 +33,7 @@ REPORT = 7
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    return 18 * (n + 2) + 15 * n + 96 + 6 + 6 * n + n * n + 3 * max(n, 6)
+    return 18 * (n + 2) + 15 * n + 96 + 6 + 6 * n + max(n, 6) ** 2 + 4 * max(n, 6)
 
 
 @kernel
@@ -67,29 +68,21 @@ def _aim(
 
 @kernel
 def _residual_at(
-    q: Array, x: Array, links: Array, ends: Array, frames: Array, out: Array, e: Array
+    q: Array, x: Array, links: Array, ends: Array, free: bool, frames: Array, out: Array, e: Array
 ) -> float:
     """Residual of the pose at q + x, which goes to ``out``; ``ends`` as in `_newton`."""
     for i in range(q.shape[0]):
         out[i] = q[i] + x[i]
     walk(out[: q.shape[0]], links, ends[0], frames, ends[3])
     newton.at_tool(ends[3], ends[1])
-    return newton.residual(ends[2], ends[3], e)
+    return equations.residual(ends[2], ends[3], ends[1], free, e)
 
 
 @kernel
 def _first_steps(
-    q: Array,
-    links: Array,
-    ends: Array,
-    largest: Array,
-    frames: Array,
-    J: Array,
-    L: Array,
-    steps: Array,
-    out: Array,
-    e: Array,
-) -> float:
+    q: Array, links: Array, ends: Array, largest: Array, free: bool, frames: Array, J: Array,
+    L: Array, steps: Array, out: Array, e: Array,
+) -> float:  # fmt: skip
     """Newton's step and a second one with the same matrix, shortened near a singularity.
 
     ``steps[0]`` receives the shift. The goal becomes the pose that lies the returned share of the
@@ -99,7 +92,7 @@ def _first_steps(
     """
     n = q.shape[0]
     x, step = steps[0, :n], steps[1, :n]
-    newton.solve(J, L, e, x, step)
+    equations.step(J, L, e, x, free, False, steps[3, :6], step)
     share = k.share(step, largest)
     for r in range(6):
         steps[2, r] = e[r]
@@ -109,8 +102,8 @@ def _first_steps(
         k.part_of_the_way(start, steps[2, :6], share, ends[2])
     for i in range(n):
         x[i] = share * step[i]
-    _residual_at(q, x, links, ends, frames, out, e)
-    newton.solve(J, L, e, x, step)
+    _residual_at(q, x, links, ends, free, frames, out, e)
+    equations.step(J, L, e, x, free, False, steps[3, :6], step)
     length, second, along = 1e-300, 0.0, 0.0
     for i in range(n):
         length += x[i] * x[i]
@@ -127,11 +120,15 @@ def _first_steps(
 
 
 @kernel
-def _add_step(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
-    """One step with a factored matrix."""
-    newton.solve(J, L, e, x, step)
+def _add_step(
+    J: Array, L: Array, e: Array, free: bool, shorten: bool, steps: Array, x: Array
+) -> float:
+    """One step with a factored matrix; returns its largest component."""
+    step = steps[1, : x.shape[0]]
+    equations.step(J, L, e, x, free, shorten, steps[3, :6], step)
     for i in range(x.shape[0]):
         x[i] += step[i]
+    return newton.largest_of(step)
 
 
 @kernel
@@ -147,45 +144,41 @@ def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bo
 
 @kernel
 def _newton(
-    q: Array,
-    links: Array,
-    ends: Array,
-    largest: Array,
-    frames: Array,
-    J: Array,
-    L: Array,
-    steps: Array,
-    out: Array,
-    e: Array,
-) -> None:
+    q: Array, links: Array, ends: Array, largest: Array, free: bool, frames: Array, J: Array,
+    L: Array, steps: Array, out: Array, e: Array,
+) -> None:  # fmt: skip
     """Newton's steps from ``q``.
 
     ``ends``: root, tool, goal, the pose at q (with its residual ``e``), and a spare pose.
     """
     n = q.shape[0]
-    x, step = steps[0, :n], steps[1, :n]
+    x, size = steps[0, :n], 0.0
     for i in range(n):
         x[i] = 0.0
+    # The shortest of many solutions is sought once, in the second iteration: so what is found does
+    # not hang on how many there are.
+    least = 2 if equations.wide(n, free) else 1
     share, iterations = 1.0, 0
     converged = newton.largest_of(e) <= SMALL_RESIDUAL
     while not converged and iterations < MOST_ITERATIONS:
         newton.columns(links, frames, ends[3], J)
-        if not newton.factor(J, L):
+        if not equations.factor(J, ends[3], ends[1], free, L):
             if iterations == 0:
                 share, converged = 0.0, True
             break
         if iterations == 0:
-            share = _first_steps(q, links, ends, largest, frames, J, L, steps, out, e)
+            share = _first_steps(q, links, ends, largest, free, frames, J, L, steps, out, e)
         else:
-            _add_step(J, L, e, x, step)
+            size = _add_step(J, L, e, free, iterations == 1, steps, x)
         iterations += 1
-        converged = _residual_at(q, x, links, ends, frames, out, e) <= SMALL_RESIDUAL
+        converged = _residual_at(q, x, links, ends, free, frames, out, e) <= SMALL_RESIDUAL
+        converged = converged and iterations >= least
         if iterations > 1 and not converged:
             # a second step with the same matrix: third order for little more
-            _add_step(J, L, e, x, step)
-            converged = _residual_at(q, x, links, ends, frames, out, e) <= SMALL_RESIDUAL
-        if converged or (iterations > 1 and newton.largest_of(step) <= SMALL_STEP):
-            _add_step(J, L, e, x, step)
+            size = _add_step(J, L, e, free, False, steps, x)
+            converged = _residual_at(q, x, links, ends, free, frames, out, e) <= SMALL_RESIDUAL
+        if converged or (iterations > 1 and size <= SMALL_STEP):
+            _add_step(J, L, e, free, False, steps, x)
             converged = True
     out[n + CONVERGED] = _take(q, x, largest, converged, out)
     out[n + ITERATIONS] = iterations
@@ -194,12 +187,12 @@ def _newton(
 
 @kernel
 def correct_point(
-    q: Array, models: Array, s: float, largest: Array, work: Array, out: Array
+    q: Array, models: Array, s: float, largest: Array, free: bool, work: Array, out: Array
 ) -> None:
     """Joints that put the actual tool where the reference tool is at ``q``.
 
-    ``largest`` (n,) bounds the joint shift. ``out`` (n + 7): joints, then the report. See
-    `joint_correction.JointCorrection`.
+    ``largest`` (n,) bounds the joint shift; ``free``: the turn about the tool's z is free.
+    ``out`` (n + 7): joints, then the report. See `joint_correction.JointCorrection`.
     """
     n = q.shape[0]
     reference, actual, frames, at = _models(work, n)
@@ -208,29 +201,30 @@ def correct_point(
     at += 96
     e, J = work[at : at + 6], work[at + 6 : at + 6 + 6 * n].reshape(n, 6)
     at += 6 + 6 * n
-    L, at = work[at : at + n * n].reshape(n, n), at + n * n
-    steps = work[at : at + 3 * max(n, 6)].reshape(3, max(n, 6))
+    size = 6 if equations.wide(n, free) else n
+    L, at = work[at : at + size * size].reshape(size, size), at + size * size
+    steps = work[at : at + 4 * max(n, 6)].reshape(4, max(n, 6))
     k.blend(models[0], models[1], s, reference)
     k.blend(models[2], models[3], s, actual)
     links = actual[:n]
     _aim(q, reference, actual, frames, ends[0], ends[1], ends[4], goal)
     walk(q, links, ends[0], frames, here)
     newton.at_tool(here, ends[1])
-    newton.residual(goal, here, e)
+    equations.residual(goal, here, ends[1], free, e)
     out[n + TCP_SHIFT], out[n + TCP_ROTATION] = newton.length(e, 0), newton.length(e, 3)
     newton.copy(goal, ends[2])
-    _newton(q, links, ends, largest, frames, J, L, steps, out, e)
+    _newton(q, links, ends, largest, free, frames, J, L, steps, out, e)
     if out[n + SHARE] < 1.0:
         walk(out[:n], links, ends[0], frames, here)
         newton.at_tool(here, ends[1])
-        newton.residual(goal, here, e)
+        equations.residual(goal, here, ends[1], free, e)
     out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = newton.length(e, 0), newton.length(e, 3)
 
 
 @kernel
 def correct_batch(
-    q: Array, models: Array, s: Array, largest: Array, work: Array, out: Array
+    q: Array, models: Array, s: Array, largest: Array, free: bool, work: Array, out: Array
 ) -> None:
     """`correct_point` for (m, n) joints at blends (m,)."""
     for i in range(q.shape[0]):
-        correct_point(q[i], models, s[i], largest, work, out[i])
+        correct_point(q[i], models, s[i], largest, free, work, out[i])

@@ -97,9 +97,8 @@ def columns(links: Array, frames: Array, T: Array, J: Array) -> None:
 
 @kernel
 def factor(J: Array, L: Array) -> bool:
-    """Cholesky factor of J^T J (with 1 / diagonal on the diagonal); False where singular."""
+    """Cholesky factor of J^T J, see `cholesky`; False where singular."""
     n = J.shape[0]
-    largest = 0.0
     for i in range(n):
         for j in range(i + 1):
             value = 0.0
@@ -108,6 +107,15 @@ def factor(J: Array, L: Array) -> bool:
             L[i, j] = value
         if n > 6:
             L[i, i] += REDUNDANT
+    return cholesky(L)
+
+
+@kernel
+def cholesky(L: Array) -> bool:
+    """Factor in place (lower half, 1 / diagonal on the diagonal); False where singular."""
+    n = L.shape[0]
+    largest = 0.0
+    for i in range(n):
         largest = max(largest, L[i, i])
     for i in range(n):
         for j in range(i):
@@ -132,14 +140,24 @@ def solve(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
         value = -REDUNDANT * x[i] if n > 6 else 0.0
         for r in range(6):
             value += J[i, r] * e[r]
+        step[i] = value
+    substitute(L, step)
+
+
+@kernel
+def substitute(L: Array, x: Array) -> None:
+    """Solve in place with the factor of `cholesky`."""
+    n = L.shape[0]
+    for i in range(n):
+        value = x[i]
         for k in range(i):
-            value -= L[i, k] * step[k]
-        step[i] = value * L[i, i]
+            value -= L[i, k] * x[k]
+        x[i] = value * L[i, i]
     for i in range(n - 1, -1, -1):
-        value = step[i]
+        value = x[i]
         for k in range(i + 1, n):
-            value -= L[k, i] * step[k]
-        step[i] = value * L[i, i]
+            value -= L[k, i] * x[k]
+        x[i] = value * L[i, i]
 
 
 @kernel
