@@ -7,19 +7,25 @@ there are more joints than equations, the solution is the one with the shortest 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel
+from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 
 Array = NDArray[np.float64]
 
 
-@kernel
+@lean
 def wide(n: int, free: bool) -> bool:
     """Whether there are more joints than equations."""
     return n > 5 if free else n > 6
 
 
-@kernel
+@lean
+def unknowns(n: int, free: bool) -> int:
+    """How many unknowns a step is found from: the joints, or the multipliers of the equations."""
+    return 6 if wide(n, free) else n
+
+
+@lean
 def _axis(T: Array, tool: Array) -> tuple[float, float, float]:
     """Axis z of the tool on a flange with the axes of ``T``."""
     x, y, z = tool[0, 2], tool[1, 2], tool[2, 2]
@@ -30,7 +36,7 @@ def _axis(T: Array, tool: Array) -> tuple[float, float, float]:
     )
 
 
-@kernel
+@lean
 def residual(goal: Array, T: Array, tool: Array, free: bool, e: Array) -> float:
     """Twist ``e`` from ``T`` to ``goal``; returns its largest component.
 
@@ -41,18 +47,15 @@ def residual(goal: Array, T: Array, tool: Array, free: bool, e: Array) -> float:
     z0, z1, z2 = _axis(T, tool)
     g0, g1, g2 = _axis(goal, tool)
     w0, w1, w2 = z1 * g2 - z2 * g1, z2 * g0 - z0 * g2, z0 * g1 - z1 * g0
-    square, cosine = w0 * w0 + w1 * w1 + w2 * w2, z0 * g0 + z1 * g1 + z2 * g2
-    factor = 1.0 + square / 6.0
-    if square > 1e-8 or cosine < 0.0:
-        sine = np.sqrt(square)
-        factor = np.arctan2(sine, cosine) / max(sine, 1e-150)
+    sine_square, cosine = w0 * w0 + w1 * w1 + w2 * w2, z0 * g0 + z1 * g1 + z2 * g2
+    factor = newton.angle_by_sine(sine_square, cosine)
     for r in range(3):
         e[r] = goal[r, 3] - T[r, 3]
     e[3], e[4], e[5] = factor * w0, factor * w1, factor * w2
     return newton.largest_of(e)
 
 
-@kernel
+@lean
 def factor(J: Array, T: Array, tool: Array, free: bool, L: Array) -> bool:
     """Factor for `step`; False where singular. ``J`` (n, 6) loses its part about a free axis."""
     n = J.shape[0]
@@ -74,10 +77,10 @@ def factor(J: Array, T: Array, tool: Array, free: bool, L: Array) -> bool:
             for i in range(n):
                 value += J[i, r] * J[i, c]
             L[r, c] = value
-    return newton.cholesky(L)
+    return newton.factor_in_place(L)
 
 
-@kernel
+@lean
 def step(
     J: Array, L: Array, e: Array, x: Array, free: bool, shorten: bool, spare: Array, out: Array
 ) -> None:
@@ -95,7 +98,7 @@ def step(
         spare[r] = e[r]
         for i in range(n):
             spare[r] += back * J[i, r] * x[i]
-    newton.substitute(L, spare)
+    newton.solve_in_place(L, spare)
     for i in range(n):
         out[i] = -back * x[i]
         for r in range(6):

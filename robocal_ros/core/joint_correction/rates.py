@@ -3,20 +3,21 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel
+from robocal_ros.core.compiled import kernel, lean
 from robocal_ros.core.joint_correction import kernels as k
 from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import walk
+from robocal_ros.core.kinematics.kernels import turns_size, walk
 
 Array = NDArray[np.float64]
 
 
-@kernel
+@lean
 def _twist(
     q: Array,
     qd: Array,
     qdd: Array,
     model: Array,
+    turns: Array,
     frames: Array,
     poses: Array,
     J: Array,
@@ -28,7 +29,7 @@ def _twist(
     root, tool, T = poses[0], poses[1], poses[2]
     newton.pose(model[n], root)
     newton.pose(model[n + 1], tool)
-    walk(q, model[:n], root, frames, T)
+    walk(q, model[:n], root, turns, frames, T)
     newton.at_tool(T, tool)
     newton.columns(model[:n], frames, T, J)
     newton.bias(model[:n], frames, T, qd, v, a)
@@ -54,20 +55,21 @@ def rates_batch(
     Meaningful where a point was corrected in full; NaN where the pose is singular.
     """
     n = q.shape[1]
-    model, frames, poses = np.empty((n + 2, 9)), np.empty((n, 5, 3)), np.empty((3, 4, 4))
+    model, frames, poses = np.empty((n + 2, 9)), np.empty((n, 2, 3)), np.empty((3, 4, 4))
+    turns = np.empty(turns_size(n))
     J, L, zero = np.empty((n, 6)), np.empty((n, n)), np.zeros(n)
     v, a, v2, a2 = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
     for i in range(q.shape[0]):
         k.blend(models[0], models[1], s[i], model)
-        _twist(q[i], qd[i], qdd[i], model, frames, poses, J, v, a)
+        _twist(q[i], qd[i], qdd[i], model, turns, frames, poses, J, v, a)
         k.blend(models[2], models[3], s[i], model)
-        _twist(corrected[i], zero, zero, model, frames, poses, J, v2, a2)
+        _twist(corrected[i], zero, zero, model, turns, frames, poses, J, v2, a2)
         if not newton.factor(J, L):
             for j in range(n):
                 velocity[i, j], acceleration[i, j] = np.nan, np.nan
             continue
         newton.solve(J, L, v, zero, velocity[i])
-        _twist(corrected[i], velocity[i], zero, model, frames, poses, J, v2, a2)
+        _twist(corrected[i], velocity[i], zero, model, turns, frames, poses, J, v2, a2)
         for r in range(6):
             a[r] -= a2[r]
         newton.solve(J, L, a, zero, acceleration[i])
