@@ -18,6 +18,8 @@ from robocal_ros.core.kinematics.kernels import turns_size, walk
 Array = NDArray[np.float64]
 
 MOST_ITERATIONS = 10
+# How often a step is repeated with the same matrix, from the second one on.
+REPEATS = 3
 # A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
 SMALL_RESIDUAL = 1e-12
 # A step below which the next one is under the rounding floor (convergence is quadratic).
@@ -210,12 +212,17 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
             size = _add_step(free, iterations == 1, room)
         iterations += 1
         converged = _moved(q, free, room, out) <= SMALL_RESIDUAL and iterations >= least
-        if iterations > 1 and not converged:
-            # a second step with the same matrix: third order for little more
+        repeats = 0
+        while iterations > 1 and repeats < REPEATS and not converged:
+            # more steps with the same matrix: each raises the order, for little
+            repeats += 1
             size = _add_step(free, False, room)
             converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
         if converged or (iterations > 1 and size <= SMALL_STEP):
             _add_step(free, False, room)
+            if repeats > 0:
+                _moved(q, free, room, out)
+                _add_step(free, False, room)
             converged = True
     out[n + CONVERGED] = _take(q, room.x, largest, converged, out)
     out[n + ITERATIONS] = iterations
