@@ -26,6 +26,7 @@ KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
     from bench import (
+        correction,
         files,
         hand_eye,
         hand_eye_camera,
@@ -53,6 +54,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "hand_eye_camera": hand_eye_camera.tables,
         "hand_eye_tracker": hand_eye_tracker.tables,
         "speed": speed.tables,
+        "correction": correction.tables,
         "startup": start,
         "files": lambda: [files.file_times()],
     }

@@ -7,6 +7,7 @@ runs that take turns.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +73,8 @@ def kinematics_table() -> Table:
     return table
 
 
-def _pinocchio(arm: SerialArm, q: Array) -> tuple[Callable[[], Array], Callable[[], Array]]:
-    """Loops over Pinocchio's model of the same parameters."""
+def pinocchio_model(arm: SerialArm) -> tuple[Any, int]:
+    """Pinocchio's model of the same parameters, and its frame of the tool."""
     import pinocchio as pin
 
     model, before = pin.Model(), arm.T_base_root
@@ -83,8 +84,16 @@ def _pinocchio(arm: SerialArm, q: Array) -> tuple[Callable[[], Array], Callable[
         joint = pin.JointModelRevoluteUnaligned(axis)
         model.addJoint(i, joint, pin.SE3(T[:3, :3], T[:3, 3]), name)
         before = link_transform(np.array([0.0, 0.0, *arm.mdh[i, 2:]]))
-    last = pin.SE3(before[:3, :3], before[:3, 3])
-    frame = model.addFrame(pin.Frame("flange", arm.n, last, pin.FrameType.OP_FRAME))
+    last = before @ arm.T_flange_tool
+    placement = pin.SE3(last[:3, :3], last[:3, 3])
+    return model, model.addFrame(pin.Frame("tool", arm.n, placement, pin.FrameType.OP_FRAME))
+
+
+def _pinocchio(arm: SerialArm, q: Array) -> tuple[Callable[[], Array], Callable[[], Array]]:
+    """Loops over Pinocchio's model."""
+    import pinocchio as pin
+
+    model, frame = pinocchio_model(arm)
     data = model.createData()
     poses, jacobians = np.empty((len(q), 4, 4)), np.empty((len(q), 6, arm.n))
 

@@ -26,13 +26,25 @@ def kernel(function: Function) -> Function:
     return _compiled(function, "never")
 
 
+def lean(function: Function) -> Function:
+    """Decorator: as `kernel`, for a small function that makes no array, only parts of given ones.
+
+    Its machine code goes into each caller's, and no references are counted in it: both would take
+    longer than its work.
+    """
+    return _compiled(function, "never", lean=True)
+
+
 def inlined(function: Function) -> Function:
     """Decorator: as `kernel`, but the body is put into each kernel that calls it."""
     return _compiled(function, "always")
 
 
-def _compiled(function: Function, inline: Literal["never", "always"]) -> Function:
-    compiler: Any = numba.njit(cache=True, nogil=True, error_model="numpy", inline=inline)
+def _compiled(
+    function: Function, inline: Literal["never", "always"], lean: bool = False
+) -> Function:
+    options: dict[str, Any] = {"inline": inline, "forceinline": lean, "_nrt": not lean}
+    compiler: Any = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
     made = compiler(function)
     if made is not function:  # as it is with NUMBA_DISABLE_JIT
         # Kept code is valid while this equals what stands beside it; numba puts the file's age.

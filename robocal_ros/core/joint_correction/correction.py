@@ -15,6 +15,10 @@ and (1) is solved exactly for the pose that lies this share of the way from the 
 the taught one. So the shift stays within about b, is continuous in q through the singularity
 (where it is zero), and the remaining error is (1 - share) times the uncorrected one: never more
 than without correction.
+
+A tool that may turn about its z (`free_axis`) leaves five equations: its origin and its axis. The
+turn is then the one that moves the joints least, and only where these five are singular is less
+corrected.
 """
 
 from collections.abc import Callable
@@ -68,7 +72,8 @@ class CorrectionResult:
     Attributes
     ----------
     q : (n,) or (m, n) corrected joints, rad (prismatic: m).
-    position_error_m, rotation_error_rad : error that remains at the tool.
+    position_error_m, rotation_error_rad : error that remains at the tool; with a free axis,
+        here and below, a rotation is that of the axis.
     iterations : Newton steps taken.
     converged : False where the point could not be solved; ``q`` then is the input.
     tcp_shift_m, tcp_rotation_rad : error at the tool without the correction.
@@ -96,10 +101,14 @@ class JointCorrection:
         of a blend (see `pack_model`, `between`).
     largest : largest shift of a joint, rad (prismatic: m), for all or (n,) for each: bounds what
         is done near a singularity, see equation 2.
+    free_axis : the tool may turn about its z; the turn is used to move the joints least.
     """
 
-    def __init__(self, models: Array, largest: ArrayLike = LARGEST_SHIFT) -> None:
+    def __init__(
+        self, models: Array, largest: ArrayLike = LARGEST_SHIFT, free_axis: bool = False
+    ) -> None:
         self.models = plain(models)
+        self.free_axis = free_axis
         self.n = self.models.shape[1] - 2
         if self.models.shape != (4, self.n + 2, 9):
             raise ValueError(f"models have shape {self.models.shape}, expected (4, n + 2, 9)")
@@ -110,13 +119,17 @@ class JointCorrection:
 
     @classmethod
     def between(
-        cls, reference: SerialArm, actual: SerialArm, largest: ArrayLike = LARGEST_SHIFT
+        cls,
+        reference: SerialArm,
+        actual: SerialArm,
+        largest: ArrayLike = LARGEST_SHIFT,
+        free_axis: bool = False,
     ) -> "JointCorrection":
         """Correction from one arm to another, each with its base and its ``T_flange_tool``."""
         if reference.n != actual.n or np.any(reference.prismatic != actual.prismatic):
             raise ValueError(f"{reference.name} and {actual.name} have different joints")
         first, second = pack_model(reference), pack_model(actual)
-        return cls(np.stack([first, first, second, second]), largest)
+        return cls(np.stack([first, first, second, second]), largest, free_axis)
 
     def correct(self, q: ArrayLike, s: ArrayLike = 1.0) -> CorrectionResult:
         """Correct joints (n,) or (m, n), at blend s (one, or one per point).
@@ -127,7 +140,9 @@ class JointCorrection:
         points = plain(joints.reshape(-1, self.n))
         out = np.empty((len(points), self.n + solution.REPORT))
         blends = plain(s, (len(points),))
-        solution.correct_batch(points, self.models, blends, self.largest, self._work, out)
+        solution.correct_batch(
+            points, self.models, blends, self.largest, self.free_axis, self._work, out
+        )
         lead = joints.shape[:-1]
         corrected, report = plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
         return CorrectionResult(
@@ -145,9 +160,11 @@ class JointCorrection:
     def inverse(self) -> "JointCorrection":
         """The correction with the models exchanged: from corrected to taught joints.
 
-        Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1.
+        Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1 and all six
+        equations hold; with a free axis it chooses another turn, which differs by the second
+        order of the shift: `staged.StagedCorrection.uncorrect` refines it.
         """
-        return JointCorrection(self.models[[2, 3, 0, 1]], self.largest)
+        return JointCorrection(self.models[[2, 3, 0, 1]], self.largest, self.free_axis)
 
 
 def path_rates(

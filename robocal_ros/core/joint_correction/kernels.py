@@ -8,13 +8,13 @@ them). Angles in rad, lengths in m, twists [v; w] in base axes at the tool.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel
+from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics.newton import copy, length
 
 Array = NDArray[np.float64]
 
 
-@kernel
+@lean
 def blend(a: Array, b: Array, s: float, out: Array) -> None:
     """Model between two packed ones: lengths and angles linear, rotations along the chord."""
     n = a.shape[0] - 2
@@ -46,7 +46,7 @@ def blend(a: Array, b: Array, s: float, out: Array) -> None:
         out[i, 7], out[i, 8] = 0.0, 0.0
 
 
-@kernel
+@lean
 def swap_tool(T: Array, old: Array, new: Array) -> None:
     """Turn the axes of a flange pose with tool ``old`` to those of the flange with tool ``new``."""
     for r in range(3):
@@ -59,7 +59,7 @@ def swap_tool(T: Array, old: Array, new: Array) -> None:
         T[r, 0], T[r, 1], T[r, 2] = x0, x1, x2
 
 
-@kernel
+@lean
 def part_of_the_way(T: Array, e: Array, share: float, goal: Array) -> None:
     """Pose ``goal``: ``T`` moved by a share of the twist ``e``."""
     turn = length(e, 3)
@@ -76,7 +76,7 @@ def part_of_the_way(T: Array, e: Array, share: float, goal: Array) -> None:
         goal[r, 3] = T[r, 3] + share * e[r]
 
 
-@kernel
+@lean
 def share(step: Array, largest: Array) -> float:
     """How much of the correction is made: all of it while the first step is within bounds.
 

@@ -4,17 +4,22 @@
 end of a blend. ``work`` is scratch of `work_size` numbers, so that a point allocates nothing.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel
+from robocal_ros.core.compiled import lean
+from robocal_ros.core.joint_correction import equations
 from robocal_ros.core.joint_correction import kernels as k
 from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import walk
+from robocal_ros.core.kinematics.kernels import turns_size, walk
 
 Array = NDArray[np.float64]
 
 MOST_ITERATIONS = 10
+# How often a step is repeated with the same matrix, from the second one on.
+REPEATS = 3
 # A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
 SMALL_RESIDUAL = 1e-12
 # A step below which the next one is under the rounding floor (convergence is quadratic).
@@ -30,87 +35,125 @@ POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, 
 REPORT = 7
 
 
+class Room(NamedTuple):
+    """Where a solution is worked out: parts of ``work``, made once for a batch.
+
+    Attributes
+    ----------
+    taught, actual : (n + 2, 9) blended models.
+    taught_links, links : (n, 9) their joints.
+    taught_root, taught_tool, root, tool : their (4, 4) ends, T_base_root and T_flange_tool.
+    goal, aim : (4, 4) where the tool must go, and the part of the way there that is gone. Such
+        poses have the axes of the flange, their origin is the tool's.
+    here, start : (4, 4) pose of the tool at the joints tried last, and at the given ones.
+    turns, frames : scratch of `walk`.
+    J, L : (n, 6) Jacobian, and the factor for its steps.
+    e, first, spare : (6,) residual to ``aim``; that at the given joints; scratch.
+    x, step : (n,) shift of the joints, and its last step.
+    """
+
+    taught: Array
+    actual: Array
+    taught_links: Array
+    links: Array
+    taught_root: Array
+    taught_tool: Array
+    root: Array
+    tool: Array
+    goal: Array
+    aim: Array
+    here: Array
+    start: Array
+    turns: Array
+    frames: Array
+    J: Array
+    L: Array
+    e: Array
+    first: Array
+    spare: Array
+    x: Array
+    step: Array
+
+
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    return 18 * (n + 2) + 15 * n + 96 + 6 + 6 * n + n * n + 3 * max(n, 6)
+    return 18 * (n + 2) + 8 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 18 + 2 * n
 
 
-@kernel
-def _models(work: Array, n: int) -> tuple[Array, Array, Array, int]:
-    """Places of the blended reference and actual model and of the joints' frames in ``work``."""
+@lean
+def _room(work: Array, n: int, free: bool) -> Room:
+    """Divide ``work``."""
     m = 9 * (n + 2)
-    reference, actual = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9)
-    return reference, actual, work[2 * m : 2 * m + 15 * n].reshape(n, 5, 3), 2 * m + 15 * n
+    taught, actual, at = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9), 2 * m
+    poses, at = work[at : at + 128].reshape(8, 4, 4), at + 128
+    turns, at = work[at : at + turns_size(n)], at + turns_size(n)
+    frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
+    J, at = work[at : at + 6 * n].reshape(n, 6), at + 6 * n
+    size = equations.unknowns(n, free)
+    L, at = work[at : at + size * size].reshape(size, size), at + size * size
+    twists, at = work[at : at + 18].reshape(3, 6), at + 18
+    return Room(
+        taught, actual, taught[:n], actual[:n], poses[0], poses[1], poses[2], poses[3], poses[4],
+        poses[5], poses[6], poses[7], turns, frames, J, L, twists[0], twists[1], twists[2],
+        work[at : at + n], work[at + n : at + 2 * n],
+    )  # fmt: skip
 
 
-@kernel
-def _aim(
-    q: Array,
-    reference: Array,
-    actual: Array,
-    frames: Array,
-    root: Array,
-    tool: Array,
-    spare: Array,
-    goal: Array,
-) -> None:
-    """Where the actual flange's axes and the tool's origin must go; ``root`` and ``tool`` too."""
+@lean
+def _settle(models: Array, s: float, room: Room) -> None:
+    """Models at blend s, and their ends."""
+    n = room.links.shape[0]
+    k.blend(models[0], models[1], s, room.taught)
+    k.blend(models[2], models[3], s, room.actual)
+    newton.pose(room.taught[n], room.taught_root)
+    newton.pose(room.taught[n + 1], room.taught_tool)
+    newton.pose(room.actual[n], room.root)
+    newton.pose(room.actual[n + 1], room.tool)
+
+
+@lean
+def _residual_at(q: Array, free: bool, room: Room) -> float:
+    """Residual of the pose at joints q."""
+    walk(q, room.links, room.root, room.turns, room.frames, room.here)
+    newton.at_tool(room.here, room.tool)
+    return equations.residual(room.aim, room.here, room.tool, free, room.e)
+
+
+@lean
+def _moved(q: Array, free: bool, room: Room, out: Array) -> float:
+    """Residual of the pose at q + x, which goes to ``out``."""
     n = q.shape[0]
-    newton.pose(reference[n], root)
-    walk(q, reference[:n], root, frames, goal)
-    newton.pose(reference[n + 1], spare)
-    newton.at_tool(goal, spare)
-    newton.pose(actual[n + 1], tool)
-    k.swap_tool(goal, spare, tool)
-    newton.pose(actual[n], root)
+    for i in range(n):
+        out[i] = q[i] + room.x[i]
+    return _residual_at(out[:n], free, room)
 
 
-@kernel
-def _residual_at(
-    q: Array, x: Array, links: Array, ends: Array, frames: Array, out: Array, e: Array
-) -> float:
-    """Residual of the pose at q + x, which goes to ``out``; ``ends`` as in `_newton`."""
-    for i in range(q.shape[0]):
-        out[i] = q[i] + x[i]
-    walk(out[: q.shape[0]], links, ends[0], frames, ends[3])
-    newton.at_tool(ends[3], ends[1])
-    return newton.residual(ends[2], ends[3], e)
+@lean
+def _next_step(free: bool, shorten: bool, room: Room) -> None:
+    equations.step(room.J, room.L, room.e, room.x, free, shorten, room.spare, room.step)
 
 
-@kernel
-def _first_steps(
-    q: Array,
-    links: Array,
-    ends: Array,
-    largest: Array,
-    frames: Array,
-    J: Array,
-    L: Array,
-    steps: Array,
-    out: Array,
-    e: Array,
-) -> float:
+@lean
+def _first_steps(q: Array, largest: Array, free: bool, room: Room, out: Array) -> float:
     """Newton's step and a second one with the same matrix, shortened near a singularity.
 
-    ``steps[0]`` receives the shift. The goal becomes the pose that lies the returned share of the
-    way. The second step tells how far the first may be trusted: towards the edge of the reach
-    (where sigma x + kappa x^2 / 2 = e has a solution while the second step is at most a quarter
-    of the first, in its direction), and where the arm bends too much for Newton's method.
+    The aim becomes the pose that lies the returned share of the way. The second step tells how
+    far the first may be trusted: towards the edge of the reach (where sigma x + kappa x^2 / 2 = e
+    has a solution while the second step is at most a quarter of the first, in its direction), and
+    where the arm bends too much for Newton's method.
     """
-    n = q.shape[0]
-    x, step = steps[0, :n], steps[1, :n]
-    newton.solve(J, L, e, x, step)
+    n, x, step = q.shape[0], room.x, room.step
+    _next_step(free, False, room)
     share = k.share(step, largest)
     for r in range(6):
-        steps[2, r] = e[r]
-    start = ends[4]
-    newton.copy(ends[3], start)
+        room.first[r] = room.e[r]
+    newton.copy(room.here, room.start)
     if share < 1.0:
-        k.part_of_the_way(start, steps[2, :6], share, ends[2])
+        k.part_of_the_way(room.start, room.first, share, room.aim)
     for i in range(n):
         x[i] = share * step[i]
-    _residual_at(q, x, links, ends, frames, out, e)
-    newton.solve(J, L, e, x, step)
+    _moved(q, free, room, out)
+    _next_step(free, False, room)
     length, second, along = 1e-300, 0.0, 0.0
     for i in range(n):
         length += x[i] * x[i]
@@ -120,21 +163,22 @@ def _first_steps(
     trust = min(trust, BESIDE * np.sqrt(length / max(second, 1e-300)))
     if trust < 1.0:
         share *= trust
-        k.part_of_the_way(start, steps[2, :6], share, ends[2])
+        k.part_of_the_way(room.start, room.first, share, room.aim)
     for i in range(n):
         x[i] = trust * x[i] + trust * trust * step[i]
     return share
 
 
-@kernel
-def _add_step(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
-    """One step with a factored matrix."""
-    newton.solve(J, L, e, x, step)
-    for i in range(x.shape[0]):
-        x[i] += step[i]
+@lean
+def _add_step(free: bool, shorten: bool, room: Room) -> float:
+    """One step with a factored matrix; returns its largest component."""
+    _next_step(free, shorten, room)
+    for i in range(room.x.shape[0]):
+        room.x[i] += room.step[i]
+    return newton.largest_of(room.step)
 
 
-@kernel
+@lean
 def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bool:
     """Joints ``q + x``; where that is no solution within reach, the point stays as it came."""
     n = q.shape[0]
@@ -145,92 +189,75 @@ def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bo
     return converged
 
 
-@kernel
-def _newton(
-    q: Array,
-    links: Array,
-    ends: Array,
-    largest: Array,
-    frames: Array,
-    J: Array,
-    L: Array,
-    steps: Array,
-    out: Array,
-    e: Array,
-) -> None:
-    """Newton's steps from ``q``.
-
-    ``ends``: root, tool, goal, the pose at q (with its residual ``e``), and a spare pose.
-    """
-    n = q.shape[0]
-    x, step = steps[0, :n], steps[1, :n]
+@lean
+def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
+    """Newton's steps from ``q``, whose pose is ``here`` and whose residual is ``e``."""
+    n, size = q.shape[0], 0.0
     for i in range(n):
-        x[i] = 0.0
+        room.x[i] = 0.0
+    # The shortest of many solutions is sought once, in the second iteration: so what is found does
+    # not hang on how many there are.
+    least = 2 if equations.wide(n, free) else 1
     share, iterations = 1.0, 0
-    converged = newton.largest_of(e) <= SMALL_RESIDUAL
+    converged = newton.largest_of(room.e) <= SMALL_RESIDUAL
     while not converged and iterations < MOST_ITERATIONS:
-        newton.columns(links, frames, ends[3], J)
-        if not newton.factor(J, L):
+        newton.columns(room.links, room.frames, room.here, room.J)
+        if not equations.factor(room.J, room.here, room.tool, free, room.L):
             if iterations == 0:
                 share, converged = 0.0, True
             break
         if iterations == 0:
-            share = _first_steps(q, links, ends, largest, frames, J, L, steps, out, e)
+            share = _first_steps(q, largest, free, room, out)
         else:
-            _add_step(J, L, e, x, step)
+            size = _add_step(free, iterations == 1, room)
         iterations += 1
-        converged = _residual_at(q, x, links, ends, frames, out, e) <= SMALL_RESIDUAL
-        if iterations > 1 and not converged:
-            # a second step with the same matrix: third order for little more
-            _add_step(J, L, e, x, step)
-            converged = _residual_at(q, x, links, ends, frames, out, e) <= SMALL_RESIDUAL
-        if converged or (iterations > 1 and newton.largest_of(step) <= SMALL_STEP):
-            _add_step(J, L, e, x, step)
+        converged = _moved(q, free, room, out) <= SMALL_RESIDUAL and iterations >= least
+        repeats = 0
+        while iterations > 1 and repeats < REPEATS and not converged:
+            # more steps with the same matrix: each raises the order, for little
+            repeats += 1
+            size = _add_step(free, False, room)
+            converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
+        if converged or (iterations > 1 and size <= SMALL_STEP):
+            _add_step(free, False, room)
+            if repeats > 0:
+                _moved(q, free, room, out)
+                _add_step(free, False, room)
             converged = True
-    out[n + CONVERGED] = _take(q, x, largest, converged, out)
+    out[n + CONVERGED] = _take(q, room.x, largest, converged, out)
     out[n + ITERATIONS] = iterations
     out[n + SHARE] = share if out[n + CONVERGED] else 0.0
 
 
-@kernel
-def correct_point(
-    q: Array, models: Array, s: float, largest: Array, work: Array, out: Array
-) -> None:
-    """Joints that put the actual tool where the reference tool is at ``q``.
-
-    ``largest`` (n,) bounds the joint shift. ``out`` (n + 7): joints, then the report. See
-    `joint_correction.JointCorrection`.
-    """
-    n = q.shape[0]
-    reference, actual, frames, at = _models(work, n)
-    ends = work[at : at + 96].reshape(6, 4, 4)
-    goal, here = ends[5], ends[3]
-    at += 96
-    e, J = work[at : at + 6], work[at + 6 : at + 6 + 6 * n].reshape(n, 6)
-    at += 6 + 6 * n
-    L, at = work[at : at + n * n].reshape(n, n), at + n * n
-    steps = work[at : at + 3 * max(n, 6)].reshape(3, max(n, 6))
-    k.blend(models[0], models[1], s, reference)
-    k.blend(models[2], models[3], s, actual)
-    links = actual[:n]
-    _aim(q, reference, actual, frames, ends[0], ends[1], ends[4], goal)
-    walk(q, links, ends[0], frames, here)
-    newton.at_tool(here, ends[1])
-    newton.residual(goal, here, e)
+@lean
+def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
+    """One point with settled models: ``out`` (n + 7), joints, then the report."""
+    n, e = q.shape[0], room.e
+    walk(q, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
+    newton.at_tool(room.goal, room.taught_tool)
+    k.swap_tool(room.goal, room.taught_tool, room.tool)
+    newton.copy(room.goal, room.aim)
+    _residual_at(q, free, room)
     out[n + TCP_SHIFT], out[n + TCP_ROTATION] = newton.length(e, 0), newton.length(e, 3)
-    newton.copy(goal, ends[2])
-    _newton(q, links, ends, largest, frames, J, L, steps, out, e)
+    _newton(q, largest, free, room, out)
     if out[n + SHARE] < 1.0:
-        walk(out[:n], links, ends[0], frames, here)
-        newton.at_tool(here, ends[1])
-        newton.residual(goal, here, e)
+        newton.copy(room.goal, room.aim)
+        _residual_at(out[:n], free, room)
     out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = newton.length(e, 0), newton.length(e, 3)
 
 
-@kernel
+@lean
 def correct_batch(
-    q: Array, models: Array, s: Array, largest: Array, work: Array, out: Array
+    q: Array, models: Array, s: Array, largest: Array, free: bool, work: Array, out: Array
 ) -> None:
-    """`correct_point` for (m, n) joints at blends (m,)."""
+    """Joints that put the actual tool where the reference tool is at ``q`` (m, n).
+
+    ``s`` (m,) blends; ``largest`` (n,) bounds the joint shift; ``free``: the turn about the
+    tool's z is free. ``out`` (m, n + 7): joints, then the report. See
+    `joint_correction.JointCorrection`.
+    """
+    room = _room(work, q.shape[1], free)
     for i in range(q.shape[0]):
-        correct_point(q[i], models, s[i], largest, work, out[i])
+        if i == 0 or s[i] != s[i - 1]:
+            _settle(models, s[i], room)
+        _correct(q[i], largest, free, room, out[i])

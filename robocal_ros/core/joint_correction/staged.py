@@ -24,7 +24,7 @@ from robocal_ros.core.kinematics import SerialArm
 Array = NDArray[np.float64]
 
 # The inverse near a singularity is refined until it is exact to this (rad, m), or so often.
-EXACT = 1e-12
+EXACT, ROUNDING = 1e-13, 1e-9
 MOST_REFINEMENTS = 30
 
 
@@ -57,23 +57,30 @@ class StagedCorrection:
     reference, start, end : packed models, see `pack_model`; blend s goes from start to end. The
         taught tool is the reference's.
     arm_largest, tool_largest : (n,) largest joint shift of each stage, rad (prismatic: m).
+    free_axis : the tool may turn about its z, in both stages.
     """
 
     def __init__(
-        self, reference: Array, start: Array, end: Array, arm_largest: Array, tool_largest: Array
+        self,
+        reference: Array,
+        start: Array,
+        end: Array,
+        arm_largest: Array,
+        tool_largest: Array,
+        free_axis: bool = False,
     ) -> None:
         taught = reference[-1]
         bare = [model.copy() for model in (start, end)]
         for model in bare:
             model[-1] = taught
         self.n = len(reference) - 2
-        self._arm = JointCorrection(np.stack([reference, reference, *bare]), arm_largest)
-        self._whole = JointCorrection(
-            np.stack([reference, reference, start, end]), arm_largest + tool_largest
-        )
+        self._arm = JointCorrection(np.stack([reference, reference, *bare]), arm_largest, free_axis)
+        self._models = np.stack([reference, reference, start, end])
+        # six joints and six equations: rates by the chain rule
+        self._analytic = self.n == 6 and not free_axis
         self._tool: JointCorrection | None = None
         if not (np.array_equal(start[-1], taught) and np.array_equal(end[-1], taught)):
-            self._tool = JointCorrection(np.stack([*bare, start, end]), tool_largest)
+            self._tool = JointCorrection(np.stack([*bare, start, end]), tool_largest, free_axis)
 
     def correct(self, q: Array, s: Array) -> StagedResult:
         """Correct joints (m, n) at blends (m,)."""
@@ -86,23 +93,29 @@ class StagedCorrection:
     def uncorrect(self, corrected: Array, s: Array) -> Array:
         """Taught joints (m, n) of corrected ones: the inverse of `correct`.
 
-        Exact where the whole correction is made; near a singularity refined until it is, or
-        until it is as near as it gets.
+        Exact where the whole correction is made; near a singularity, or with a free axis, refined
+        until it is, or until it is as near as it gets.
         """
-        q = corrected if self._tool is None else self._tool.inverse().correct(corrected, s).q
-        q = self._arm.inverse().correct(q, s).q
-        best = np.full(len(q), np.inf)
-        answer = q
+        answer, best = corrected.copy(), np.full(len(corrected), np.inf)
+        rows, aim = np.arange(len(corrected)), corrected
         for _ in range(MOST_REFINEMENTS):
-            ahead = self.correct(q, s)
-            miss = corrected - ahead.q
+            q = self._exchanged(aim, s[rows])
+            miss = corrected[rows] - self.correct(q, s[rows]).q
             size = np.max(np.abs(miss), axis=1)
-            answer = np.where((size < best)[:, None], q, answer)
-            best = np.minimum(best, size)
-            if np.all(best < EXACT):
+            better = size < best[rows]
+            answer[rows[better]], best[rows[better]] = q[better], size[better]
+            # one that no longer gets nearer is at the rounding floor
+            more = (size >= EXACT) & (better | (size >= ROUNDING))
+            if not np.any(more):
                 break
-            q = q + miss
+            aim, rows = aim[more] + miss[more], rows[more]
         return answer
+
+    def _exchanged(self, q: Array, s: Array) -> Array:
+        """Joints (m, n) corrected with the models exchanged: nearly the taught ones."""
+        if self._tool is not None:
+            q = self._tool.inverse().correct(q, s).q
+        return self._arm.inverse().correct(q, s).q
 
     def rates(
         self,
@@ -121,10 +134,11 @@ class StagedCorrection:
         """
         out_v, out_a = np.empty(q.shape), np.empty(q.shape)
         points, qd, qdd = plain(q), plain(velocity), plain(acceleration)
-        models = self._whole.models
-        rates.rates_batch(points, qd, qdd, plain(result.q), models, plain(s), out_v, out_a)
-        exact = result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1)
-        rough = ~exact if self.n == 6 else np.ones(len(q), dtype=np.bool_)
+        rough = np.ones(len(q), dtype=np.bool_)
+        if self._analytic:
+            blends = plain(s)
+            rates.rates_batch(points, qd, qdd, plain(result.q), self._models, blends, out_v, out_a)
+            rough = ~(result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1))
         if np.any(rough):
 
             def corrected(p: Array, t: float) -> Array:
@@ -141,8 +155,9 @@ class StagedCorrection:
         At the end of the blend. Where a singularity is near they are the corrected joints' own.
         """
         out, unused, zero = np.empty_like(q), np.empty_like(q), np.zeros_like(q)
-        models = self._whole.models[[2, 3, 0, 1]]
-        ones = np.ones(len(q))
+        models, ones = self._models[[2, 3, 0, 1]], np.ones(len(q))
+        if not self._analytic:
+            return path_rates(lambda p, _: self.uncorrect(p, ones), corrected, velocity, zero)[0]
         rates.rates_batch(corrected, velocity, zero, q, models, ones, out, unused)
         exact = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
         return np.where(exact[:, None], out, velocity)

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel
 from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import walk
+from robocal_ros.core.kinematics.kernels import turns_size, walk
 
 Array = NDArray[np.float64]
 
@@ -19,8 +19,8 @@ REACHED, SINGULAR, MISSED = range(3)
 
 @kernel
 def _reach(
-    goal: Array, links: Array, poses: Array, frames: Array, J: Array, L: Array, near: Array,
-    longest: float, q: Array,
+    goal: Array, links: Array, poses: Array, turns: Array, frames: Array, J: Array, L: Array,
+    near: Array, longest: float, q: Array,
 ) -> int:  # fmt: skip
     """Newton's steps in ``q`` from ``near`` to ``goal``; ``poses``: root, tool, pose at q."""
     n = q.shape[0]
@@ -29,7 +29,7 @@ def _reach(
         q[i] = near[i]
     small = False
     for _ in range(MOST_ITERATIONS):
-        walk(q, links, poses[0], frames, poses[2])
+        walk(q, links, poses[0], turns, frames, poses[2])
         newton.at_tool(poses[2], poses[1])
         newton.columns(links, frames, poses[2], J)
         if not newton.factor(J, L):
@@ -66,14 +66,15 @@ def follow_batch(
     to the next. Gives how many were reached and what became of the next.
     """
     n = links.shape[0]
-    poses, frames = np.empty((3, 4, 4)), np.empty((n, 5, 3))
+    poses, frames = np.empty((3, 4, 4)), np.empty((n, 2, 3))
+    turns = np.empty(turns_size(n))
     J, L, zero = np.empty((n, 6)), np.empty((n, n)), np.zeros(n)
     v, a = np.empty(6), np.empty(6)
     newton.copy(root_and_tool[0], poses[0])
     newton.copy(root_and_tool[1], poses[1])
     for i in range(goals.shape[0]):
         start = near if i == 0 else q[i - 1]
-        outcome = _reach(goals[i], links, poses, frames, J, L, start, longest, q[i])
+        outcome = _reach(goals[i], links, poses, turns, frames, J, L, start, longest, q[i])
         if outcome != REACHED:
             return i, outcome
         newton.solve(J, L, twist[i], zero, qd[i])

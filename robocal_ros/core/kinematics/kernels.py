@@ -9,7 +9,7 @@ form) column by column, so that no matrix product is formed. Angles in rad, leng
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import inlined, kernel
+from robocal_ros.core.compiled import inlined, kernel, lean
 from robocal_ros.core.kinematics.columns import (
     base_columns,
     joint_columns,
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _BLOCK = 256  # poses whose sines are formed at once
+_LANES = 8  # joints of one pose whose sines are
 
 
 def pack_links(mdh: Array, sign: Array, prismatic: NDArray[np.bool_]) -> Array:
@@ -132,19 +133,52 @@ def _keep_link(frame: Frame, frames: Array, i: int) -> None:
     frames[i, 4, 0], frames[i, 4, 1], frames[i, 4, 2] = frame[3], frame[4], frame[5]
 
 
-@kernel
-def walk(q: Array, links: Array, T_root: Array, frames: Array, T_out: Array) -> None:
-    """Forward kinematics that keeps each joint's axes.
+@inlined
+def turns_size(n: int) -> int:
+    """How many scratch numbers `walk` needs for n joints."""
+    return _LANES * 3 * ((n + _LANES - 1) // _LANES)
 
-    ``frames`` (n, 5, 3) receives per joint: z of the joint axis and its point, x of the link
-    (after theta), the link frame's origin, and the y axis about which beta turns.
+
+@lean
+def _turn_lanes(lanes: Array) -> None:
+    """Cosines and sines of eight angles, behind them: with the number known, in one register."""
+    for j in range(_LANES):
+        c, s = reduced_cos_sin(lanes[j])
+        lanes[_LANES + j], lanes[2 * _LANES + j] = c, s
+
+
+@lean
+def _turn(q: Array, links: Array, turns: Array) -> None:
+    """Angle, cosine and sine of each theta: for each eight joints eight, eight and eight."""
+    n = links.shape[0]
+    for i in range(n):
+        turns[_lane(i)] = _theta(links, i, q[i])
+    for first in range(0, n, _LANES):
+        _turn_lanes(turns[3 * first : 3 * (first + _LANES)])
+    for i in range(n):
+        at = _lane(i)
+        if abs(turns[at]) > LARGEST_ANGLE:
+            turns[at + _LANES], turns[at + 2 * _LANES] = cos_sin(turns[at])
+
+
+@inlined
+def _lane(i: int) -> int:
+    return i + 2 * _LANES * (i // _LANES)
+
+
+@lean
+def walk(q: Array, links: Array, T_root: Array, turns: Array, frames: Array, T_out: Array) -> None:
+    """Forward kinematics that keeps each joint's axis.
+
+    ``frames`` (n, 2, 3) receives per joint: z of the joint axis and its point. ``turns`` is
+    scratch of `turns_size` numbers.
     """
+    _turn(q, links, turns)
     frame = _root(T_root)
     for i in range(links.shape[0]):
         _keep_axis(frame, frames, i)
-        c, s = cos_sin(_theta(links, i, q[i]))
-        frame = _link(links, i, q[i], c, s, frame)
-        _keep_link(frame, frames, i)
+        at = _lane(i)
+        frame = _link(links, i, q[i], turns[at + _LANES], turns[at + 2 * _LANES], frame)
         frame = _bend(links, i, frame)
     _store(frame, T_out)
 

@@ -7,17 +7,17 @@ A packed pose holds x, y, z, w of its quaternion, then the translation.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel
+from robocal_ros.core.compiled import inlined, lean
 
 Array = NDArray[np.float64]
 
-# Pivots of J^T J below this share of its largest: the pose is singular to rounding.
+# Pivots of J^T J (or J J^T) below this share of its largest: the pose is singular to rounding.
 SINGULAR_PIVOT = 1e-13
 # Keeps J^T J of a redundant arm regular; the shift then is the shortest one.
 REDUNDANT = 1e-9
 
 
-@kernel
+@lean
 def copy(source: Array, target: Array) -> None:
     """Copy a matrix: element by element, which compiles in a tenth of an assignment's time."""
     for i in range(source.shape[0]):
@@ -25,7 +25,7 @@ def copy(source: Array, target: Array) -> None:
             target[i, j] = source[i, j]
 
 
-@kernel
+@lean
 def pose(row: Array, T: Array) -> None:
     """Transform (4, 4) of a packed pose."""
     x, y, z, w = row[0], row[1], row[2], row[3]
@@ -36,7 +36,7 @@ def pose(row: Array, T: Array) -> None:
     T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@kernel
+@lean
 def at_tool(T: Array, tool: Array) -> None:
     """Move the origin of a flange pose to the tool's; the flange's axes are kept."""
     x, y, z = tool[0, 3], tool[1, 3], tool[2, 3]
@@ -44,7 +44,7 @@ def at_tool(T: Array, tool: Array) -> None:
         T[r, 3] += T[r, 0] * x + T[r, 1] * y + T[r, 2] * z
 
 
-@kernel
+@lean
 def largest_of(values: Array) -> float:
     """Largest magnitude of some numbers."""
     largest = 0.0
@@ -53,7 +53,19 @@ def largest_of(values: Array) -> float:
     return largest
 
 
-@kernel
+@lean
+def angle_by_sine(square: float, cosine: float) -> float:
+    """Angle over its sine, of which the square is given."""
+    if square > 1e-3 or cosine < 0.0:
+        sine = np.sqrt(square)
+        # at half a turn the axis is lost; the length still tells that the goal is far
+        return float(np.arctan2(sine, cosine) / max(sine, 1e-150))
+    # arcsine's series, to 1e-17
+    tail = square * (105.0 / 3456.0 + square * (945.0 / 42240.0))
+    return 1.0 + square * (1.0 / 6.0 + square * (3.0 / 40.0 + square * (15.0 / 336.0 + tail)))
+
+
+@lean
 def residual(goal: Array, T: Array, e: Array) -> float:
     """Twist ``e`` from ``T`` to ``goal``; returns its largest component."""
     for r in range(3):
@@ -66,17 +78,12 @@ def residual(goal: Array, T: Array, e: Array) -> float:
         w1 += 0.5 * (a2 * b0 - a0 * b2)
         w2 += 0.5 * (a0 * b1 - a1 * b0)
         trace += a0 * b0 + a1 * b1 + a2 * b2
-    square = w0 * w0 + w1 * w1 + w2 * w2
-    factor = 1.0 + square / 6.0
-    if square > 1e-8 or trace < 0.0:
-        sine = np.sqrt(square)
-        # at half a turn the axis is lost; the length still tells that the goal is far
-        factor = np.arctan2(sine, 0.5 * trace) / max(sine, 1e-150)
+    factor = angle_by_sine(w0 * w0 + w1 * w1 + w2 * w2, 0.5 * trace)
     e[3], e[4], e[5] = factor * w0, factor * w1, factor * w2
     return largest_of(e)
 
 
-@kernel
+@lean
 def columns(links: Array, frames: Array, T: Array, J: Array) -> None:
     """Columns of the geometric Jacobian at the origin of ``T``, as rows of ``J`` (n, 6)."""
     p0, p1, p2 = T[0, 3], T[1, 3], T[2, 3]
@@ -95,60 +102,108 @@ def columns(links: Array, frames: Array, T: Array, J: Array) -> None:
         J[i, 3], J[i, 4], J[i, 5] = z0, z1, z2
 
 
-@kernel
+@lean
 def factor(J: Array, L: Array) -> bool:
-    """Cholesky factor of J^T J (with 1 / diagonal on the diagonal); False where singular."""
+    """Factor of J^T J, see `factor_in_place`; False where singular."""
     n = J.shape[0]
-    largest = 0.0
+    if n == 6:
+        _square(J, L, 6)
+        return factor_in_place(L)
+    _square(J, L, n)
+    if n > 6:
+        for i in range(n):
+            L[i, i] += REDUNDANT
+    return factor_in_place(L)
+
+
+# Six is a constant in the code of six joints: the compiler unrolls its loops.
+@inlined
+def _square(J: Array, L: Array, n: int) -> None:
     for i in range(n):
         for j in range(i + 1):
             value = 0.0
             for r in range(6):
                 value += J[i, r] * J[j, r]
             L[i, j] = value
-        if n > 6:
-            L[i, i] += REDUNDANT
-        largest = max(largest, L[i, i])
+
+
+@lean
+def factor_in_place(L: Array) -> bool:
+    """L D L^T of the matrix in the lower half, with 1 / D on the diagonal; False where singular."""
+    return _factored(L, 6) if L.shape[0] == 6 else _factored(L, L.shape[0])
+
+
+@inlined
+def _factored(L: Array, n: int) -> bool:
+    largest, regular = 0.0, True
     for i in range(n):
-        for j in range(i):
-            value = L[i, j]
-            for k in range(j):
-                value -= L[i, k] * L[j, k]
-            L[i, j] = value * L[j, j]
-        value = L[i, i]
-        for k in range(i):
-            value -= L[i, k] * L[i, k]
-        if not value > SINGULAR_PIVOT * largest:
-            return False
-        L[i, i] = 1.0 / np.sqrt(value)
-    return True
+        largest = max(largest, L[i, i])
+    for k in range(n):
+        regular = regular and L[k, k] > SINGULAR_PIVOT * largest
+        inverse = 1.0 / L[k, k]
+        L[k, k] = inverse
+        for i in range(k + 1, n):
+            value = L[i, k] * inverse
+            for j in range(k + 1, i + 1):
+                L[i, j] -= value * L[j, k]
+        for i in range(k + 1, n):
+            L[i, k] *= inverse
+    return regular
 
 
-@kernel
+@lean
 def solve(J: Array, L: Array, e: Array, x: Array, step: Array) -> None:
     """Joint step for the twist ``e``; of a redundant arm, the one that shortens ``x`` too."""
     n = J.shape[0]
+    if n == 6:
+        _multiply(J, e, step, 6)
+    else:
+        _multiply(J, e, step, n)
+    if n > 6:
+        for i in range(n):
+            step[i] -= REDUNDANT * x[i]
+    solve_in_place(L, step)
+
+
+@inlined
+def _multiply(J: Array, e: Array, out: Array, n: int) -> None:
     for i in range(n):
-        value = -REDUNDANT * x[i] if n > 6 else 0.0
+        value = 0.0
         for r in range(6):
             value += J[i, r] * e[r]
+        out[i] = value
+
+
+@lean
+def solve_in_place(L: Array, x: Array) -> None:
+    """Solve with the factor of `factor_in_place`."""
+    if L.shape[0] == 6:
+        _solved(L, x, 6)
+    else:
+        _solved(L, x, L.shape[0])
+
+
+@inlined
+def _solved(L: Array, x: Array, n: int) -> None:
+    for i in range(n):
+        value = x[i]
         for k in range(i):
-            value -= L[i, k] * step[k]
-        step[i] = value * L[i, i]
+            value -= L[i, k] * x[k]
+        x[i] = value
     for i in range(n - 1, -1, -1):
-        value = step[i]
+        value = x[i] * L[i, i]
         for k in range(i + 1, n):
-            value -= L[k, i] * step[k]
-        step[i] = value * L[i, i]
+            value -= L[k, i] * x[k]
+        x[i] = value
 
 
-@kernel
+@lean
 def length(e: Array, first: int) -> float:
     """Length of a twist's translation (``first`` 0) or rotation (3)."""
     return float(np.sqrt(e[first] ** 2 + e[first + 1] ** 2 + e[first + 2] ** 2))
 
 
-@kernel
+@lean
 def bias(links: Array, frames: Array, T: Array, qd: Array, rate: Array, out: Array) -> None:
     """Twist ``rate`` (6,) at the origin of ``T``, and its derivative ``out`` at constant ``qd``."""
     w0, w1, w2 = 0.0, 0.0, 0.0
