@@ -112,7 +112,7 @@ COLCON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$(CURDIR)/$(VENV
 	--event-handlers console_cohesion- --packages-select
 
 # Build folders remember absolute paths and half-done work: these start afresh.
-INTERFACES := robocal_msgs tf2_msgs
+INTERFACES := robocal_msgs control_msgs tf2_msgs
 $(STAMPS)/interfaces: $(STAMPS)/wheels $(shell find msg_defs tools/interfaces -type f)
 	@echo "Building $(INTERFACES) (about half a minute, once)"
 	command -v c++ >/dev/null || { echo "make: a C++ compiler is needed (apt install g++)" >&2; exit 1; }
