@@ -20,6 +20,7 @@ from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.trajectory_proxy import TrajectoryProxy
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     CorrectionStatus,
@@ -37,6 +38,7 @@ from robocal_ros.sessions.correction import (
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
 STATES = "joint_states"
+ACTION = "follow_joint_trajectory"
 MODEL = "kinematic_model"
 TOOL = "tool_frame"
 
@@ -47,6 +49,7 @@ class JointCorrectionNode(HouseNode):
     NAME = "joint_correction_node"
     SETTINGS = SETTINGS
     _made_for = ""  # serial of the model in use
+    _proxy: TrajectoryProxy | None = None
 
     def configure(self) -> None:
         """Load the models, then open the topics."""
@@ -72,6 +75,20 @@ class JointCorrectionNode(HouseNode):
         )
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_timer(POLL_S, self._look, steady=True)
+        if self.settings[ACTION]:
+            names = ACTION, self.settings[ACTION]
+            self._proxy = TrajectoryProxy(self, *names, self._corrected, self._taught, self._stop)
+
+    def deactivate(self) -> None:
+        """Cancel the goals under way."""
+        if self._proxy is not None:
+            self._proxy.deactivate()
+
+    def cleanup(self) -> None:
+        """Take the action down."""
+        if self._proxy is not None:
+            self._proxy.close()
+            self._proxy = None
 
     # ---- what decides about the correction ------------------------------------------------------
 
@@ -125,17 +142,33 @@ class JointCorrectionNode(HouseNode):
         self._outputs[topic].publish(message)
 
     def _on_path(self, message: Any) -> None:
-        now = time.monotonic()
-        if not message.points:
+        if message.points:
+            self._outputs[TRAJECTORY].publish(self._corrected(message))
+        else:
             self._outputs[TRAJECTORY].publish(message)
-            self._session.trajectory(_STOP, now)
-            return
+            self._stop()
+
+    def _corrected(self, message: Any) -> Any:
+        """The message, with corrected points."""
         command = self._session.counted(lambda: trajectory_command(message))
         starts_in = (command.stamp_ns - self.now_ns()) * 1e-9 if command.stamp_ns else 0.0
-        corrected = self._session.trajectory(command, now, starts_in)
+        corrected = self._session.trajectory(command, time.monotonic(), starts_in)
         if corrected is not command:
             _fill(message, corrected)
-        self._outputs[TRAJECTORY].publish(message)
+        return message
+
+    def _stop(self) -> None:
+        self._session.trajectory(_STOP, time.monotonic())
+
+    def _taught(self, names: Any, position: Any, velocity: Any) -> tuple[Any, Any]:
+        stage = self._session._corrector.commanded(time.monotonic())
+        if stage is None:
+            return position, velocity
+        taught = stage.uncorrect(position[None], np.ones(1))
+        rates = None if velocity is None else velocity[None]
+        return taught[0], None if rates is None else stage.taught_velocity(
+            taught, position[None], rates
+        )[0]
 
     # ---- what is reported -----------------------------------------------------------------------
 
