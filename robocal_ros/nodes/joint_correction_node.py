@@ -76,7 +76,7 @@ class JointCorrectionNode(HouseNode):
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_timer(POLL_S, self._look, steady=True)
         if self.settings[ACTION]:
-            names = ACTION, self.settings[ACTION]
+            names = f"~/{ACTION}", self.settings[ACTION]
             self._proxy = TrajectoryProxy(self, *names, self._corrected, self._taught, self._stop)
 
     def deactivate(self) -> None:

@@ -16,7 +16,7 @@ from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
 from control_msgs.action import FollowJointTrajectory
 from numpy.typing import NDArray
-from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.action import ActionClient, CancelResponse, GoalResponse
 from rclpy.action.client import ClientGoalHandle
 from rclpy.action.server import ServerGoalHandle
 from rclpy.task import Future
@@ -24,6 +24,7 @@ from rclpy.task import Future
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.samples import TAUGHT
+from robocal_ros.nodes.deferred_action import DeferredActionServer
 from robocal_ros.nodes.endpoints import EndpointNode
 
 Array = NDArray[np.float64]
@@ -31,30 +32,11 @@ Result = FollowJointTrajectory.Result
 
 ANSWER_S = 5.0  # a controller that has not answered a goal or a cancel by then never will
 WATCH_S = 0.2
-RESULT_KEPT_S = 60  # for callers that ask late
 _ABOUT_JOINTS = {Reason.UNKNOWN_JOINT, Reason.DOUBLED_JOINT, Reason.MISSING_JOINT}
 
 
-class _Server(ActionServer):
-    """An action server whose goals are ended by a callback, not by a coroutine that waits."""
-
-    def __init__(self, node: EndpointNode, name: str, **callbacks: Any) -> None:
-        self._host = node
-        super().__init__(
-            node,
-            FollowJointTrajectory,
-            name,
-            lambda goal: Result(),
-            result_timeout=RESULT_KEPT_S,
-            **callbacks,
-        )
-
-    def notify_execute(
-        self, goal_handle: ServerGoalHandle, execute_callback: Callable[..., Any] | None
-    ) -> None:
-        """Called when a goal begins, without a callback, and with one when it shall end."""
-        if execute_callback is not None and self._host.executor is not None:
-            super().notify_execute(goal_handle, execute_callback)
+class ControllerError(RobocalError):
+    """The controller cannot take a goal."""
 
 
 @dataclass(eq=False)
@@ -63,7 +45,7 @@ class _Goal:
 
     Attributes
     ----------
-    servers : of the controller's action, when it was sent.
+    servers : who offered the controller's action when it was sent.
     asked_s : since when the controller owes an answer; None when it owes none.
     accepted : the goal at the controller.
     result : what it will answer in the end.
@@ -79,7 +61,7 @@ class _Goal:
 
 
 class TrajectoryProxy:
-    """Serves ``server_name`` until `close`, by means of the controller's action ``client_name``.
+    """Serves the action ``server_name`` with the controller's action ``client_name``.
 
     Parameters
     ----------
@@ -103,16 +85,18 @@ class TrajectoryProxy:
         stop: Callable[[], None],
     ) -> None:
         self._node, self._correct, self._taught, self._stop = node, correct, taught, stop
-        self._controller = node.resolve_topic_name(client_name)
-        if node.resolve_topic_name(server_name) == self._controller:
-            raise InputError(f"{self._controller} is this node's own action: name the controller's")
+        # rclpy remaps the topics and services of an action, but not its name.
+        name, self._name = (node.resolve_topic_name(x) for x in (server_name, client_name))
+        if name == self._name:
+            raise InputError(f"{name} is this node's own action: name the controller's")
         self._goals: list[_Goal] = []
         self._last: _Goal | None = None
-        self._client = ActionClient(node, FollowJointTrajectory, client_name)
-        self._server = _Server(
+        self._client = ActionClient(node, FollowJointTrajectory, self._name)
+        self._server = DeferredActionServer(
             node,
-            server_name,
-            goal_callback=self._requested,
+            FollowJointTrajectory,
+            name,
+            goal_callback=self._asked,
             handle_accepted_callback=self._begin,
             cancel_callback=self._cancelled,
         )
@@ -131,40 +115,42 @@ class TrajectoryProxy:
 
     # ---- from the caller ------------------------------------------------------------------------
 
-    def _requested(self, request: Any) -> GoalResponse:
+    def _asked(self, request: Any) -> GoalResponse:
         if self._node.is_active:
             return GoalResponse.ACCEPT
-        self._node.get_logger().warning(f"goal rejected: {self._node.get_name()} is not active")
+        self._node.get_logger().warning(f"goal rejected: the node is {self._node.state}")
         return GoalResponse.REJECT
 
     def _begin(self, caller: ServerGoalHandle) -> None:
         caller.execute()
-        goal, request = _Goal(caller), caller.request
-        is_stop = not request.trajectory.points
-        if not self._client.server_is_ready():
-            self._fail(goal, f"the controller's action {self._controller} is not there")
-            return
-        if not is_stop:
-            try:
-                request.trajectory = self._correct(request.trajectory)
-            except RefusedError as error:
-                about_joints = error.reason in _ABOUT_JOINTS
-                code = Result.INVALID_JOINTS if about_joints else Result.INVALID_GOAL
-                self._fail(goal, str(error), code)
-                return
-            except Exception as error:
-                self._node.get_logger().error(traceback.format_exc())
-                self._fail(goal, f"a defect of this software, please report it: {error!r}")
-                return
-        earlier = list(self._goals)
-        self._send(goal, request)
-        if is_stop:  # controllers that do not take it for one hold when the goal is cancelled
-            for other in earlier:
+        goal = _Goal(caller)
+        try:
+            self._forward(goal, caller.request)
+        except RobocalError as error:
+            about_joints = isinstance(error, RefusedError) and error.reason in _ABOUT_JOINTS
+            code = Result.INVALID_JOINTS if about_joints else Result.INVALID_GOAL
+            self._fail(goal, str(error), code)
+        except Exception as error:
+            self._node.get_logger().error(traceback.format_exc())
+            self._fail(goal, f"a defect of this software, please report it: {error!r}")
+
+    def _forward(self, goal: _Goal, request: Any) -> None:
+        """Correct the goal and send it; one without points is a stop, which nothing bars."""
+        goal.servers = self._servers()
+        if not (goal.servers and self._client.server_is_ready()):
+            raise ControllerError(f"no controller offers {self._name}: start it")
+        if not request.trajectory.points:
+            for other in self._goals:  # for controllers that know no goal without points
                 self._forward_cancel(other)
             self._stop()
-
-    def _send(self, goal: _Goal, request: Any) -> None:
-        goal.servers, goal.asked_s = self._servers(), time.monotonic()
+        elif len(goal.servers) > 1:  # each of them would move the robot
+            raise ControllerError(
+                f"{len(goal.servers)} nodes offer {self._name}: end all but one; one that was "
+                "killed counts until DDS gives it up"
+            )
+        else:
+            request.trajectory = self._correct(request.trajectory)
+        goal.asked_s = time.monotonic()
         self._goals.append(goal)
         self._last = goal
         future = self._client.send_goal_async(
@@ -191,7 +177,7 @@ class TrajectoryProxy:
     def _answered(self, goal: _Goal, accepted: ClientGoalHandle) -> None:
         goal.asked_s = None
         if not accepted.accepted:
-            self._fail(goal, f"{self._controller} rejected the goal, its log says why")
+            self._fail(goal, f"{self._name} rejected the goal, its log says why")
             return
         goal.accepted = accepted
         if goal.cancel or goal.over:
@@ -205,7 +191,7 @@ class TrajectoryProxy:
         if answer.return_code == CancelGoal.Response.ERROR_NONE:
             self._stopped(goal)  # it holds from now on, its result follows
         elif answer.return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID:
-            self._fail(goal, f"{self._controller} does not know the goal any more")
+            self._fail(goal, f"{self._name} does not know the goal any more")
 
     def _feedback(self, goal: _Goal, feedback: Any) -> None:
         names = tuple(feedback.joint_names)
@@ -231,26 +217,30 @@ class TrajectoryProxy:
     def _finished(self, goal: _Goal, answer: Any) -> None:
         if goal.over:
             return
-        if answer.status == GoalStatus.STATUS_UNKNOWN:
-            self._fail(goal, f"{self._controller} does not know the goal any more")
-            return
-        self._end(goal, answer.status, answer.result)
+        status, result = answer.status, answer.result
+        cancelled = status == GoalStatus.STATUS_CANCELED and goal.caller.is_cancel_requested
+        if status == GoalStatus.STATUS_UNKNOWN:
+            self._fail(goal, f"{self._name} does not know the goal any more")
+        elif cancelled or status == GoalStatus.STATUS_SUCCEEDED:
+            self._end(goal, status, result)
+        else:
+            why = result.error_string or f"{self._name} gave the goal up without a reason"
+            self._fail(goal, why, result.error_code or Result.INVALID_GOAL)
 
     def _watch(self) -> None:
         """End goals that the controller will not end."""
         servers = self._servers() if self._goals else frozenset()
         overdue_s = time.monotonic() - ANSWER_S
         for goal in list(self._goals):
-            if not goal.servers & servers:
-                self._fail(goal, f"the controller's action {self._controller} vanished")
+            if not goal.servers <= servers:
+                self._fail(goal, f"the controller that offered {self._name} vanished")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
-                what = "cancel, it may still move" if goal.cancel else "goal"
-                text = f"{self._controller} did not answer within {ANSWER_S:g} s to the {what}"
-                self._fail(goal, text)
+                what = "cancel, the robot may still move" if goal.cancel else "goal"
+                self._fail(goal, f"{self._name} did not answer within {ANSWER_S:g} s to the {what}")
 
     def _servers(self) -> frozenset[bytes]:
         """Who offers the controller's action: a restarted controller is another one."""
-        infos = self._node.get_publishers_info_by_topic(f"{self._controller}/_action/status")
+        infos = self._node.get_publishers_info_by_topic(f"{self._name}/_action/status")
         return frozenset(bytes(info.endpoint_gid) for info in infos)
 
     # ---- the end --------------------------------------------------------------------------------
@@ -258,35 +248,22 @@ class TrajectoryProxy:
     def _fail(self, goal: _Goal, why: str, code: int = Result.INVALID_GOAL) -> None:
         if not goal.over:
             self._node.get_logger().warning(f"goal aborted: {why}")
-            self._end(goal, GoalStatus.STATUS_ABORTED, Result(error_code=code, error_string=why))
+            result = Result(error_code=code, error_string=why)
+            self._end(goal, GoalStatus.STATUS_ABORTED, result)
 
     def _end(self, goal: _Goal, status: int, result: Any) -> None:
         goal.over = True
         if goal in self._goals:
             self._goals.remove(goal)
         if goal.result is not None:
-            goal.result.cancel()  # so that nothing is kept of it
+            goal.result.cancel()  # nothing is kept of it
         if status != GoalStatus.STATUS_SUCCEEDED:
             self._stopped(goal)
-        self._server.notify_execute(goal.caller, lambda caller: _close(caller, status, result))
+        self._server.end(goal.caller, status, result)
 
     def _stopped(self, goal: _Goal) -> None:
         if goal is self._last:
             self._stop()
-
-
-def _close(caller: ServerGoalHandle, status: int, result: Any) -> Any:
-    """Give the caller's goal the controller's outcome."""
-    if status == GoalStatus.STATUS_SUCCEEDED:
-        caller.succeed()
-    elif status == GoalStatus.STATUS_CANCELED and caller.is_cancel_requested:
-        caller.canceled()
-    else:
-        if result.error_code == Result.SUCCESSFUL:
-            result.error_code = Result.INVALID_GOAL
-            result.error_string = result.error_string or "the controller gave the goal up"
-        caller.abort()
-    return result
 
 
 def _subtract(desired: Any, actual: Any, error: Any) -> None:

@@ -68,6 +68,11 @@ class Follower(Node):
         )
         self.create_timer(TICK_S, self._tick)
 
+    def close(self) -> None:
+        """Go, so that others see it gone."""
+        self._server.destroy()
+        self.destroy_node()
+
     def _asked(self, request: Any) -> GoalResponse:
         self.goals.append(request)
         good = request.trajectory.points and set(request.trajectory.joint_names) == set(NAMES)
@@ -78,11 +83,10 @@ class Follower(Node):
             self.path.end(Result.INVALID_GOAL, "preempted by a newer goal")
         trajectory = goal.request.trajectory
         order = [trajectory.joint_names.index(name) for name in NAMES]
-        duration = [
-            p.time_from_start.sec + p.time_from_start.nanosec * 1e-9 for p in trajectory.points
-        ]
+        from_start = [p.time_from_start for p in trajectory.points]
+        times = np.array([t.sec + t.nanosec * 1e-9 for t in from_start])
         points = np.array([p.positions for p in trajectory.points])[:, order]
-        path = self.path = Path(goal, np.array(duration), points, self._now_s(), Future())
+        path = self.path = Path(goal, times, points, self._now_s(), Future())
         result = await path.ended
         if goal.is_cancel_requested:
             goal.canceled()

@@ -25,12 +25,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes import conversions, qos, trajectory_proxy
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = load_robot("kr150_r3100")
 NODE = "/joint_correction_node"
+OWN = f"{NODE}/follow_joint_trajectory"
 Result = FollowJointTrajectory.Result
 MOVED = HOME + np.array([0.2, 0.1, -0.1, 0.2, -0.1, 0.3])
 AT_ONCE_S = 0.5  # with other work on the machine
@@ -103,7 +104,9 @@ class Cell:
 
     def __init__(self, graph: Any, **parameters: Any) -> None:
         self.graph = graph
-        self.client = ActionClient(graph.probe, FollowJointTrajectory, "follow_joint_trajectory")
+        self.client = ActionClient(
+            graph.probe, FollowJointTrajectory, f"{NODE}/follow_joint_trajectory"
+        )
         self.states = graph.collect(JointState, f"{NODE}/joint_states")
         self.parameters = SETTINGS | parameters
 
@@ -139,7 +142,7 @@ def cell(graph: Any) -> Iterator[Any]:
     graph.spin_until(lambda: cell.node._proxy._client.server_is_ready(), "the controller")
     yield cell
     cell.client.destroy()
-    cell.robot.destroy_node()
+    cell.robot.close()
 
 
 def test_a_goal_reaches_the_taught_pose_and_all_else_passes(cell: Any) -> None:
@@ -285,19 +288,51 @@ def test_without_a_controller_a_goal_ends_at_once(graph: Any) -> None:
     graph.spin_until(cell.client.server_is_ready, "the action")
     result = cell.send(HOME, HOME).ends(GoalStatus.STATUS_ABORTED)
     assert result.error_code == Result.INVALID_GOAL
-    assert f"{ACTION} is not there" in result.error_string
+    assert f"no controller offers {ACTION}" in result.error_string
     cell.client.destroy()
 
 
 def test_its_own_action_is_not_the_controllers(graph: Any) -> None:
     node = graph.add(
-        JointCorrectionNode, SETTINGS | {"follow_joint_trajectory": "/follow_joint_trajectory"}
+        JointCorrectionNode,
+        SETTINGS | {"follow_joint_trajectory": f"{NODE}/follow_joint_trajectory"},
     )
     assert node.state == "unconfigured"
     assert "name the controller's" in node._full_health().message
 
 
-# ---- node and controller as processes: the node in its own executor -------------------------------
+def test_two_controllers_get_no_goal_but_the_stop(cell: Any) -> None:
+    cell.begin()
+    other = Follower(context=cell.graph.context)
+    cell.graph.executor.add_node(other)
+    proxy = cell.node._proxy
+    cell.graph.spin_until(lambda: len(proxy._servers()) == 2, "both controllers")
+    result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
+    assert f"2 nodes offer {ACTION}" in result.error_string
+    assert not other.goals
+    Sent(cell, goal_of())
+    cell.graph.spin_until(lambda: other.goals, "the stop")
+    other.close()
+    cell.graph.spin_until(lambda: len(proxy._servers()) == 1, "one controller")
+    cell.send(HOME, MOVED).ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_renamed_action_and_a_controller_that_goes(graph: Any) -> None:
+    cell = Cell(graph)
+    robot = Follower(context=graph.context)
+    graph.executor.add_node(robot)
+    renamed = ["--ros-args", "-r", f"{OWN}:=/arm/follow_joint_trajectory"]
+    graph.add(JointCorrectionNode, cell.parameters, cli_args=renamed)
+    cell.client.destroy()
+    cell.client = ActionClient(graph.probe, FollowJointTrajectory, "/arm/follow_joint_trajectory")
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    robot.close()
+    assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 1.0).error_string
+    cell.client.destroy()
+
+
+# ---- node and controller as processes: the node in its own executor -----------------------------
 
 SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
@@ -313,27 +348,26 @@ LEASE_S = 2.0
 
 
 @pytest.fixture
-def processes(graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The node as users run it, and a controller whose death is noticed after 2 s."""
+def apart(graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The controller is a process whose death is noticed after 2 s."""
     cell = Cell(graph)
     profiles = tmp_path / "lease.xml"
     profiles.write_text(SHORT_LEASE)
-    cell.lease = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(profiles)}
 
-    def controller() -> Any:
+    def start() -> Any:
         with monkeypatch.context() as patch:
-            patch.setitem(graph._environment, *next(iter(cell.lease.items())))
+            patch.setitem(graph._environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(profiles))
             return graph.start(Path(__file__).parent / "follower.py")
 
-    cell.start_controller = controller
-    cell.controller = controller()
-    cell.process = graph.start("joint_correction_node", cell.parameters)
+    cell.start = start
+    cell.controller = start()
     yield cell
     cell.client.destroy()
 
 
-def test_goal_cancel_and_signal_in_the_events_executor(processes: Any) -> None:
-    cell = processes
+def test_goal_cancel_and_signal_in_the_events_executor(apart: Any) -> None:
+    cell = apart
+    process = cell.graph.start("joint_correction_node", cell.parameters)
     cell.begin()
     sent = cell.send(HOME, MOVED)
     assert sent.ends(GoalStatus.STATUS_SUCCEEDED).error_string == "Goal successfully reached!"
@@ -343,18 +377,37 @@ def test_goal_cancel_and_signal_in_the_events_executor(processes: Any) -> None:
     sent.ends(GoalStatus.STATUS_CANCELED, AT_ONCE_S)
     here = cell.taught()
     cell.send(here, HOME, lasts_s=20.0).moves()
-    assert cell.process.stop(signal.SIGINT) == 0, cell.process.output
-    assert "Traceback" not in cell.process.output
+    assert process.stop(signal.SIGINT) == 0, process.output
+    assert "Traceback" not in process.output
+    raw = cell.graph.collect(JointState, "joint_states")
+    cell.graph.spin_until(
+        lambda: len(raw) > 10 and raw[-1].position == raw[-10].position, "the robot holds"
+    )
+    assert np.abs(np.array(raw[-1].position) - HOME).max() > 0.1
 
 
-def test_a_controller_that_is_killed_ends_the_goal(processes: Any) -> None:
-    cell = processes
+def test_a_controller_that_is_killed_ends_the_goal(apart: Any) -> None:
+    cell = apart
+    cell.graph.start("joint_correction_node", cell.parameters)
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
     cell.controller.kill()
-    again = cell.start_controller()  # at once: the old one is still believed alive
+    again = cell.start()  # at once: the old one is still believed alive
     result = sent.ends(GoalStatus.STATUS_ABORTED, LEASE_S + 3.0)
     assert "vanished" in result.error_string
     assert again.process.poll() is None
     cell.graph.call(SetBool, f"{NODE}/enable", data=True)
     cell.send(cell.taught(), HOME).ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_goal_accepted_too_late_is_cancelled(apart: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(trajectory_proxy, "ANSWER_S", 0.4)
+    cell = apart
+    cell.graph.add(JointCorrectionNode, cell.parameters)
+    cell.begin()
+    cell.controller.process.send_signal(signal.SIGSTOP)
+    result = cell.send(HOME, MOVED, lasts_s=10.0).ends(GoalStatus.STATUS_ABORTED, 1.5)
+    assert "did not answer within 0.4 s to the goal" in result.error_string
+    cell.controller.process.send_signal(signal.SIGCONT)
+    cell.graph.spin_for(1.0)  # a tenth of the way, if it were not cancelled
+    assert np.abs(cell.taught() - HOME).max() < 0.01 * np.abs(MOVED - HOME).max()
