@@ -133,9 +133,9 @@ class Cell:
 
 
 @pytest.fixture
-def cell(graph: Any) -> Iterator[Any]:
+def cell(graph: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
     """With node and controller in the test's process."""
-    cell = Cell(graph)
+    cell = Cell(graph, **getattr(request, "param", {}))
     cell.robot = Follower(context=graph.context)
     graph.executor.add_node(cell.robot)
     cell.node = graph.add(JointCorrectionNode, cell.parameters)
@@ -204,9 +204,21 @@ def test_a_cancel_stops_the_robot_and_the_next_goal_goes_on_from_there(cell: Any
     assert np.abs(tcp(ACTUAL, cell.robot.q) - tcp(NOMINAL, MOVED)).max() < 1e-5
 
 
+@pytest.mark.parametrize("cell", [{"blend_deg_s": 0.001}], indirect=True)
+def test_a_blend_ends_where_its_goal_was_cancelled(cell: Any) -> None:
+    cell.begin(settled=False)
+    sent = cell.send(HOME, HOME, lasts_s=20.0)  # its blend takes seconds
+    lag = np.radians(0.001) * 0.1  # as far as a blend may go in 0.1 s
+    cell.graph.spin_until(lambda: np.abs(cell.robot.q - HOME).max() > 8.0 * lag, "the blend")
+    sent.handle.cancel_goal_async()
+    sent.ends(GoalStatus.STATUS_CANCELED)
+    cell.graph.spin_for(1.2)
+    assert np.abs(cell.taught() - HOME).max() < lag
+
+
 def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
     cell.begin()
-    sent = cell.send(HOME, MOVED, lasts_s=1.5).moves()
+    sent = cell.send(HOME, MOVED, lasts_s=0.8).moves()
     count = len(cell.robot.goals)
     unknown, missing = goal_of(HOME, MOVED), goal_of(HOME, MOVED * np.nan)
     unknown.trajectory.joint_names = [*NAMES[:5], "elbow"]
