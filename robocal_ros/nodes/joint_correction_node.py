@@ -76,8 +76,10 @@ class JointCorrectionNode(HouseNode):
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_timer(POLL_S, self._look, steady=True)
         if self.settings[ACTION]:
-            names = f"~/{ACTION}", self.settings[ACTION]
-            self._proxy = TrajectoryProxy(self, *names, self._corrected, self._taught, self._stop)
+            if self._proxy is None:
+                acts = self._corrected, self._taught, self._stop
+                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", *acts)
+            self._proxy.open(self.settings[ACTION])
 
     def deactivate(self) -> None:
         """Cancel the goals under way."""
@@ -85,10 +87,15 @@ class JointCorrectionNode(HouseNode):
             self._proxy.deactivate()
 
     def cleanup(self) -> None:
-        """Take the action down."""
+        """Take no goals any more."""
         if self._proxy is not None:
             self._proxy.close()
-            self._proxy = None
+
+    def destroy_node(self) -> None:
+        """Take the action down with the node."""
+        if self._proxy is not None:
+            self._proxy.destroy()
+        super().destroy_node()
 
     # ---- what decides about the correction ------------------------------------------------------
 

@@ -61,46 +61,52 @@ class _Goal:
 
 
 class TrajectoryProxy:
-    """Serves the action ``server_name`` with the controller's action ``client_name``.
+    """Serves the action ``name`` with a controller's action, from `open` to `close`.
+
+    Both ends stay until `destroy`, which must not be called while the node spins: rclpy's events
+    executor reads freed memory when an action goes that something waits for. When closed, goals
+    are rejected.
 
     Parameters
     ----------
     correct : the corrected trajectory of a taught one; raises `RefusedError`.
     taught : taught positions and velocities of (names, positions, velocities or None), each (k,).
     stop : called when the trajectory that was corrected last ends early.
-
-    Raises
-    ------
-    InputError
-        When both names are the same.
     """
 
     def __init__(
         self,
         node: EndpointNode,
-        server_name: str,
-        client_name: str,
+        name: str,
         correct: Callable[[Any], Any],
         taught: Callable[[tuple[str, ...], Array, Array | None], tuple[Array, Array | None]],
         stop: Callable[[], None],
     ) -> None:
         self._node, self._correct, self._taught, self._stop = node, correct, taught, stop
-        # rclpy remaps the topics and services of an action, but not its name.
-        name, self._name = (node.resolve_topic_name(x) for x in (server_name, client_name))
-        if name == self._name:
-            raise InputError(f"{name} is this node's own action: name the controller's")
         self._goals: list[_Goal] = []
         self._last: _Goal | None = None
-        self._client = ActionClient(node, FollowJointTrajectory, self._name)
+        self._clients: dict[str, ActionClient] = {}
+        self._name = ""  # of the controller's action; empty when closed
+        # rclpy remaps the topics and services of an action, but not its name.
+        self._own_name = node.resolve_topic_name(name)
         self._server = DeferredActionServer(
             node,
             FollowJointTrajectory,
-            name,
+            self._own_name,
             goal_callback=self._asked,
             handle_accepted_callback=self._begin,
             cancel_callback=self._cancelled,
         )
-        node.add_timer(WATCH_S, self._watch, steady=True)
+
+    def open(self, controller: str) -> None:
+        """Take goals for the action ``controller``; `InputError` when it is this node's own."""
+        name = self._node.resolve_topic_name(controller)
+        if name == self._own_name:
+            raise InputError(f"{name} is this node's own action: name the controller's")
+        if name not in self._clients:
+            self._clients[name] = ActionClient(self._node, FollowJointTrajectory, name)
+        self._name = name
+        self._node.add_timer(WATCH_S, self._watch, steady=True)
 
     def deactivate(self) -> None:
         """Cancel every goal at the controller, and end it."""
@@ -109,14 +115,18 @@ class TrajectoryProxy:
             self._fail(goal, "the joint correction was deactivated, it cancelled the goal")
 
     def close(self) -> None:
-        """Take both actions down."""
-        self._server.destroy()
-        self._client.destroy()
+        """Take no goals any more."""
+        self._name = ""
+
+    def destroy(self) -> None:
+        """Take both ends down."""
+        for end in (self._server, *self._clients.values()):
+            end.destroy()
 
     # ---- from the caller ------------------------------------------------------------------------
 
     def _asked(self, request: Any) -> GoalResponse:
-        if self._node.is_active:
+        if self._node.is_active and self._name:
             return GoalResponse.ACCEPT
         self._node.get_logger().warning(f"goal rejected: the node is {self._node.state}")
         return GoalResponse.REJECT
@@ -136,8 +146,8 @@ class TrajectoryProxy:
 
     def _forward(self, goal: _Goal, request: Any) -> None:
         """Correct the goal and send it; one without points is a stop, which nothing bars."""
-        goal.servers = self._servers()
-        if not (goal.servers and self._client.server_is_ready()):
+        goal.servers, client = self._servers(), self._clients[self._name]
+        if not (goal.servers and client.server_is_ready()):
             raise ControllerError(f"no controller offers {self._name}: start it")
         if not request.trajectory.points:
             for other in self._goals:  # for controllers that know no goal without points
@@ -153,7 +163,7 @@ class TrajectoryProxy:
         goal.asked_s = time.monotonic()
         self._goals.append(goal)
         self._last = goal
-        future = self._client.send_goal_async(
+        future = client.send_goal_async(
             request, lambda message: self._feedback(goal, message.feedback), goal.caller.goal_id
         )
         future.add_done_callback(lambda done: self._answered(goal, done.result()))
@@ -194,6 +204,8 @@ class TrajectoryProxy:
             self._fail(goal, f"{self._name} does not know the goal any more")
 
     def _feedback(self, goal: _Goal, feedback: Any) -> None:
+        if goal.over:
+            return
         names = tuple(feedback.joint_names)
         try:
             for point in (feedback.desired, feedback.actual):
@@ -215,7 +227,7 @@ class TrajectoryProxy:
         point.velocities = [] if velocity is None else velocity.tolist()
 
     def _finished(self, goal: _Goal, answer: Any) -> None:
-        if goal.over:
+        if goal.over or answer is None:
             return
         status, result = answer.status, answer.result
         cancelled = status == GoalStatus.STATUS_CANCELED and goal.caller.is_cancel_requested
@@ -233,6 +245,8 @@ class TrajectoryProxy:
         overdue_s = time.monotonic() - ANSWER_S
         for goal in list(self._goals):
             if not goal.servers <= servers:
+                if goal.result is not None:
+                    goal.result.cancel()  # rclpy would keep it for ever
                 self._fail(goal, f"the controller that offered {self._name} vanished")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
                 what = "cancel, the robot may still move" if goal.cancel else "goal"
@@ -255,8 +269,6 @@ class TrajectoryProxy:
         goal.over = True
         if goal in self._goals:
             self._goals.remove(goal)
-        if goal.result is not None:
-            goal.result.cancel()  # nothing is kept of it
         if status != GoalStatus.STATUS_SUCCEEDED:
             self._stopped(goal)
         self._server.end(goal.caller, status, result)

@@ -125,6 +125,14 @@ class Cell:
     def send(self, *places: np.ndarray, **fields: Any) -> Sent:
         return Sent(self, goal_of(*places, **fields))
 
+    def change(self, *transitions: int) -> None:
+        """Let the node go through its lifecycle."""
+        for what in transitions:
+            transition = Transition(id=what)
+            assert self.graph.call(
+                ChangeState, f"{NODE}/change_state", transition=transition
+            ).success
+
     def taught(self) -> np.ndarray:
         """Where the robot stands, as planners see it."""
         self.states.clear()
@@ -139,7 +147,8 @@ def cell(graph: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
     cell.robot = Follower(context=graph.context)
     graph.executor.add_node(cell.robot)
     cell.node = graph.add(JointCorrectionNode, cell.parameters)
-    graph.spin_until(lambda: cell.node._proxy._client.server_is_ready(), "the controller")
+    client = cell.node._proxy._clients[ACTION]
+    graph.spin_until(client.server_is_ready, "the controller")
     yield cell
     cell.client.destroy()
     cell.robot.close()
@@ -232,6 +241,9 @@ def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
     again.trajectory.header.frame_id = CORRECTED
     result = Sent(cell, again).ends(GoalStatus.STATUS_ABORTED)
     assert "comes from a joint correction already" in result.error_string
+    cell.node._proxy._correct = lambda message: 1 / 0
+    result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
+    assert "a defect of this software" in result.error_string
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
     assert len(cell.robot.goals) == count
 
@@ -270,26 +282,19 @@ def test_a_violated_tolerance_keeps_its_code(cell: Any) -> None:
 
 def test_deactivation_cancels_and_rejects(cell: Any) -> None:
     cell.begin()
-
-    def change(what: int) -> None:
-        transition = Transition(id=what)
-        assert cell.graph.call(ChangeState, f"{NODE}/change_state", transition=transition).success
-
     sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
-    change(Transition.TRANSITION_DEACTIVATE)
+    cell.change(Transition.TRANSITION_DEACTIVATE)
     result = sent.ends(GoalStatus.STATUS_ABORTED)
     assert result.error_code == Result.INVALID_GOAL
     assert "deactivated" in result.error_string
     cell.graph.spin_until(lambda: cell.robot.path is None, "the robot holds", AT_ONCE_S)
-    rejected = cell.send(HOME, MOVED)
-    cell.graph.spin_until(lambda: rejected.handle, "the answer")
-    assert not rejected.handle.accepted
-    change(Transition.TRANSITION_CLEANUP)
-    cell.graph.spin_until(lambda: not cell.client.server_is_ready(), "the action goes")
-    change(Transition.TRANSITION_CONFIGURE)
-    change(Transition.TRANSITION_ACTIVATE)
-    cell.graph.spin_until(cell.client.server_is_ready, "the action comes back")
-    cell.graph.spin_until(lambda: cell.node._proxy._client.server_is_ready(), "the controller")
+    for _ in range(2):  # inactive, then unconfigured
+        rejected = cell.send(HOME, MOVED)
+        cell.graph.spin_until(lambda sent=rejected: sent.handle, "the answer")
+        assert not rejected.handle.accepted
+        if cell.node.state == "inactive":
+            cell.change(Transition.TRANSITION_CLEANUP)
+    cell.change(Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
     here = cell.taught()
     cell.send(here, HOME).ends(GoalStatus.STATUS_SUCCEEDED)
 
@@ -396,6 +401,22 @@ def test_goal_cancel_and_signal_in_the_events_executor(apart: Any) -> None:
         lambda: len(raw) > 10 and raw[-1].position == raw[-10].position, "the robot holds"
     )
     assert np.abs(np.array(raw[-1].position) - HOME).max() > 0.1
+
+
+def test_the_events_executor_survives_a_new_configuration_in_mid_goal(apart: Any) -> None:
+    cell = apart
+    cell.graph.start("joint_correction_node", cell.parameters)
+    cell.begin()
+    for _ in range(4):
+        cell.send(cell.taught(), MOVED, lasts_s=20.0).moves()
+        cell.change(
+            Transition.TRANSITION_DEACTIVATE,
+            Transition.TRANSITION_CLEANUP,
+            Transition.TRANSITION_CONFIGURE,
+            Transition.TRANSITION_ACTIVATE,
+        )
+        cell.taught()
+    cell.send(cell.taught(), HOME).ends(GoalStatus.STATUS_SUCCEEDED)
 
 
 def test_a_controller_that_is_killed_ends_the_goal(apart: Any) -> None:
