@@ -37,7 +37,7 @@ demo: setup  ## a simulated shift through the live nodes, with a report in out/
 HALF := test/core test/sessions test/sim test/report
 REST := $(HALF:%=--ignore=%) --ignore=test/nodes
 TIMED := $(addprefix test/nodes/test_,base cell_sim_node joint_correction_node launch replay_node run \
-	tcf_node thermal_node tool_cell)
+	tcf_node thermal_node tool_cell trajectory_proxy)
 TIMED := $(TIMED:%=%.py)
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
@@ -112,7 +112,7 @@ COLCON = PATH="$(CURDIR)/$(VENV)/bin:$$PATH" AMENT_PREFIX_PATH="$(CURDIR)/$(VENV
 	--event-handlers console_cohesion- --packages-select
 
 # Build folders remember absolute paths and half-done work: these start afresh.
-INTERFACES := robocal_msgs tf2_msgs
+INTERFACES := robocal_msgs control_msgs tf2_msgs
 $(STAMPS)/interfaces: $(STAMPS)/wheels $(shell find msg_defs tools/interfaces -type f)
 	@echo "Building $(INTERFACES) (about half a minute, once)"
 	command -v c++ >/dev/null || { echo "make: a C++ compiler is needed (apt install g++)" >&2; exit 1; }

@@ -1,5 +1,7 @@
 """The joint correction node: taught joints in, corrected ones out (docs/joint_correction.md)."""
 
+import contextlib
+import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,6 +31,7 @@ from robocal_ros.nodes.joint_correction_settings import (
 )
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.trajectory_proxy import TrajectoryProxy
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     CorrectionStatus,
@@ -44,6 +47,7 @@ TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
 COMMANDS = "joint_commands"
 STATES = "joint_states"
+ACTION = "follow_joint_trajectory"
 MODEL = "kinematic_model"
 TOOL = "tool_frame"
 KINDS = {
@@ -63,6 +67,7 @@ class JointCorrectionNode(HouseNode):
     NAME = "joint_correction_node"
     SETTINGS = SETTINGS
     _made_for = ""  # serial of the model in use
+    _proxy: TrajectoryProxy | None = None
 
     def configure(self) -> None:
         """Load the models, then open the topics."""
@@ -107,9 +112,31 @@ class JointCorrectionNode(HouseNode):
         self.add_timer(POLL_S, self._look_at_graph, steady=True)
         self.add_timer(LOOK_S, self._look, steady=True)
 
+        if self.settings[ACTION]:
+            if self._proxy is None:
+                acts = self._goal, self._taught, self._stop
+                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", *acts)
+            self._proxy.open(self.settings[ACTION])
+
     def activate(self) -> None:
         """Tell at once what is done."""
         self._tell()
+
+    def deactivate(self) -> None:
+        """Cancel the goals under way."""
+        if self._proxy is not None:
+            self._proxy.deactivate()
+
+    def cleanup(self) -> None:
+        """Take no goals any more."""
+        if self._proxy is not None:
+            self._proxy.close()
+
+    def destroy_node(self) -> None:
+        """Take the action down with the node."""
+        if self._proxy is not None:
+            self._proxy.destroy()
+        super().destroy_node()
 
     # ---- what decides about the correction ------------------------------------------------------
 
@@ -198,6 +225,17 @@ class JointCorrectionNode(HouseNode):
         if corrected is not command:
             messages.fill_path(message, corrected)
         return message
+
+    def _goal(self, message: Any) -> Any:
+        """A goal's trajectory, corrected; as it came in shadow mode."""
+        if self._shadow:
+            with contextlib.suppress(RefusedError):
+                self._corrected(copy.deepcopy(message))
+            return message
+        return self._corrected(message)
+
+    def _taught(self, names: Any, position: Any, velocity: Any) -> Any:
+        return self._session.taught(names, position, velocity, time.monotonic())
 
     def _stop(self) -> None:
         self._session.trajectory(_STOP, time.monotonic())

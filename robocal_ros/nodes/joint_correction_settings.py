@@ -83,6 +83,11 @@ SETTINGS = (
     ),
     Setting("flange_frame", "tool0", "Parent frame that tools of tool_frame must have"),
     Setting("tool_child_frame", "", "Child frame that they must have; empty: any"),
+    Setting(
+        "follow_joint_trajectory",
+        "",
+        "Action of the controller that goals of follow_joint_trajectory go to; empty: no action",
+    ),
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
     Setting(
         "thermal_tcp_mm",

@@ -1,0 +1,154 @@
+"""A simulated controller with the action FollowJointTrajectory, as joint_trajectory_controller.
+
+It follows with a lag, watches the path tolerance, aborts a goal for a newer one, holds when it is
+cancelled, and rejects a goal without points. Run as a script it is a process of its own.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rclpy
+from control_msgs.action import FollowJointTrajectory
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectoryPoint
+
+ACTION = "/arm_controller/follow_joint_trajectory"
+NAMES = [f"joint_a{i}" for i in range(1, 7)]
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+TICK_S = 0.02
+LAG = 0.5  # of the way in each tick
+THERE = 1e-6
+Result = FollowJointTrajectory.Result
+
+
+@dataclass(eq=False)
+class Path:
+    """A goal that is followed."""
+
+    goal: Any
+    times: np.ndarray
+    points: np.ndarray
+    begun_s: float
+    ended: Future
+
+    def end(self, code: int, words: str) -> None:
+        if not self.ended.done():
+            self.ended.set_result(Result(error_code=code, error_string=words))
+
+
+class Follower(Node):
+    """The controller and its robot.
+
+    Attributes
+    ----------
+    goals : as they were received, rejected ones too.
+    feedback : what it sent.
+    stuck : the robot does not move.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("arm_controller", **options)
+        self.q, self.hold = HOME.copy(), HOME.copy()
+        self.goals: list[Any] = []
+        self.feedback: list[Any] = []
+        self.stuck = False
+        self.path: Path | None = None
+        self._states = self.create_publisher(JointState, "joint_states", 10)
+        self._server = ActionServer(
+            self,
+            FollowJointTrajectory,
+            ACTION,
+            self._execute,
+            goal_callback=self._asked,
+            cancel_callback=self._cancelled,
+        )
+        self.create_timer(TICK_S, self._tick)
+
+    def close(self) -> None:
+        """Go, so that others see it gone."""
+        self._server.destroy()
+        self.destroy_node()
+
+    def _asked(self, request: Any) -> GoalResponse:
+        self.goals.append(request)
+        good = request.trajectory.points and set(request.trajectory.joint_names) == set(NAMES)
+        return GoalResponse.ACCEPT if good else GoalResponse.REJECT
+
+    async def _execute(self, goal: Any) -> Any:
+        if self.path is not None:
+            self.path.end(Result.INVALID_GOAL, "preempted by a newer goal")
+        trajectory = goal.request.trajectory
+        order = [trajectory.joint_names.index(name) for name in NAMES]
+        from_start = [p.time_from_start for p in trajectory.points]
+        times = np.array([t.sec + t.nanosec * 1e-9 for t in from_start])
+        points = np.array([p.positions for p in trajectory.points])[:, order]
+        path = self.path = Path(goal, times, points, self._now_s(), Future())
+        result = await path.ended
+        if goal.is_cancel_requested:
+            goal.canceled()
+        elif result.error_code == Result.SUCCESSFUL:
+            goal.succeed()
+        else:
+            goal.abort()
+        return result
+
+    def _cancelled(self, goal: Any) -> CancelResponse:
+        if self.path is not None and self.path.goal == goal:
+            self.path.end(Result.SUCCESSFUL, "")
+            self.path, self.hold = None, self.q.copy()
+        return CancelResponse.ACCEPT
+
+    def _now_s(self) -> float:
+        return self.get_clock().now().nanoseconds * 1e-9
+
+    def _tick(self) -> None:
+        path = self.path
+        if path is not None:
+            at = self._now_s() - path.begun_s
+            self.hold = np.array([np.interp(at, path.times, column) for column in path.points.T])
+        lag = 0.0 if self.stuck else LAG
+        moved = lag * (self.hold - self.q)
+        self.q = self.q + moved
+        stamp = self.get_clock().now().to_msg()
+        state = JointState(name=NAMES, position=self.q.tolist())
+        state.header.stamp = stamp
+        self._states.publish(state)
+        if path is not None:
+            self._tell(path, moved / TICK_S)
+            self._judge(path, at)
+
+    def _tell(self, path: Path, speed: np.ndarray) -> None:
+        def point(position: np.ndarray, velocity: np.ndarray) -> JointTrajectoryPoint:
+            return JointTrajectoryPoint(
+                positions=position.tolist(),
+                velocities=velocity.tolist(),
+                accelerations=[0.5] * 6,
+            )
+
+        message = FollowJointTrajectory.Feedback(joint_names=NAMES)
+        message.desired = point(self.hold, 2.0 * speed)
+        message.actual = point(self.q, speed)
+        message.error = point(self.hold - self.q, speed)
+        message.multi_dof_joint_names = ["rail"]
+        self.feedback.append(message)
+        path.goal.publish_feedback(message)
+
+    def _judge(self, path: Path, at: float) -> None:
+        error = np.abs(self.hold - self.q)
+        for tolerance in path.goal.request.path_tolerance:
+            if error[NAMES.index(tolerance.name)] > tolerance.position:
+                path.end(Result.PATH_TOLERANCE_VIOLATED, f"path tolerance of {tolerance.name}")
+                self.path, self.hold = None, self.q.copy()
+                return
+        if at >= path.times[-1] and error.max() < THERE:
+            path.end(Result.SUCCESSFUL, "Goal successfully reached!")
+            self.path = None
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    rclpy.spin(Follower())

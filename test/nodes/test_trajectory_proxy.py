@@ -1,0 +1,436 @@
+"""The action of the joint correction before a controller's, over DDS."""
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Duration
+from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointTolerance
+from follower import ACTION, HOME, NAMES, Follower
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.action import ActionClient
+from robocal_msgs.msg import KinematicModel
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import CORRECTED, TAUGHT
+from robocal_ros.nodes import conversions, qos, trajectory_proxy
+from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.storage.robots import load_robot
+
+NOMINAL = load_robot("kr150_r3100")
+NODE = "/joint_correction_node"
+OWN = f"{NODE}/follow_joint_trajectory"
+Result = FollowJointTrajectory.Result
+MOVED = HOME + np.array([0.2, 0.1, -0.1, 0.2, -0.1, 0.3])
+AT_ONCE_S = 0.5  # with other work on the machine
+SETTINGS = {
+    "serial": "s1",
+    "follow_joint_trajectory": ACTION,
+    "enable_on_start": True,
+    "blend_deg_s": 5.0,
+    "joint_state_age_s": 5.0,
+}
+
+
+def drifted() -> SerialArm:
+    rng = np.random.default_rng(0)
+    chosen = NOMINAL.parameters
+    size = np.where(chosen.is_length, 1e-4, 5e-5)
+    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
+
+
+ACTUAL = drifted()
+
+
+def tcp(arm: SerialArm, q: Any) -> np.ndarray:
+    return np.asarray(arm.fk(np.array(q)) @ arm.T_flange_tool)
+
+
+def goal_of(*places: np.ndarray, lasts_s: float = 0.4, **fields: Any) -> Any:
+    """From place to place in equal times, at rest at the ends."""
+    times = np.linspace(0.0, lasts_s, len(places))
+    points = [
+        JointTrajectoryPoint(
+            positions=q.tolist(),
+            time_from_start=Duration(sec=int(t), nanosec=round(t % 1 * 1e9)),
+        )
+        for q, t in zip(places, times, strict=True)
+    ]
+    trajectory = JointTrajectory(joint_names=NAMES, points=points)
+    return FollowJointTrajectory.Goal(trajectory=trajectory, **fields)
+
+
+class Sent:
+    """A goal as its caller sees it."""
+
+    def __init__(self, cell: "Cell", goal: Any) -> None:
+        self._cell = cell
+        self.feedback: list[Any] = []
+        self.handle: Any = None
+        self.answer: Any = None
+        future = cell.client.send_goal_async(goal, lambda m: self.feedback.append(m.feedback))
+        future.add_done_callback(self._accepted)
+
+    def _accepted(self, future: Any) -> None:
+        self.handle = future.result()
+        if self.handle.accepted:
+            done = self.handle.get_result_async()
+            done.add_done_callback(lambda f: setattr(self, "answer", f.result()))
+
+    def ends(self, status: int, within_s: float = 5.0) -> Any:
+        self._cell.graph.spin_until(lambda: self.answer, "the goal ends", within_s)
+        assert self.answer.status == status, self.answer
+        return self.answer.result
+
+    def moves(self) -> "Sent":
+        self._cell.graph.spin_until(lambda: len(self.feedback) > 2, "the robot moves")
+        return self
+
+
+class Cell:
+    """Caller (the probe), correction node and controller; the model is in force."""
+
+    def __init__(self, graph: Any) -> None:
+        self.graph = graph
+        self.client = ActionClient(
+            graph.probe, FollowJointTrajectory, f"{NODE}/follow_joint_trajectory"
+        )
+        self.states = graph.collect(JointState, f"{NODE}/joint_states")
+
+    def begin(self, settled: bool = True) -> None:
+        self.graph.spin_until(self.client.server_is_ready, "the action")
+        publisher = self.graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+        fields = {"serial": "s1", "model_hash": NOMINAL.model_hash, "revision": 1}
+        stamp = Header(frame_id="base")
+        state = KinematicModel.ACCEPTED
+        document = model_document(ACTUAL)
+        publisher.publish(conversions.kinematic_model(document, stamp=stamp, state=state, **fields))
+        self.graph.spin_until(lambda: len(self.states) > 5, "joint states")
+        if settled:
+            self.send(HOME, HOME).ends(GoalStatus.STATUS_SUCCEEDED)
+
+    def send(self, *places: np.ndarray, **fields: Any) -> Sent:
+        return Sent(self, goal_of(*places, **fields))
+
+    def change(self, *transitions: int) -> None:
+        """Let the node go through its lifecycle."""
+        for what in transitions:
+            transition = Transition(id=what)
+            assert self.graph.call(
+                ChangeState, f"{NODE}/change_state", transition=transition
+            ).success
+
+    def taught(self) -> np.ndarray:
+        """Where the robot stands, as planners see it."""
+        self.states.clear()
+        self.graph.spin_until(lambda: len(self.states) > 3, "joint states")
+        return np.array(self.states[-1].position)
+
+
+@pytest.fixture
+def cell(graph: Any) -> Iterator[Any]:
+    """With node and controller in the test's process."""
+    cell = Cell(graph)
+    cell.robot = Follower(context=graph.context)
+    graph.executor.add_node(cell.robot)
+    cell.node = graph.add(JointCorrectionNode, SETTINGS)
+    client = cell.node._proxy._clients[ACTION]
+    graph.spin_until(client.server_is_ready, "the controller")
+    yield cell
+    cell.client.destroy()
+    cell.robot.close()
+
+
+def test_a_goal_reaches_the_taught_pose_and_all_else_passes(cell: Any) -> None:
+    cell.begin()
+    tolerance = [JointTolerance(name=NAMES[2], position=0.5, velocity=-1.0)]
+    fields = {"path_tolerance": tolerance, "goal_time_tolerance": Duration(sec=3)}
+    sent = cell.send(HOME, MOVED, goal_tolerance=tolerance, **fields)
+    result = sent.ends(GoalStatus.STATUS_SUCCEEDED)
+    assert (result.error_code, result.error_string) == (0, "Goal successfully reached!")
+    received = cell.robot.goals[-1]
+    points = received.trajectory.points
+    assert received.trajectory.header.frame_id == CORRECTED
+    assert [p.time_from_start for p in points] == [Duration(), Duration(nanosec=400_000_000)]
+    assert received.path_tolerance == received.goal_tolerance == tolerance
+    assert received.goal_time_tolerance == Duration(sec=3)
+    for point, taught in zip(points, (HOME, MOVED), strict=True):
+        assert np.abs(tcp(ACTUAL, point.positions) - tcp(NOMINAL, taught)).max() < 1e-8
+        assert np.abs(tcp(ACTUAL, taught) - tcp(NOMINAL, taught)).max() > 1e-5
+
+
+def test_feedback_is_of_the_taught_world(cell: Any) -> None:
+    cell.begin()
+    cell.robot.feedback.clear()
+    sent = cell.send(HOME, MOVED)
+    sent.ends(GoalStatus.STATUS_SUCCEEDED)
+    cell.graph.spin_until(lambda: len(sent.feedback) >= len(cell.robot.feedback), "all feedback")
+    for raw, feedback in zip(cell.robot.feedback, sent.feedback, strict=True):
+        for name in ("desired", "actual"):
+            taught, driven = getattr(feedback, name), getattr(raw, name)
+            miss = tcp(NOMINAL, taught.positions) - tcp(ACTUAL, driven.positions)
+            assert np.abs(miss).max() < 1e-8
+            step = 1e-6  # the tool's velocity is the same too
+            ahead = np.array(driven.positions) + step * np.array(driven.velocities)
+            moved = np.array(taught.positions) + step * np.array(taught.velocities)
+            assert np.abs(tcp(NOMINAL, moved) - tcp(ACTUAL, ahead)).max() < 1e-8
+            assert not taught.accelerations
+        for name in ("positions", "velocities"):
+            desired, actual, error = (
+                np.array(getattr(part, name))
+                for part in (feedback.desired, feedback.actual, feedback.error)
+            )
+            assert np.array_equal(error, desired - actual)
+        assert feedback.header.frame_id == TAUGHT
+        assert feedback.multi_dof_joint_names == ["rail"]
+    assert np.abs(np.array(sent.feedback[-1].desired.positions) - MOVED).max() < 1e-9
+
+
+def test_a_cancel_stops_the_robot_and_the_next_goal_goes_on_from_there(cell: Any) -> None:
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    asked = time.monotonic()
+    sent.handle.cancel_goal_async()
+    cell.graph.spin_until(lambda: cell.robot.path is None, "the robot holds", AT_ONCE_S)
+    assert sent.ends(GoalStatus.STATUS_CANCELED, AT_ONCE_S).error_code == Result.SUCCESSFUL
+    assert time.monotonic() - asked < AT_ONCE_S
+    here = cell.taught()
+    assert 1e-4 < np.abs(here - HOME).max() < np.abs(MOVED - HOME).max()
+    cell.send(here, MOVED).ends(GoalStatus.STATUS_SUCCEEDED)
+    assert np.abs(tcp(ACTUAL, cell.robot.q) - tcp(NOMINAL, MOVED)).max() < 1e-5
+
+
+def test_a_blend_ends_where_its_goal_was_cancelled(cell: Any) -> None:
+    cell.begin(settled=False)
+    sent = cell.send(HOME, HOME, lasts_s=4.0)  # the blend goes from point to point
+    cell.graph.spin_until(lambda: np.abs(cell.robot.q - HOME).max() > 1e-5, "the blend")
+    sent.handle.cancel_goal_async()
+    sent.ends(GoalStatus.STATUS_CANCELED)
+    cell.graph.spin_for(0.8)
+    whole = np.abs(np.array(cell.robot.goals[-1].trajectory.points[-1].positions) - HOME).max()
+    assert np.abs(cell.taught() - HOME).max() < 0.1 / 4.0 * whole  # 0.1 s of the blend
+
+
+def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=0.8).moves()
+    count = len(cell.robot.goals)
+    unknown, missing = goal_of(HOME, MOVED), goal_of(HOME, MOVED * np.nan)
+    unknown.trajectory.joint_names = [*NAMES[:5], "elbow"]
+    result = Sent(cell, unknown).ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_code == Result.INVALID_JOINTS
+    assert "elbow" in result.error_string
+    result = Sent(cell, missing).ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_code == Result.INVALID_GOAL
+    assert "not finite" in result.error_string
+    again = goal_of(HOME, MOVED)
+    again.trajectory.header.frame_id = CORRECTED
+    result = Sent(cell, again).ends(GoalStatus.STATUS_ABORTED)
+    assert "comes from a joint correction already" in result.error_string
+    cell.node._proxy._correct = lambda message: 1 / 0
+    result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
+    assert "a defect of this software" in result.error_string
+    sent.ends(GoalStatus.STATUS_SUCCEEDED)
+    assert len(cell.robot.goals) == count
+
+
+def test_a_goal_without_points_stops_the_robot_at_once(cell: Any) -> None:
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    stop = Sent(cell, goal_of())
+    cell.graph.spin_until(lambda: cell.robot.path is None, "the robot holds", AT_ONCE_S)
+    assert not cell.robot.goals[-1].trajectory.points
+    assert sent.ends(GoalStatus.STATUS_ABORTED).error_code == Result.INVALID_GOAL
+    result = stop.ends(GoalStatus.STATUS_ABORTED)  # this controller rejects it
+    assert "rejected" in result.error_string
+    cell.send(cell.taught(), MOVED).ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_new_goal_preempts(cell: Any) -> None:
+    cell.begin()
+    first = cell.send(HOME, MOVED, lasts_s=4.0).moves()
+    second = cell.send(HOME, lasts_s=1.0)
+    result = first.ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_code == Result.INVALID_GOAL
+    assert result.error_string == "preempted by a newer goal"
+    second.ends(GoalStatus.STATUS_SUCCEEDED)
+    assert np.abs(tcp(ACTUAL, cell.robot.q) - tcp(NOMINAL, HOME)).max() < 1e-5
+
+
+def test_a_violated_tolerance_keeps_its_code(cell: Any) -> None:
+    cell.begin()
+    cell.robot.stuck = True
+    tolerance = [JointTolerance(name=NAMES[0], position=0.01)]
+    result = cell.send(HOME, MOVED, path_tolerance=tolerance).ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_code == Result.PATH_TOLERANCE_VIOLATED
+    assert result.error_string == "path tolerance of joint_a1"
+
+
+def test_deactivation_cancels_and_rejects(cell: Any) -> None:
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    cell.change(Transition.TRANSITION_DEACTIVATE)
+    result = sent.ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_code == Result.INVALID_GOAL
+    assert "deactivated" in result.error_string
+    cell.graph.spin_until(lambda: cell.robot.path is None, "the robot holds", AT_ONCE_S)
+    for _ in range(2):  # inactive, then unconfigured
+        rejected = cell.send(HOME, MOVED)
+        cell.graph.spin_until(lambda sent=rejected: sent.handle, "the answer")
+        assert not rejected.handle.accepted
+        if cell.node.state == "inactive":
+            cell.change(Transition.TRANSITION_CLEANUP)
+    cell.change(Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+    here = cell.taught()
+    cell.send(here, HOME).ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_without_a_controller_a_goal_ends_at_once(graph: Any) -> None:
+    cell = Cell(graph)
+    graph.add(JointCorrectionNode, SETTINGS)
+    graph.spin_until(cell.client.server_is_ready, "the action")
+    result = cell.send(HOME, HOME).ends(GoalStatus.STATUS_ABORTED)
+    assert result.error_code == Result.INVALID_GOAL
+    assert f"no controller offers {ACTION}" in result.error_string
+    cell.client.destroy()
+
+
+def test_its_own_action_is_not_the_controllers(graph: Any) -> None:
+    node = graph.add(
+        JointCorrectionNode,
+        SETTINGS | {"follow_joint_trajectory": f"{NODE}/follow_joint_trajectory"},
+    )
+    assert node.state == "unconfigured"
+    assert "name the controller's" in node._full_health().message
+
+
+def test_two_controllers_get_no_goal_but_the_stop(cell: Any) -> None:
+    cell.begin()
+    other = Follower(context=cell.graph.context)
+    cell.graph.executor.add_node(other)
+    proxy = cell.node._proxy
+    cell.graph.spin_until(lambda: len(proxy._servers()) == 2, "both controllers")
+    result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
+    assert f"2 nodes offer {ACTION}" in result.error_string
+    assert not other.goals
+    Sent(cell, goal_of())
+    cell.graph.spin_until(lambda: other.goals, "the stop")
+    other.close()
+    cell.graph.spin_until(lambda: len(proxy._servers()) == 1, "one controller")
+    cell.send(HOME, MOVED).ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_renamed_action_and_a_controller_that_goes(graph: Any) -> None:
+    cell = Cell(graph)
+    robot = Follower(context=graph.context)
+    graph.executor.add_node(robot)
+    renamed = ["--ros-args", "-r", f"{OWN}:=/arm/follow_joint_trajectory"]
+    graph.add(JointCorrectionNode, SETTINGS, cli_args=renamed)
+    cell.client.destroy()
+    cell.client = ActionClient(graph.probe, FollowJointTrajectory, "/arm/follow_joint_trajectory")
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    robot.close()
+    assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 1.0).error_string
+    cell.client.destroy()
+
+
+# ---- node and controller as processes: the node in its own executor -----------------------------
+
+SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
+<participant profile_name="short_lease" is_default_profile="true"><rtps><builtin>
+<discovery_config>
+<leaseDuration><sec>2</sec></leaseDuration>
+<leaseAnnouncement><sec>0</sec><nanosec>100000000</nanosec></leaseAnnouncement>
+</discovery_config>
+</builtin></rtps></participant>
+</profiles></dds>
+"""
+LEASE_S = 2.0
+
+
+@pytest.fixture
+def apart(graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The controller is a process whose death is noticed after 2 s."""
+    cell = Cell(graph)
+    profiles = tmp_path / "lease.xml"
+    profiles.write_text(SHORT_LEASE)
+
+    def start() -> Any:
+        with monkeypatch.context() as patch:
+            patch.setitem(graph._environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(profiles))
+            return graph.start(Path(__file__).parent / "follower.py")
+
+    cell.start = start
+    cell.controller = start()
+    yield cell
+    cell.client.destroy()
+
+
+def test_goal_cancel_configuration_and_signal_in_the_events_executor(apart: Any) -> None:
+    cell = apart
+    process = cell.graph.start("joint_correction_node", SETTINGS)
+    cell.begin()
+    sent = cell.send(HOME, MOVED)
+    assert sent.ends(GoalStatus.STATUS_SUCCEEDED).error_string == "Goal successfully reached!"
+    assert np.abs(np.array(sent.feedback[-1].desired.positions) - MOVED).max() < 1e-9
+    sent = cell.send(MOVED, HOME, lasts_s=20.0).moves()
+    sent.handle.cancel_goal_async()
+    sent.ends(GoalStatus.STATUS_CANCELED, AT_ONCE_S)
+    for _ in range(4):  # a new configuration in mid goal
+        cell.send(cell.taught(), HOME, lasts_s=20.0).moves()
+        cell.change(
+            Transition.TRANSITION_DEACTIVATE,
+            Transition.TRANSITION_CLEANUP,
+            Transition.TRANSITION_CONFIGURE,
+            Transition.TRANSITION_ACTIVATE,
+        )
+        cell.taught()
+    cell.send(cell.taught(), HOME, lasts_s=20.0).moves()
+    assert process.stop(signal.SIGINT) == 0, process.output
+    assert "Traceback" not in process.output
+    raw = cell.graph.collect(JointState, "joint_states")
+    cell.graph.spin_until(
+        lambda: len(raw) > 10 and raw[-1].position == raw[-10].position, "the robot holds"
+    )
+    assert np.abs(np.array(raw[-1].position) - HOME).max() > 0.1
+
+
+def test_a_controller_that_is_killed_ends_the_goal(apart: Any) -> None:
+    cell = apart
+    cell.graph.start("joint_correction_node", SETTINGS)
+    cell.begin()
+    sent = cell.send(HOME, MOVED, lasts_s=20.0).moves()
+    cell.controller.kill()
+    again = cell.start()  # at once: the old one is still believed alive
+    result = sent.ends(GoalStatus.STATUS_ABORTED, LEASE_S + 3.0)
+    assert "vanished" in result.error_string
+    assert again.process.poll() is None
+    cell.graph.call(SetBool, f"{NODE}/enable", data=True)
+    cell.send(cell.taught(), HOME).ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_goal_accepted_too_late_is_cancelled(apart: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(trajectory_proxy, "ANSWER_S", 0.4)
+    cell = apart
+    cell.graph.add(JointCorrectionNode, SETTINGS)
+    cell.begin()
+    cell.controller.process.send_signal(signal.SIGSTOP)
+    result = cell.send(HOME, MOVED, lasts_s=10.0).ends(GoalStatus.STATUS_ABORTED, 1.5)
+    assert "did not answer within 0.4 s to the goal" in result.error_string
+    cell.controller.process.send_signal(signal.SIGCONT)
+    cell.graph.spin_for(1.0)  # a tenth of the way, if it were not cancelled
+    assert np.abs(cell.taught() - HOME).max() < 0.01 * np.abs(MOVED - HOME).max()
