@@ -6,9 +6,11 @@
 import sys
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -22,7 +24,7 @@ KINDS = {
 
 def main(executor: str) -> None:
     """Relay each topic to the same one below ``~/`` until the process is ended."""
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # a signal ends it at once
     node = rclpy.create_node("relay")
     reliable = QoSProfile(depth=100)
     sensor = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -32,10 +34,8 @@ def main(executor: str) -> None:
         node.create_subscription(kind, topic, publisher.publish, profile)
     spinning = EXECUTORS[executor]()
     spinning.add_node(node)
-    try:
-        spinning.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        rclpy.try_shutdown()
+    while rclpy.ok():
+        spinning.spin_until_future_complete(Future(), timeout_sec=0.5)  # as nodes.run does
 
 
 if __name__ == "__main__":

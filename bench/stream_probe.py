@@ -250,13 +250,15 @@ class Probe:
         """Take what comes for so long."""
         self._executor.spin_until_future_complete(Future(), timeout_sec=seconds)
 
-    def wait(self, condition: Callable[[], object], what: str) -> None:
+    def wait(
+        self, condition: Callable[[], object], what: str, patience_s: float = PATIENCE_S
+    ) -> None:
         """Spin until something holds."""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + patience_s
         while not condition():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"waited {PATIENCE_S:.0f} s for {what}")
-            self.spin(0.02)
+                raise TimeoutError(f"waited {patience_s:g} s for {what}")
+            self.spin(0.005)
 
     def stream(self, stream: Stream, rate_hz: float, seconds: float) -> None:
         """States and targets by turns; targets begin a little later, where the robot stands."""
