@@ -9,6 +9,7 @@ corrector   which model corrects at every instant, and where a correction may st
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, ShiftBounds
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.sessions.correction.incoming import require_finite
 from robocal_ros.sessions.correction.inputs import (
     CorrectionStatus,
     JointCommand,
@@ -38,5 +39,6 @@ __all__ = [
     "joint_command",
     "offered_model",
     "offered_tool",
+    "require_finite",
     "trajectory_command",
 ]
