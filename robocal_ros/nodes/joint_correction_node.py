@@ -13,11 +13,13 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.core import serialized_path
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
+from robocal_ros.nodes.path_messages import PathMessage
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.sessions.correction import (
@@ -31,7 +33,6 @@ from robocal_ros.sessions.correction import (
     joint_command,
     offered_model,
     offered_tool,
-    trajectory_command,
 )
 
 TRAJECTORY = "joint_trajectory"
@@ -55,6 +56,7 @@ class JointCorrectionNode(HouseNode):
         serial = self.settings["serial"] or NO_SERIAL
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
+        serialized_path.load_kernels()
         self._session.enable(self.settings["enable_on_start"])
         self._refusals = 0
         self._outputs = {
@@ -67,8 +69,13 @@ class JointCorrectionNode(HouseNode):
         self.add_input(TransformStamped, TOOL, self._on_tool, qos.LATCHED)
         self.add_input(JointState, STATES, self._guarded(STATES, self._on_states), qos.SENSOR)
         self.add_input(JointState, TARGETS, self._guarded(TARGETS, self._on_target), qos.RELIABLE)
+        receive = self._guarded(TRAJECTORY, self._on_path)
         self.add_input(
-            JointTrajectory, TRAJECTORY, self._guarded(TRAJECTORY, self._on_path), qos.RELIABLE
+            JointTrajectory,
+            TRAJECTORY,
+            lambda data: receive(PathMessage(data)),
+            qos.RELIABLE,
+            raw=True,
         )
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_timer(POLL_S, self._look, steady=True)
@@ -124,18 +131,19 @@ class JointCorrectionNode(HouseNode):
             message.velocity = _doubles(command.velocity)
         self._outputs[topic].publish(message)
 
-    def _on_path(self, message: Any) -> None:
+    def _on_path(self, message: PathMessage) -> None:
         now = time.monotonic()
         if not message.points:
-            self._outputs[TRAJECTORY].publish(message)
+            self._outputs[TRAJECTORY].publish(message.unchanged())
             self._session.trajectory(_STOP, now)
             return
-        command = self._session.counted(lambda: trajectory_command(message))
+        command = self._session.counted(message.command)
         starts_in = (command.stamp_ns - self.now_ns()) * 1e-9 if command.stamp_ns else 0.0
         corrected = self._session.trajectory(command, now, starts_in)
-        if corrected is not command:
-            _fill(message, corrected)
-        self._outputs[TRAJECTORY].publish(message)
+        same = corrected is command
+        self._outputs[TRAJECTORY].publish(
+            message.unchanged() if same else message.corrected(corrected)
+        )
 
     # ---- what is reported -----------------------------------------------------------------------
 
@@ -189,20 +197,6 @@ _STOP = TrajectoryCommand((), np.empty((0, 0)), np.empty(0))
 
 def _refuse(detail: str) -> None:
     raise RefusedError(Reason.OWN_OUTPUT, detail)
-
-
-def _fill(message: Any, command: TrajectoryCommand) -> None:
-    """Put corrected positions and rates into the message; times and efforts stay."""
-    message.header.frame_id = command.mark
-    changed = {
-        "positions": command.position,
-        "velocities": command.velocity,
-        "accelerations": command.acceleration,
-    }
-    for name, values in changed.items():
-        if values is not None:
-            for point, row in zip(message.points, values, strict=True):
-                setattr(point, name, _doubles(row))
 
 
 def _doubles(values: NDArray[np.float64]) -> "array[float]":
