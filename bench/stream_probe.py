@@ -6,6 +6,7 @@ import os
 import struct
 import subprocess
 import time
+from array import array
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -168,16 +169,16 @@ class Stream:
     robot : joints that were put out last: the robot is where it is sent.
     took : seconds from publishing to coming back, by topic; since `forget`.
     sent : how many went out, by topic; since `forget`.
-    watch : called with (stamp_ns, positions, velocities) of each target that comes back.
+    watch : called with the taught and the corrected positions of each target that comes back.
     """
 
     def __init__(self, probe: "Probe", subject: Subject, names: Sequence[str]) -> None:
         self.subject, self.names = subject, tuple(names)
         self._buffer = Buffer(names)
         self.t = 0.0
-        self._pending: dict[tuple[str, int], float] = {}
+        self._pending: dict[tuple[str, int], tuple[float, Array]] = {}
         self.robot = path(0.0)[0]
-        self.watch: Callable[[int, Array, Array], None] = lambda *_: None
+        self.watch: Callable[[Array, Array], object] = lambda taught, corrected: None
         self.forget()
         self._publishers = {}
         for topic in (TARGETS, STATES):
@@ -193,7 +194,7 @@ class Stream:
 
     def forget(self) -> None:
         """Drop what was measured so far."""
-        self.took: dict[str, list[float]] = defaultdict(list)
+        self.took: dict[str, array[float]] = defaultdict(lambda: array("d"))
         self.sent: dict[str, int] = defaultdict(int)
         self._pending.clear()
 
@@ -210,13 +211,13 @@ class Stream:
     def _taker(self, topic: str) -> Callable[[bytes], None]:
         def come_back(data: bytes) -> None:
             now, stamp = time.perf_counter(), stamp_of(data)
-            begun = self._pending.pop((topic, stamp), None)
-            if begun is not None:
-                self.took[topic].append(now - begun)
+            begun, taught = self._pending.pop((topic, stamp), (None, None))
+            if begun is None or taught is None:
+                return
+            self.took[topic].append(now - begun)
             if topic == TARGETS:
-                position, velocity = self._buffer.joints(data)
-                self.robot = position.copy()  # the robot is where it is sent
-                self.watch(stamp, position, velocity)
+                self.robot = self._buffer.joints(data)[0].copy()  # the robot is where it is sent
+                self.watch(taught, self.robot)
 
         return come_back
 
@@ -233,7 +234,7 @@ class Stream:
         stamp = time.time_ns()
         data = self._buffer.filled(stamp, position, velocity)
         self.sent[topic] += 1
-        self._pending[topic, stamp] = time.perf_counter()
+        self._pending[topic, stamp] = time.perf_counter(), position
         self._publishers[topic].publish(data)
 
 
