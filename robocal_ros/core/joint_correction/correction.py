@@ -46,8 +46,10 @@ def pack_model(arm: SerialArm) -> Array:
 def plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """The one array type that the kernels are compiled for: contiguous and writable."""
     array = np.asarray(values, dtype=np.float64)
-    if shape is not None:
+    if shape is not None and array.shape != shape:
         array = np.broadcast_to(array, shape)
+    if array.flags.carray:
+        return array
     return np.require(array, requirements=["C", "W"])
 
 
@@ -107,6 +109,7 @@ class JointCorrection:
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
         self._work = np.empty(solution.work_size(self.n))
+        self._inverse: JointCorrection | None = None  # made once, for a stream of readings
 
     @classmethod
     def between(
@@ -147,7 +150,9 @@ class JointCorrection:
 
         Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1.
         """
-        return JointCorrection(self.models[[2, 3, 0, 1]], self.largest)
+        if self._inverse is None:
+            self._inverse = JointCorrection(self.models[[2, 3, 0, 1]], self.largest)
+        return self._inverse
 
 
 def path_rates(
