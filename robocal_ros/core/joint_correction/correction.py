@@ -105,7 +105,7 @@ class JointCorrection:
         self.n = self.models.shape[1] - 2
         if self.models.shape != (4, self.n + 2, 9):
             raise ValueError(f"models have shape {self.models.shape}, expected (4, n + 2, 9)")
-        self.largest = plain(largest, (self.n,))
+        self.largest = plain(largest, (self.n,)).copy()
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
         self._work = np.empty(solution.work_size(self.n))
