@@ -19,7 +19,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.joint_correction_settings import SETTINGS, arms, session_config
-from robocal_ros.nodes.path_messages import PathMessage
+from robocal_ros.nodes.path_messages import PathMessage, read_message
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.sessions.correction import (
@@ -34,6 +34,7 @@ from robocal_ros.sessions.correction import (
     offered_model,
     offered_tool,
 )
+from robocal_ros.sessions.correction.wire import JointWire
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
@@ -67,8 +68,13 @@ class JointCorrectionNode(HouseNode):
         self._sources = {topic: SourceGuard(self, topic) for topic in self._outputs}
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
         self.add_input(TransformStamped, TOOL, self._on_tool, qos.LATCHED)
-        self.add_input(JointState, STATES, self._guarded(STATES, self._on_states), qos.SENSOR)
-        self.add_input(JointState, TARGETS, self._guarded(TARGETS, self._on_target), qos.RELIABLE)
+        self._wires = {topic: JointWire() for topic in (STATES, TARGETS)}
+        states, targets = (
+            self._guarded(topic, act)
+            for topic, act in ((STATES, self._on_states), (TARGETS, self._on_target))
+        )
+        self.add_input(JointState, STATES, states, qos.SENSOR, raw=True)
+        self.add_input(JointState, TARGETS, targets, qos.RELIABLE, raw=True)
         receive = self._guarded(TRAJECTORY, self._on_path)
         self.add_input(
             JointTrajectory,
@@ -112,19 +118,32 @@ class JointCorrectionNode(HouseNode):
 
         return receive
 
-    def _on_target(self, message: Any) -> None:
-        command = self._session.counted(lambda: finite_command(message))
-        self._put_out(TARGETS, message, self._session.target(command, time.monotonic()))
+    def _on_target(self, data: bytes) -> None:
+        command, message = self._wires[TARGETS].read(data), None
+        if command is None:
+            message = read_message(data, JointState)
+            command = self._session.counted(lambda: finite_command(message))
+        self._put_out(TARGETS, data, message, self._session.target(command, time.monotonic()))
 
-    def _on_states(self, message: Any) -> None:
-        command = self._session.counted(lambda: joint_command(message))
-        if not np.all(np.isfinite(message.effort)):
-            message.effort = _doubles(np.empty(0))  # many drivers have none: no NaN goes out
+    def _on_states(self, data: bytes) -> None:
+        command, message = self._wires[STATES].read(data), None
+        if command is None:
+            message = read_message(data, JointState)
+            command = self._session.counted(lambda: joint_command(message))
+            if not np.all(np.isfinite(message.effort)):
+                message.effort = _doubles(np.empty(0))  # many drivers have none: no NaN goes out
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
-        self._put_out(STATES, message, self._session.reading(command, time.monotonic(), age))
+        taught = self._session.reading(command, time.monotonic(), age)
+        self._put_out(STATES, data, message, taught)
 
-    def _put_out(self, topic: str, message: Any, command: JointCommand) -> None:
-        """Publish the message with the command's values; what it did not change stays."""
+    def _put_out(self, topic: str, data: bytes, message: Any, command: JointCommand) -> None:
+        """Publish what came with the command's values; what it did not change stays.
+
+        ``message`` is None for data that were read from the wire.
+        """
+        if message is None:
+            self._outputs[topic].publish(self._wires[topic].written(data, command))
+            return
         message.header.frame_id = command.mark
         message.position = _doubles(command.position)
         if command.velocity is not None:

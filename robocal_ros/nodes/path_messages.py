@@ -16,6 +16,20 @@ from robocal_ros.sessions.correction import (
 POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = range(4)
 
 
+def read_message(data: bytes, kind: type) -> Any:
+    """Build a message.
+
+    Raises
+    ------
+    InputError
+        When the bytes are no such message.
+    """
+    try:
+        return deserialize_message(data, kind)
+    except Exception as error:  # what the middleware says has no type of its own
+        raise InputError(f"this is no {kind.__name__}: {error}") from error
+
+
 class PathMessage:
     """A trajectory that came in, its command, and what goes out for it.
 
@@ -34,10 +48,7 @@ class PathMessage:
         self._path: SerializedPath | None = read_path(data)
         self._message: Any = None
         if self._path is None:
-            try:
-                self._message = deserialize_message(data, JointTrajectory)
-            except Exception as error:  # as rclpy wraps what the middleware says
-                raise InputError(f"the trajectory cannot be read: {error}") from error
+            self._message = read_message(data, JointTrajectory)
         self.points = len(self._message.points) if self._path is None else len(self._path)
 
     def command(self) -> TrajectoryCommand:
