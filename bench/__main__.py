@@ -27,6 +27,7 @@ KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
     from bench import (
         correction,
+        correction_stream,
         files,
         hand_eye,
         hand_eye_camera,
@@ -45,6 +46,9 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         print("no nodes in install/ (run `make setup`): their start is left out")
         return []
 
+    def streams() -> Sequence[Table]:
+        return correction_stream.tables() if startup.EXECUTABLES.is_dir() else []
+
     return {
         "real_data": real_data.tables,
         "monte_carlo": monte_carlo.tables,
@@ -56,6 +60,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "speed": speed.tables,
         "correction": correction.tables,
         "startup": start,
+        "correction_stream": streams,
         "files": lambda: [files.file_times()],
     }
 

@@ -84,9 +84,18 @@ class EndpointNode(LifecycleNode):
         return int(self.get_clock().now().nanoseconds)
 
     def add_input(
-        self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile,
+        *,
+        raw: bool = False,
     ) -> Subscription:
-        """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid."""
+        """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
+
+        ``raw``: the callback is given the serialized message.
+        """
         count = self.inputs.setdefault(topic, InputCount())
 
         def receive(message: Any) -> None:
@@ -111,6 +120,7 @@ class EndpointNode(LifecycleNode):
             qos.own(profile),
             event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
             qos_overriding_options=qos.overridable(),
+            raw=raw,
         )
         self._takers.append((subscription, receive))
         self._release.append(lambda: self.destroy_subscription(subscription))
@@ -124,7 +134,9 @@ class EndpointNode(LifecycleNode):
         for subscription, receive in self._takers:
             for _ in range(MOST_WAITING):
                 with subscription.handle:
-                    taken = subscription.handle.take_message(subscription.msg_type, False)
+                    taken = subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    )
                 if taken is None:
                     break
                 receive(taken[0])

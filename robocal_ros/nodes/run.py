@@ -13,6 +13,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.quiet_memory import QuietMemory
 
 SPIN_S = 0.5
 ENDING = {signal.SIGINT, signal.SIGTERM}
@@ -24,7 +25,8 @@ def run(node_class: type[HouseNode], *, events: bool = False) -> None:
     Parameters
     ----------
     node_class : what to run; its parameters come from the command line.
-    events : use the events executor: half the CPU and latency, but no ``async`` services.
+    events : use the events executor: half the CPU and latency, but no ``async`` services; and
+        collect garbage between callbacks only.
     """
     # A signal must not break into a callback: neither as an exception in the middle of it (the
     # conversion of a message then fails) nor as a shutdown of the context below it.
@@ -61,9 +63,12 @@ def _spin(node: HouseNode, events: bool) -> None:
     executor = EventsExecutor()
     executor.add_node(node)
     _watch_signals(ending, executor.wake)
+    memory = QuietMemory()
     while rclpy.ok() and not ending.is_set():
         # A new future each time: one that never ends would gather callbacks.
         executor.spin_until_future_complete(Future(), timeout_sec=SPIN_S)
+        memory.look()
+    memory.end()
 
 
 def _watch_signals(ending: threading.Event, wake: Callable[[], object]) -> None:

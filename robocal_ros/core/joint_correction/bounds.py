@@ -197,13 +197,13 @@ def require_speeds(velocity: Array, limits: Array, arm: SerialArm) -> None:
 
 
 def _require(fine: NDArray[np.bool_], reason: Reason, detail: str) -> None:
-    if not np.all(fine):
+    if not fine.all():
         raise RefusedError(reason, f"{detail} (point {int(np.argmin(fine)) + 1})")
 
 
 def _require_joints(shift: Array, largest: Array, arm: SerialArm) -> None:
     over = np.abs(shift) > largest + ROUNDING
-    if np.any(over):
+    if over.any():
         point, joint = np.argwhere(over)[0]
         raise RefusedError(
             Reason.JOINT_BOUND,

@@ -50,8 +50,10 @@ def pack_model(arm: SerialArm) -> Array:
 def plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """The one array type that the kernels are compiled for: contiguous and writable."""
     array = np.asarray(values, dtype=np.float64)
-    if shape is not None:
+    if shape is not None and array.shape != shape:
         array = np.broadcast_to(array, shape)
+    if array.flags.carray:
+        return array
     return np.require(array, requirements=["C", "W"])
 
 
@@ -112,10 +114,11 @@ class JointCorrection:
         self.n = self.models.shape[1] - 2
         if self.models.shape != (4, self.n + 2, 9):
             raise ValueError(f"models have shape {self.models.shape}, expected (4, n + 2, 9)")
-        self.largest = plain(largest, (self.n,))
+        self.largest = plain(largest, (self.n,)).copy()
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
         self._work = np.empty(solution.work_size(self.n))
+        self._inverse: JointCorrection | None = None  # made once, for a stream of readings
 
     @classmethod
     def between(
@@ -164,7 +167,9 @@ class JointCorrection:
         equations hold; with a free axis it chooses another turn, which differs by the second
         order of the shift: `staged.StagedCorrection.uncorrect` refines it.
         """
-        return JointCorrection(self.models[[2, 3, 0, 1]], self.largest, self.free_axis)
+        if self._inverse is None:
+            self._inverse = JointCorrection(self.models[[2, 3, 0, 1]], self.largest, self.free_axis)
+        return self._inverse
 
 
 def path_rates(

@@ -15,6 +15,7 @@ corrector   which model corrects at every instant
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.sessions.correction.incoming import require_finite
 from robocal_ros.sessions.correction.inputs import (
     JointCommand,
     OfferedModel,
@@ -46,5 +47,6 @@ __all__ = [
     "joint_command",
     "offered_model",
     "offered_tool",
+    "require_finite",
     "trajectory_command",
 ]

@@ -205,9 +205,9 @@ class Corrector:
             require_speeds(velocity, limits, self._arm)
 
     def _note(self, q: Array, result: StagedResult) -> None:
-        self.reduced += int(np.sum(~result.whole))
+        self.reduced += int((~result.whole).sum())
         self.figures = (
-            float(np.max(result.arm.tcp_shift_m)),
-            float(np.max(np.abs(result.q - q))),
-            float(np.max(result.remaining_m)),
+            float(result.arm.tcp_shift_m.max()),
+            float(np.abs(result.q - q).max()),
+            float(result.remaining_m.max()),
         )

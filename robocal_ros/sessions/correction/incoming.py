@@ -241,7 +241,7 @@ class Echoes:
             self._names = names
             self._positions = np.zeros((self._size, *corrected.shape))
             self._within = np.full(self._size, -1.0)
-        shift = float(np.max(np.abs(corrected - taught)))
+        shift = float(np.abs(corrected - taught).max())
         i = self._next % self._size
         self._positions[i] = corrected
         self._within[i] = min(ROUNDED, OF_SHIFT * shift) if shift > SHIFTED else -1.0
@@ -252,7 +252,7 @@ class Echoes:
         if names != self._names or position.shape != self._positions.shape[1:]:
             return False
         beside = np.abs(self._positions - position).reshape(self._size, -1).max(axis=1)
-        return bool(np.any(beside <= self._within))
+        return bool((beside <= self._within).any())
 
 
 def require_finite(names: tuple[str, ...], values: Array | None) -> None:

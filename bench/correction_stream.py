@@ -1,0 +1,285 @@
+"""What joint_correction_node adds to a stream of joint messages, beside a bare relay of rclpy.
+
+Needs rclpy, which the other benchmarks' venv has not: ``tables`` runs this file in the venv of the
+nodes, as ``tools/with_ros python -m bench.correction_stream`` does (``--seconds 4`` for a look).
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from array import array
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.startup import EXECUTABLES
+from bench.tables import Goal, Table
+
+if TYPE_CHECKING:
+    from bench.stream_probe import Probe, Stream
+
+ROOT = Path(__file__).parents[1]
+RATES_HZ = (500, 1000)
+SECONDS = 60.0  # of each stream
+BLOCK_S = 2.0  # each in its turn
+DRIFT_M = 0.5e-3
+POINTS, PATHS, PATH_S = 10_000, 10, 3.0
+NODE, RELAY, SINGLE = "corrected", "relayed", "relayed_single"
+IN_WORDS = {
+    NODE: "joint_correction_node",
+    RELAY: "bare relay, EventsExecutor",
+    SINGLE: "bare relay, SingleThreadedExecutor",
+}
+QUANTILES = (0.5, 0.99, 0.999)
+MOST = {"p50": 1.05, "p99": 1.15, "cpu_us": 1.25}
+GOALS = {"p50": "median", "p99": "99 %", "cpu_us": "CPU time per message"}
+
+
+def tables(seconds: float = SECONDS) -> Sequence[Table]:
+    """The streams and whole trajectories, measured in the venv of the nodes."""
+    command = [ROOT / "tools" / "with_ros", "python", "-m", "bench.correction_stream", "--json"]
+    done = subprocess.run(
+        [*command, "--seconds", str(seconds)],
+        cwd=ROOT,
+        env=os.environ | {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    return in_tables(json.loads(done.stdout))
+
+
+def in_tables(found: dict[str, Any]) -> Sequence[Table]:
+    """Distributions, their comparison with the goals, whole trajectories."""
+    streams = Table(
+        "correction_stream",
+        "Streams through joint_correction_node and through a bare relay",
+        ("through", "topic", "Hz", "n", "lost", "p50, ms", "p99, ms", "p99.9, ms", "longest, ms",
+         "CPU per message, µs"),
+        f"Position and velocity of six joints, there and back, {BLOCK_S:g} s of each by turns; "
+        "joint_states run beside the targets. The model in force has drifted by up to "
+        f"{DRIFT_M * 1e3:g} mm. CPU: of the whole process, both topics. Load of the machine in "
+        f"the last minute before and after: {found['load'][0]:.2f}, {found['load'][1]:.2f}; "
+        f"{os.cpu_count()} CPUs.",
+    )  # fmt: skip
+    beside = Table(
+        "correction_beside_relay",
+        "joint_correction_node beside a bare relay in the same executor",
+        ("targets, Hz", "figure", "relay", "node", "node / relay", "goal"),
+        "Of the rows above: joint_targets, there and back, ms; CPU in µs.",
+    )
+    for row in found["streams"]:
+        figures = [row[f"p{q * 100:g}"] for q in QUANTILES]
+        streams.add(
+            IN_WORDS[row["through"]], row["topic"], row["rate_hz"], row["n"], row["lost"],
+            *figures, row["longest"], row["cpu_us"],
+        )  # fmt: skip
+    for rate in sorted({row["rate_hz"] for row in found["streams"]}):
+        node, relay = (_targets(found["streams"], name, rate) for name in (NODE, RELAY))
+        for figure, words in GOALS.items():
+            ratio = node[figure] / relay[figure]
+            goal = Goal(ratio, MOST[figure])
+            beside.add(rate, words, relay[figure], node[figure], ratio, goal)
+        lost = sum(
+            r["lost"] for r in found["streams"] if r["rate_hz"] == rate and r["through"] == NODE
+        )
+        beside.add(rate, "messages lost", None, lost, None, Goal(lost, 0))
+    paths = Table(
+        "correction_path",
+        f"A whole trajectory of {POINTS} points, there and back",
+        ("through", "sent", "lost", "goal", "median, ms", "longest, ms", "median / relay"),
+        "Positions, velocities and accelerations of six joints: 1.9 MB.",
+    )
+    middle = {name: float(np.median(times)) for name, times in found["paths"].items() if times}
+    for name, times in found["paths"].items():
+        lost = PATHS - len(times)
+        figures = (middle[name], max(times), middle[name] / middle[RELAY]) if times else 3 * (None,)
+        paths.add(IN_WORDS[name], PATHS, lost, Goal(lost, 0), *figures)
+    return [streams, beside, paths]
+
+
+def _targets(rows: list[dict[str, Any]], through: str, rate: int) -> dict[str, Any]:
+    return next(
+        row for row in rows
+        if (row["through"], row["topic"], row["rate_hz"]) == (through, "joint_targets", rate)
+    )  # fmt: skip
+
+
+def measure(seconds: float) -> dict[str, Any]:
+    """All of it; times in ms."""
+    load = [os.getloadavg()[0]]
+    with tempfile.TemporaryDirectory() as folder, _subjects(Path(folder)) as (probe, streams):
+        rows = [row for rate in RATES_HZ for row in _stream(probe, streams, rate, seconds)]
+        paths = _paths(probe, streams)
+    load.append(os.getloadavg()[0])
+    return {"load": load, "streams": rows, "paths": paths}
+
+
+@contextlib.contextmanager
+def _subjects(folder: Path) -> "Iterator[tuple[Probe, list[Stream]]]":
+    """All processes with their streams, the correction in force and settled."""
+    from bench.stream_probe import Probe, Stream, Subject
+    from robocal_ros.storage.robots import load_robot
+
+    arm = load_robot("kr150_r3100")
+    relay = [sys.executable, Path(__file__).with_name("bare_relay.py")]
+    node = [EXECUTABLES / "joint_correction_node"]
+    given = {
+        NODE: ("joint_correction_node", node),
+        RELAY: ("relay", [*relay, "events"]),
+        SINGLE: ("relay", [*relay, "single"]),
+    }
+    probe = Probe()
+    subjects: list[Subject] = []
+    try:
+        for name, (own, command) in given.items():
+            subjects.append(Subject(name, own, command, folder))
+        streams = [Stream(probe, subject, arm.joint_names) for subject in subjects]
+        for stream in streams:
+            probe.wait(lambda s=stream: s.connected, stream.subject.name)
+        _correct(probe, streams[0], arm)
+        yield probe, streams
+    except TimeoutError:
+        for log in folder.glob("*.log"):
+            print(f"{log.stem}: {log.read_text()[-2000:]}", file=sys.stderr)
+        raise
+    finally:
+        probe.close(*subjects)
+
+
+def _correct(probe: "Probe", stream: "Stream", arm: Any) -> None:
+    """Bring a drift in force; stream until what comes back is corrected by it."""
+    from robocal_msgs.msg import KinematicModel
+
+    from bench.stream_probe import drifted, offered, path
+    from robocal_ros.core.joint_correction import JointCorrection
+
+    actual = drifted(arm, DRIFT_M)
+    models = probe.model_publisher(stream.subject)
+    models.publish(offered(arm, actual, 1, KinematicModel.ACCEPTED))
+    probe.enable(stream.subject)
+    correction = JointCorrection.between(arm, actual)
+    for _ in range(10):
+        probe.stream(stream, 250, 0.5)
+        probe.drain()
+        wanted = correction.correct(path(stream.t)[0]).q
+        if np.allclose(stream.robot, wanted, rtol=0.0, atol=1e-9):
+            return
+    raise TimeoutError("the correction did not come in force: see the node's diagnostics")
+
+
+def _stream(
+    probe: "Probe", streams: "list[Stream]", rate: int, seconds: float
+) -> Iterator[dict[str, Any]]:
+    """Blocks of each by turns, there and back, so that all meet the same machine."""
+    took: dict[tuple[str, str], list[float]] = defaultdict(list)
+    sent: dict[tuple[str, str], int] = defaultdict(int)
+    lost: dict[tuple[str, str], int] = defaultdict(int)
+    cpu_s: dict[str, float] = defaultdict(float)
+    for block in range(max(1, round(seconds / BLOCK_S))):
+        for stream in streams if block % 2 else reversed(streams):
+            name = stream.subject.name
+            stream.forget()
+            begin = stream.subject.cpu_s()
+            probe.stream(stream, rate, BLOCK_S)
+            probe.drain()
+            cpu_s[name] += stream.subject.cpu_s() - begin
+            for topic, count in stream.sent.items():
+                sent[name, topic] += count
+                lost[name, topic] += count - len(stream.took[topic])
+                took[name, topic] += stream.took[topic]
+    for (name, topic), times in took.items():
+        ms = np.array(times) * 1e3
+        messages = sum(count for (of, _), count in sent.items() if of == name)
+        figures = {f"p{q * 100:g}": float(np.quantile(ms, q)) for q in QUANTILES}
+        yield {
+            "through": name,
+            "topic": topic,
+            "rate_hz": rate,
+            "n": sent[name, topic],
+            "lost": lost[name, topic],
+            "longest": float(ms.max()),
+            "cpu_us": cpu_s[name] / messages * 1e6,
+        } | figures
+
+
+def _paths(probe: "Probe", streams: "list[Stream]") -> dict[str, list[float]]:
+    """How long whole trajectories take, ms, by turns."""
+    from rclpy.serialization import serialize_message
+    from trajectory_msgs.msg import JointTrajectory
+
+    from robocal_ros.nodes import qos
+
+    came: list[float] = []
+    chosen = [stream for stream in streams if stream.subject.name != SINGLE]
+    publishers = {}
+    for stream in chosen:
+        subject = stream.subject
+        name = subject.topic("joint_trajectory")
+        publishers[subject.name] = probe.node.create_publisher(JointTrajectory, name, qos.RELIABLE)
+        out = subject.topic(f"{subject.node}/joint_trajectory")
+        probe.node.create_subscription(
+            JointTrajectory, out, lambda _: came.append(time.perf_counter()), qos.RELIABLE, raw=True
+        )
+    for publisher in publishers.values():
+        probe.wait(publisher.get_subscription_count, "the trajectories' inputs")
+    probe.drain()
+    found: dict[str, list[float]] = defaultdict(list)
+    for _ in range(PATHS):
+        for stream in chosen:
+            data = serialize_message(_trajectory(stream))
+            name = stream.subject.name
+            for _ in range(20):  # where the robot is
+                stream.send_state()
+                probe.spin(0.005)
+            came.clear()
+            begin = time.perf_counter()
+            publishers[name].publish(data)
+            with contextlib.suppress(TimeoutError):
+                probe.wait(lambda: came, f"a trajectory through {name}", PATH_S)
+            found[name] += [(came[0] - begin) * 1e3] if came else []
+    return dict(found)
+
+
+def _trajectory(stream: "Stream") -> Any:
+    """The path from where the stream stands, a point each millisecond."""
+    from builtin_interfaces.msg import Duration
+    from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+    from bench.stream_probe import path
+
+    points = []
+    for i in range(POINTS):
+        q, speed = path(stream.t + 1e-3 * i)
+        rows = [array("d", row.tobytes()) for row in (q, speed, np.zeros(len(q)))]
+        point = JointTrajectoryPoint(positions=rows[0], velocities=rows[1], accelerations=rows[2])
+        point.time_from_start = Duration(sec=i // 1000, nanosec=i % 1000 * 10**6)
+        points.append(point)
+    return JointTrajectory(joint_names=list(stream.names), points=points)
+
+
+def main() -> None:
+    """Measure here, in the venv of the nodes."""
+    from bench.tables import show
+
+    parser = argparse.ArgumentParser(prog="python -m bench.correction_stream", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each stream")
+    parser.add_argument("--json", action="store_true", help="figures for the tables")
+    given = parser.parse_args()
+    found = measure(given.seconds)
+    if given.json:
+        print(json.dumps(found))
+    else:
+        show(in_tables(found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""joint_correction_node for hours: a stream at 500 Hz, and another model every ten seconds.
+
+``tools/with_ros python -m bench.soak_correction --seconds 60`` for a look; an hour is the default.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from robocal_msgs.msg import KinematicModel
+
+from bench.startup import EXECUTABLES
+from bench.stream_probe import TARGETS, Probe, Stream, Subject, drifted, offered
+from bench.tables import Goal, Table, show
+from robocal_ros.core.joint_correction import JointCorrection
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.storage.robots import load_robot
+
+Array = NDArray[np.float64]
+
+HOUR_S = 3600.0
+RATE_HZ = 500
+CHANGE_S = 10.0  # between two models
+SETTLED_S = 4.0  # after this a model is in force: twice 0.3 deg at 0.5 deg/s, and stalls
+LARGEST_M = 0.5e-3
+WARM = 2  # models until caches are full
+MOST_GROWTH_MB = 5.0
+EXACT_RAD = 1e-9
+
+
+class Watch:
+    """Judges each corrected target by the models that were offered last.
+
+    Attributes
+    ----------
+    worst : largest step of a joint's correction from one message to the next, in units of what
+        the blend may do in the longest step, and the models' own change between the two points.
+    stale : targets that the last model did not make, `SETTLED_S` after it was offered.
+    checked : targets that were compared with it.
+    """
+
+    def __init__(self, arm: SerialArm) -> None:
+        config = CorrectionConfig()
+        self._arm, self._blends = arm, config.blend_rad_s * config.longest_step_s
+        self._models = (JointCorrection.between(arm, arm),) * 2
+        self._last: tuple[Array, Array] | None = None
+        self._since_s = time.monotonic()
+        self.worst, self.stale, self.checked = 0.0, 0, 0
+
+    def change(self, model: SerialArm) -> None:
+        """From now on another model is wanted."""
+        self._models = (self._models[1], JointCorrection.between(self._arm, model))
+        self._since_s = time.monotonic()
+
+    def look(self, taught: Array, corrected: Array) -> None:
+        """Judge one target that came back."""
+        shifts = np.array([model.correct(taught).joint_shift for model in self._models])
+        shift = corrected - taught
+        if self._last is not None:
+            before, shifts_before = self._last
+            allowed = self._blends + np.max(np.abs(shifts - shifts_before), axis=0)
+            self.worst = max(self.worst, float(np.max(np.abs(shift - before) / allowed)))
+        self._last = (shift, shifts)
+        if time.monotonic() - self._since_s > SETTLED_S:
+            self.checked += 1
+            self.stale += bool(np.max(np.abs(shifts[1] - shift)) > EXACT_RAD)
+
+
+def soak(seconds: float = HOUR_S) -> Table:
+    """Stream, change models, and judge all that comes back."""
+    arm = load_robot("kr150_r3100")
+    probe = Probe()
+    with tempfile.TemporaryDirectory() as folder:
+        command = [EXECUTABLES / "joint_correction_node"]
+        subject = Subject("corrected", "joint_correction_node", command, Path(folder))
+        try:
+            stream, watch = Stream(probe, subject, arm.joint_names), Watch(arm)
+            stream.watch = watch.look
+            probe.wait(lambda: stream.connected, subject.name)
+            memory_mb = _run(probe, stream, watch, arm, seconds)
+        finally:
+            probe.close(subject)
+    return _judged(stream, watch, memory_mb, seconds)
+
+
+def _run(probe: Probe, stream: Stream, watch: Watch, arm: SerialArm, seconds: float) -> list[float]:
+    """Resident memory of the node, MB, at each change of the model, without the first ones."""
+    models = probe.model_publisher(stream.subject)
+    revision, memory_mb = 0, []
+
+    def change() -> None:
+        nonlocal revision
+        revision += 1
+        model = drifted(arm, LARGEST_M * (revision % 5 + 1) / 5, revision)
+        models.publish(offered(arm, model, revision, KinematicModel.ACCEPTED))
+        watch.change(model)
+        if revision > WARM:
+            memory_mb.append(stream.subject.memory_mb())
+
+    change()
+    probe.enable(stream.subject)
+    timer = probe.node.create_timer(CHANGE_S, change)
+    probe.stream(stream, RATE_HZ, WARM * CHANGE_S + seconds)
+    probe.node.destroy_timer(timer)
+    probe.drain()
+    return memory_mb
+
+
+def _judged(stream: Stream, watch: Watch, memory_mb: list[float], seconds: float) -> Table:
+    table = Table(
+        "soak_correction",
+        f"joint_correction_node for {seconds:.0f} s at {RATE_HZ} Hz, another model every "
+        f"{CHANGE_S:g} s",
+        ("what", "value", "goal"),
+        "Steps: of a joint's correction from one message to the next, in units of what the blend "
+        "and the models allow. Stale: targets that the last model did not make, "
+        f"{SETTLED_S:g} s after it was offered. Memory: resident, after the first {WARM} models. "
+        f"Load of the machine in the last minute: {os.getloadavg()[0]:.2f}; {os.cpu_count()} CPUs.",
+    )
+    ms = np.array(stream.took[TARGETS]) * 1e3
+    grew = memory_mb[-1] - memory_mb[0]
+    lost = stream.missing
+    table.add("targets", stream.sent[TARGETS], None)
+    table.add("messages lost", lost, Goal(lost, 0))
+    table.add("largest step", watch.worst, Goal(watch.worst, 1.0))
+    table.add("targets compared with the model in force", watch.checked, None)
+    table.add("of them stale", watch.stale, Goal(watch.stale, 0))
+    table.add("memory grew, MB", grew, Goal(grew, MOST_GROWTH_MB))
+    for words, q in (("median", 0.5), ("99 %", 0.99), ("99.9 %", 0.999), ("longest", 1.0)):
+        table.add(f"there and back, {words}, ms", float(np.quantile(ms, q)), None)
+    return table
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """1 when a goal is missed."""
+    parser = argparse.ArgumentParser(prog="python -m bench.soak_correction", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=HOUR_S, help="how long")
+    table = soak(parser.parse_args(arguments).seconds)
+    show([table])
+    return 0 if table.met else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,51 @@
+"""Garbage is collected when it is told to be, and never in between."""
+
+import gc
+import weakref
+
+import pytest
+
+from robocal_ros.nodes.quiet_memory import QuietMemory
+
+
+class Knot:
+    """Garbage that only a collection finds."""
+
+    def __init__(self) -> None:
+        self.own = self
+
+
+@pytest.fixture
+def memory():
+    quiet = QuietMemory()
+    yield quiet
+    quiet.end()
+
+
+def test_garbage_waits_for_the_look(memory):
+    knot = weakref.ref(Knot())
+    kept = [[] for _ in range(10 * gc.get_threshold()[0])]  # enough for Python to collect
+    assert knot() is not None, f"collected while {len(kept)} objects were made"
+    memory.look()
+    assert knot() is None
+
+
+def test_what_was_kept_for_a_while_goes_too(memory):
+    old = Knot()
+    knot = weakref.ref(old)
+    for _ in range(3):  # now it is of the oldest generation
+        memory.look()
+    del old
+    memory.look()
+    assert knot() is None
+
+
+def test_what_the_start_made_is_not_looked_at(memory):
+    assert gc.get_freeze_count() > 0
+    assert not gc.isenabled()
+
+
+def test_in_the_end_python_collects_again(memory):
+    memory.end()
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
