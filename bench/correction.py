@@ -189,8 +189,8 @@ def speed_table() -> Table:
         "Newton's method in Python on its kinematics, Jacobian and logarithm, with LAPACK; KDL: "
         "its compiled solver. Both stop at 1 nm and 1 nrad, ours at the rounding floor. Same "
         "models and postures, and the same joints found to 10 urad. Pinocchio and KDL have no "
-        "free axis: theirs is the time for six "
-        "equations." + ("" if "KDL" in rivals else " PyKDL is not installed: it is left out."),
+        "free axis: theirs is the time for six equations."
+        + ("" if "KDL" in rivals else " PyKDL is not installed: it is left out."),
     )
     for name, (_, count, limit) in ours.items():
         mine, others = t[name] / count * 1e6, [t[r] / len(q) * 1e6 for r in rivals]
@@ -334,7 +334,7 @@ def round_trip_table() -> Table:
         ("robot", "tool", "equations", "postures", "median, rad", "beyond 1e-12 rad", "goal"),
         "Postures as above, of which the correction and the one with the models exchanged are "
         "made in full. Six equations: the exchanged correction undoes it. Five: refined as in the "
-        "node; what is beyond lies near a singularity of the five; at most one in 200, for a tool "
+        "node; what is beyond lies near a singularity of the five: at most one in 200, for a tool "
         "within the node's bounds.",
     )
     for name in ROBOTS:

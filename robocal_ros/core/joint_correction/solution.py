@@ -45,10 +45,10 @@ class Room(NamedTuple):
     taught_root, taught_tool, root, tool : their (4, 4) ends, T_base_root and T_flange_tool.
     goal, aim : (4, 4) where the tool must go, and the part of the way there that is gone. Such
         poses have the axes of the flange, their origin is the tool's.
-    here, start : (4, 4) pose of the tool at the joints tried last, and at the given ones.
+    here : (4, 4) pose of the tool at the joints tried last.
     turns, frames : scratch of `walk`.
     J, L : (n, 6) Jacobian, and the factor for its steps.
-    e, first, spare : (6,) residual to ``aim``; that at the given joints; scratch.
+    e, spare : (6,) residual to ``aim``, and scratch.
     x, step : (n,) shift of the joints, and its last step.
     """
 
@@ -63,13 +63,11 @@ class Room(NamedTuple):
     goal: Array
     aim: Array
     here: Array
-    start: Array
     turns: Array
     frames: Array
     J: Array
     L: Array
     e: Array
-    first: Array
     spare: Array
     x: Array
     step: Array
@@ -77,7 +75,7 @@ class Room(NamedTuple):
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    return 18 * (n + 2) + 8 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 18 + 2 * n
+    return 18 * (n + 2) + 7 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 12 + 2 * n
 
 
 @lean
@@ -85,16 +83,16 @@ def _room(work: Array, n: int, free: bool) -> Room:
     """Divide ``work``."""
     m = 9 * (n + 2)
     taught, actual, at = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9), 2 * m
-    poses, at = work[at : at + 128].reshape(8, 4, 4), at + 128
+    poses, at = work[at : at + 112].reshape(7, 4, 4), at + 112
     turns, at = work[at : at + turns_size(n)], at + turns_size(n)
     frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
     J, at = work[at : at + 6 * n].reshape(n, 6), at + 6 * n
     size = equations.unknowns(n, free)
     L, at = work[at : at + size * size].reshape(size, size), at + size * size
-    twists, at = work[at : at + 18].reshape(3, 6), at + 18
+    twists, at = work[at : at + 12].reshape(2, 6), at + 12
     return Room(
         taught, actual, taught[:n], actual[:n], poses[0], poses[1], poses[2], poses[3], poses[4],
-        poses[5], poses[6], poses[7], turns, frames, J, L, twists[0], twists[1], twists[2],
+        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1],
         work[at : at + n], work[at + n : at + 2 * n],
     )  # fmt: skip
 
@@ -145,11 +143,8 @@ def _first_steps(q: Array, largest: Array, free: bool, room: Room, out: Array) -
     n, x, step = q.shape[0], room.x, room.step
     _next_step(free, False, room)
     share = k.share(step, largest)
-    for r in range(6):
-        room.first[r] = room.e[r]
-    newton.copy(room.here, room.start)
     if share < 1.0:
-        k.part_of_the_way(room.start, room.first, share, room.aim)
+        k.part_of_the_way(room.here, room.e, share, room.aim)
     for i in range(n):
         x[i] = share * step[i]
     _moved(q, free, room, out)
@@ -163,7 +158,9 @@ def _first_steps(q: Array, largest: Array, free: bool, room: Room, out: Array) -
     trust = min(trust, BESIDE * np.sqrt(length / max(second, 1e-300)))
     if trust < 1.0:
         share *= trust
-        k.part_of_the_way(room.start, room.first, share, room.aim)
+        newton.copy(room.goal, room.aim)
+        _residual_at(q, free, room)
+        k.part_of_the_way(room.here, room.e, share, room.aim)
     for i in range(n):
         x[i] = trust * x[i] + trust * trust * step[i]
     return share
