@@ -151,6 +151,13 @@ def live(seconds: float) -> Table:
     return table
 
 
+def correction(seconds: float) -> Table:
+    """joint_correction_node at 500 Hz while its models change."""
+    from bench.soak_correction import soak
+
+    return soak(seconds)
+
+
 def simulated(robots: int) -> Sequence[Table]:
     """The simulated truth of ``make bench``, with more robots and so with narrower bounds."""
     monte_carlo.RUNS = robots
@@ -171,7 +178,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     amount = SHORT if given.short else LONG
     start = time.monotonic()
-    tables = [live(amount.live_s), *simulated(amount.robots), endurance(amount)]
+    streams = (live(amount.live_s), correction(amount.live_s))
+    tables = [*streams, *simulated(amount.robots), endurance(amount)]
     show(tables)
     facts = about(time.monotonic() - start) | {"cpus": str(os.cpu_count())}
     command = "make soak SOAK=--short" if given.short else "make soak"
