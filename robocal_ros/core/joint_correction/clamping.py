@@ -56,7 +56,9 @@ class ClampedCorrection(StagedCorrection):
         self, reference: Array, start: Array, end: Array, arm: SerialArm, config: CorrectionConfig
     ) -> None:
         thermal, tool = config.thermal.of_joints(arm), config.tool.of_joints(arm)
-        super().__init__(reference, start, end, FADES_FROM * thermal, tool, **_freedom(config))
+        super().__init__(
+            reference, start, end, FADES_FROM * thermal, tool, free_axis=config.free_axis
+        )
         self._thermal, self._joint_bounds = config.thermal, (thermal, tool)
         self._lower, self._upper = arm.lower, arm.upper
 
@@ -122,9 +124,5 @@ def correction_between(
         end,
         FADES_FROM * config.thermal.of_joints(arm),
         config.tool.of_joints(arm),
-        **_freedom(config),
+        free_axis=config.free_axis,
     )
-
-
-def _freedom(config: CorrectionConfig) -> dict[str, bool]:
-    return {"free_axis": True} if config.free_axis else {}

@@ -86,9 +86,13 @@ class Sent:
 
     def since(self, oldest_s: float) -> "Sent":
         """The same without what was over before an instant."""
-        over = self.before is None or self.begin_s + self.times_s[0] <= oldest_s
-        before = None if self.before is None or over else self.before.since(oldest_s)
-        return replace(self, before=before)
+        kept = [self]
+        while kept[-1].begin_s + kept[-1].times_s[0] > oldest_s and kept[-1].before is not None:
+            kept.append(kept[-1].before)
+        found = replace(kept.pop(), before=None)
+        while kept:  # not by recursion: there may be hundreds within the robot's response
+            found = replace(kept.pop(), before=found)
+        return found
 
     def around(self, now_s: float) -> Array | None:
         """Taught and corrected joints (2, r, k) at r instants of the robot's response time.
@@ -104,11 +108,13 @@ class Sent:
         return np.stack(known, axis=1) if known else None
 
     def _at(self, now_s: float) -> Array | None:
-        t = now_s - self.begin_s
-        if t < self.times_s[0]:
-            return None if self.before is None else self.before._at(now_s)
-        columns = [*self.taught.T, *self.corrected.T]
-        row = np.array([np.interp(t, self.times_s, column) for column in columns])
+        sent = self
+        while now_s - sent.begin_s < sent.times_s[0]:
+            if sent.before is None:
+                return None
+            sent = sent.before
+        t, columns = now_s - sent.begin_s, [*sent.taught.T, *sent.corrected.T]
+        row = np.array([np.interp(t, sent.times_s, column) for column in columns])
         return row.reshape(2, -1)
 
 
