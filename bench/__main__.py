@@ -1,4 +1,4 @@
-"""Make every table, print it, and write it to out/bench: ``python -m bench``.
+"""Make every table, print it, and write it to out/bench, a file for each part: ``python -m bench``.
 
 With ``--keep`` also to docs/figures, where the documents refer to it.
 """
@@ -31,6 +31,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         files,
         hand_eye,
         hand_eye_camera,
+        hand_eye_profiles,
         hand_eye_tracker,
         monte_carlo,
         real_data,
@@ -39,6 +40,12 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         thermal,
         tool,
     )
+
+    def times() -> Sequence[Table]:
+        return [
+            *speed.tables(),
+            *(of.speed_table() for of in (thermal, tool, hand_eye_profiles, hand_eye_camera)),
+        ]
 
     def start() -> Sequence[Table]:
         if startup.EXECUTABLES.is_dir():
@@ -57,7 +64,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "hand_eye": hand_eye.tables,
         "hand_eye_camera": hand_eye_camera.tables,
         "hand_eye_tracker": hand_eye_tracker.tables,
-        "speed": speed.tables,
+        "speed": times,
         "correction": correction.tables,
         "startup": start,
         "correction_stream": streams,
@@ -92,18 +99,18 @@ def about(seconds: float) -> dict[str, str]:
     }
 
 
-def _write(folder: Path, tables: Sequence[Table], about: dict[str, str]) -> None:
+def _write(folder: Path, part: str, tables: Sequence[Table], about: dict[str, str]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     document = {"about": about, "tables": [table.document() for table in tables]}
     text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
-    (folder / "bench_core.json").write_text(text + "\n")
+    (folder / f"{part}.json").write_text(text + "\n")
     words = ", ".join(f"{name} {value}" for name, value in about.items())
     body = "\n".join(table.markdown() for table in tables)
-    (folder / "bench_core.md").write_text(f"Made by `make bench`: {words}.\n\n{body}")
+    (folder / f"{part}.md").write_text(f"Made by `python -m bench {part}`: {words}.\n\n{body}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the chosen parts; all of them write the files. 1 when a goal is missed."""
+    """Run the chosen parts. 1 when a goal is missed."""
     parts = _parts()
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("part", nargs="*", choices=[*parts, []], help=f"of {', '.join(parts)}")
@@ -112,10 +119,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = given.part
     tables: list[Table] = []
     missed: list[str] = []
-    start = time.monotonic()
     for name, make in parts.items():
         if chosen and name not in chosen:
             continue
+        start = time.monotonic()
         try:
             made = make()
         except subprocess.CalledProcessError as error:
@@ -124,11 +131,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         show(made)
         tables += made
-    if not chosen:
         made_by = about(time.monotonic() - start)
-        for folder in (OUT, KEPT) if given.keep else (OUT,):
-            _write(folder, tables, made_by)
-            print(f"written: {folder / 'bench_core.json'}, {folder / 'bench_core.md'}")
+        for folder in (OUT, KEPT) if given.keep and made else (OUT,):
+            _write(folder, name, made, made_by)
     missed += [table.title for table in tables if not table.met]
     for title in missed:
         print(f"goal missed: {title}", file=sys.stderr)

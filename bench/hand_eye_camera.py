@@ -314,7 +314,7 @@ def arm_table() -> Table:
 
 def tables() -> Sequence[Table]:
     """All of them; those of real measurements where these are."""
-    made = [bound_table(), intrinsics_table(), speed_table()]
+    made = [bound_table(), intrinsics_table()]
     if not folder().is_dir():
         print(f"no real measurements at {folder()} (set ROBOCAL_DATA): left out")
         return made

@@ -282,4 +282,4 @@ def speed_table(runs: int = 15) -> Table:
 
 def tables() -> Sequence[Table]:
     """All of them."""
-    return [step_table(), effects_table(), joint_table(), speed_table()]
+    return [step_table(), effects_table(), joint_table()]

@@ -277,5 +277,4 @@ def tables() -> Sequence[Table]:
         *thermal_setup.tables(),
         *thermal_tracking.tables(),
         *thermal_real.tables(),
-        speed_table(),
     ]

@@ -373,5 +373,4 @@ def tables() -> Sequence[Table]:
         remount_table(),
         effects_table(),
         check_table(),
-        speed_table(),
     ]
