@@ -130,8 +130,7 @@ def test_every_target_has_its_offset(graph: Any) -> None:
     assert len(streamed()) == count
     for target, told in zip(line.targets, streamed(), strict=True):
         assert told.joint_names == NAMES
-        # at the joints that were read last, at most some blend steps behind: second order
-        assert np.allclose(np.array(target.position) - HOME, told.offset, rtol=0.0, atol=1e-7)
+        assert np.array_equal(np.array(target.position) - HOME, told.offset)
         assert told.model_revision == 7
         assert told.tool_revision == 0
         assert not told.shadow
