@@ -179,6 +179,25 @@ def test_nothing_is_told_of_offsets_before_a_command(graph: Any) -> None:
     assert list(line.offsets[-1].offset) == [0.0] * 6
 
 
+def test_offsets_are_worked_out_for_who_listens(graph: Any) -> None:
+    node = graph.add(JointCorrectionNode, {"serial": "s1"})
+    targets = graph.collect(JointState, f"{NODE}/joint_targets")
+    state, target = (graph.publisher(JointState, t) for t in ("joint_states", "joint_targets"))
+    graph.spin_until(lambda: node._outputs["joint_targets"].get_subscription_count(), "the output")
+    state.publish(joints(HOME))
+    graph.spin_until(lambda: node.inputs["joint_states"].received, "where the robot is")
+    asked: list[float] = []
+    work_out = node._session.offset
+    node._session.offset = lambda now_s: (asked.append(now_s), work_out(now_s))[1]
+    target.publish(joints(HOME))
+    graph.spin_until(lambda: targets, "a target")
+    graph.spin_for(0.3)
+    assert not asked
+    offsets = graph.collect(JointOffset, f"{NODE}/correction")
+    graph.spin_until(lambda: offsets, "an offset")
+    assert asked
+
+
 def test_the_status_tells_what_is_in_use(graph: Any) -> None:
     tool = [0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 1.0]
     line = Line(graph, taught_tool=tool)
