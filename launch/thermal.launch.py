@@ -40,7 +40,10 @@ def generate_launch_description():
                 executable="joint_correction_node",
                 name="joint_correction_node",
                 parameters=[LaunchConfiguration("correction_params")],
-                remappings=[("kinematic_model", "/thermal_node/model")],
+                remappings=[
+                    ("kinematic_model", "/thermal_node/model"),
+                    ("tool_frame", "/tcf_node/tool"),
+                ],
                 output="screen",
             ),
         ]

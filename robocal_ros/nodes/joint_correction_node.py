@@ -1,10 +1,9 @@
 """The joint correction node: taught joints in, corrected ones out (docs/joint_correction.md)."""
 
-import contextlib
-import copy
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.core import serialized_path
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.nodes import joint_correction_messages as messages
@@ -29,19 +29,19 @@ from robocal_ros.nodes.joint_correction_settings import (
     command_joints,
     session_config,
 )
+from robocal_ros.nodes.path_messages import PathMessage
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.stream_messages import ArrayMessage, JointMessage
 from robocal_ros.nodes.trajectory_proxy import TrajectoryProxy
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     CorrectionStatus,
     TrajectoryCommand,
-    finite_command,
-    joint_command,
     offered_model,
     offered_tool,
-    trajectory_command,
 )
+from robocal_ros.sessions.correction.wire import JointWire
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
@@ -78,13 +78,13 @@ class JointCorrectionNode(HouseNode):
         self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
+        serialized_path.load_kernels()
         self._session.enable(self.settings["enable_on_start"])
         self._messages = messages.CorrectionMessages(
             nominal, reference, self.settings["reference"], serial, self._shadow
         )
         self._judge = CorrectionHealth()
-        self._streams = CommandSources(config.stream_gap_s)
-        self._paths = CommandSources(config.stream_gap_s)
+        self._streams, self._paths = (CommandSources(config.stream_gap_s) for _ in range(2))
         self._senders = {TARGETS: self._streams, COMMANDS: self._streams, TRAJECTORY: self._paths}
         self._sources = {topic: SourceGuard(self, topic) for topic in KINDS}
         self._commanded = False
@@ -101,21 +101,26 @@ class JointCorrectionNode(HouseNode):
         self._statuses = self.add_output(StatusMessage, "~/status", qos.LATCHED)
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
         self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
-        self.add_input(JointState, STATES, self._guarded(STATES, self._on_states), qos.SENSOR)
-        commands = {TARGETS: self._on_target, COMMANDS: self._on_array, TRAJECTORY: self._on_path}
-        for topic, act in commands.items():
-            receive = self._guarded(topic, act)
-            self._senders[topic].inputs[topic] = self.add_input(
-                KINDS[topic], topic, receive, qos.RELIABLE
-            )
+        acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None]]] = {
+            STATES: (partial(JointMessage, JointWire(), is_reading=True), self._on_states),
+            TARGETS: (partial(JointMessage, JointWire()), partial(self._on_target, TARGETS)),
+            COMMANDS: (partial(ArrayMessage, self._names), partial(self._on_target, COMMANDS)),
+            TRAJECTORY: (PathMessage, self._on_path),
+        }
+        for topic, (read, act) in acts.items():
+            receive, kind = self._guarded(topic, read, act), KINDS[topic]
+            profile = qos.SENSOR if topic == STATES else qos.RELIABLE
+            opened = self.add_input(kind, topic, receive, profile, raw=topic != COMMANDS)
+            if topic in self._senders:
+                self._senders[topic].inputs[topic] = opened
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_timer(POLL_S, self._look_at_graph, steady=True)
         self.add_timer(LOOK_S, self._look, steady=True)
-
         if self.settings[ACTION]:
             if self._proxy is None:
-                acts = self._goal, self._taught, self._stop
-                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", *acts)
+                self._proxy = TrajectoryProxy(
+                    self, f"~/{ACTION}", self._goal, self._taught, self._stop
+                )
             self._proxy.open(self.settings[ACTION])
 
     def activate(self) -> None:
@@ -161,7 +166,9 @@ class JointCorrectionNode(HouseNode):
 
     # ---- what is corrected ----------------------------------------------------------------------
 
-    def _guarded(self, topic: str, act: Callable[[Any], None]) -> Callable[[Any], None]:
+    def _guarded(
+        self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None]
+    ) -> Callable[[Any], None]:
         """Refuse what a correction node publishes itself, and commands of several sources.
 
         In shadow mode a message goes out as it came before anything else is done with it.
@@ -169,14 +176,13 @@ class JointCorrectionNode(HouseNode):
         guard = self._sources[topic]
         senders = self._senders.get(topic)
 
-        def receive(message: Any) -> None:
+        def receive(came: Any) -> None:
+            message = read(came)
             stop = topic == TRAJECTORY and not message.points  # nothing may hold it up
             if guard.fault and not stop:
                 self._bar(Reason.OWN_OUTPUT, guard.fault)
-            if topic == STATES:
-                messages.drop_unknown_efforts(message)
-            if self._shadow and messages.is_finite(message):
-                self._outputs[topic].publish(message)
+            if self._shadow and message.is_finite():
+                self._outputs[topic].publish(message.unchanged())
             rivals = senders.hear(topic, time.monotonic()) if senders and not stop else ""
             if rivals:
                 self._bar(Reason.TWO_SOURCES, rivals)
@@ -190,49 +196,47 @@ class JointCorrectionNode(HouseNode):
 
         self._session.counted(refuse)
 
-    def _on_target(self, message: Any) -> None:
-        command = self._session.counted(lambda: finite_command(message))
-        now = time.monotonic()
-        messages.fill_joints(message, self._session.target(command, now))
-        self._put_out(TARGETS, message)
+    def _on_target(self, topic: str, message: JointMessage | ArrayMessage) -> None:
+        command, now = self._session.counted(message.command), time.monotonic()
+        self._put_out(topic, message, command, self._session.target(command, now))
         self._tell_offset(JointOffset.STREAM, now)
 
-    def _on_array(self, message: Any) -> None:
-        command, now = messages.array_command(self._names, message), time.monotonic()
-        messages.fill_array(message, self._session.target(command, now))
-        self._put_out(COMMANDS, message)
-        self._tell_offset(JointOffset.STREAM, now)
-
-    def _on_states(self, message: Any) -> None:
-        command = self._session.counted(lambda: joint_command(message))
+    def _on_states(self, message: JointMessage) -> None:
+        command = self._session.counted(message.command)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
-        messages.fill_joints(message, self._session.reading(command, time.monotonic(), age))
-        self._put_out(STATES, message)
+        taught = self._session.reading(command, time.monotonic(), age)
+        self._put_out(STATES, message, command, taught)
 
-    def _on_path(self, message: Any) -> None:
+    def _on_path(self, message: PathMessage) -> None:
         if message.points:
-            self._put_out(TRAJECTORY, self._corrected(message))
+            self._put_out(TRAJECTORY, message, *self._corrected(message))
             self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
         else:
-            self._put_out(TRAJECTORY, message)
+            self._put_out(TRAJECTORY, message, _STOP, _STOP)
             self._stop()
 
-    def _corrected(self, message: Any) -> Any:
-        """The message, with corrected points."""
-        command = self._session.counted(lambda: trajectory_command(message))
+    def _corrected(self, message: PathMessage) -> tuple[TrajectoryCommand, TrajectoryCommand]:
+        """What is commanded by a message, as it came and corrected."""
+        command = self._session.counted(message.command)
         starts_in = (command.stamp_ns - self.now_ns()) * 1e-9 if command.stamp_ns else 0.0
-        corrected = self._session.trajectory(command, time.monotonic(), starts_in)
-        if corrected is not command:
-            messages.fill_path(message, corrected)
-        return message
+        return command, self._session.trajectory(command, time.monotonic(), starts_in)
 
-    def _goal(self, message: Any) -> Any:
+    def _put_out(self, topic: str, message: Any, came: Any, command: Any) -> None:
+        """Publish a message with another command than came; in shadow mode it has gone out."""
+        if not self._shadow:
+            same = command is came
+            self._outputs[topic].publish(message.unchanged() if same else message.changed(command))
+
+    def _goal(self, trajectory: JointTrajectory) -> JointTrajectory:
         """A goal's trajectory, corrected; as it came in shadow mode."""
-        if self._shadow:
-            with contextlib.suppress(RefusedError):
-                self._corrected(copy.deepcopy(message))
-            return message
-        return self._corrected(message)
+        message = PathMessage(trajectory)
+        try:
+            came, command = self._corrected(message)
+        except RefusedError:
+            if self._shadow:
+                return trajectory
+            raise
+        return trajectory if command is came else message.changed(command)
 
     def _taught(self, names: Any, position: Any, velocity: Any) -> Any:
         return self._session.taught(names, position, velocity, time.monotonic())
@@ -240,16 +244,13 @@ class JointCorrectionNode(HouseNode):
     def _stop(self) -> None:
         self._session.trajectory(_STOP, time.monotonic())
 
-    def _put_out(self, topic: str, message: Any) -> None:
-        if not self._shadow:
-            self._outputs[topic].publish(message)
-
     # ---- what is reported -----------------------------------------------------------------------
 
     def _tell_offset(self, cause: int, now_s: float) -> None:
         self._commanded = True
-        offset = self._session.offset(now_s)
-        self._offsets.publish(self._messages.offset(offset, cause, self.now_ns()))
+        if self._offsets.get_subscription_count():
+            offset = self._session.offset(now_s)
+            self._offsets.publish(self._messages.offset(offset, cause, self.now_ns()))
 
     def _look_at_graph(self) -> None:
         for guard in self._sources.values():

@@ -2,36 +2,27 @@
 
 from typing import Any
 
-from rclpy.serialization import deserialize_message
+import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.serialized_path import SerializedPath, read_path
+from robocal_ros.nodes.joint_correction_messages import fill_path, is_finite
+from robocal_ros.nodes.stream_messages import read_message
 from robocal_ros.sessions.correction import (
     TrajectoryCommand,
     require_finite,
     trajectory_command,
 )
 
-POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = range(4)
-
-
-def read_message(data: bytes, kind: type) -> Any:
-    """Build a message.
-
-    Raises
-    ------
-    InputError
-        When the bytes are no such message.
-    """
-    try:
-        return deserialize_message(data, kind)
-    except Exception as error:  # what the middleware says has no type of its own
-        raise InputError(f"this is no {kind.__name__}: {error}") from error
+POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = FIELDS = range(4)
 
 
 class PathMessage:
     """A trajectory that came in, its command, and what goes out for it.
+
+    Parameters
+    ----------
+    came : serialized, or as a message.
 
     Raises
     ------
@@ -43,13 +34,24 @@ class PathMessage:
     points : how many; 0 is a stop.
     """
 
-    def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._path: SerializedPath | None = read_path(data)
-        self._message: Any = None
+    def __init__(self, came: bytes | JointTrajectory) -> None:
+        self._came = came
+        self._path: SerializedPath | None = read_path(came) if isinstance(came, bytes) else None
+        self._read: Any = None
+        self.points = len(self._message().points) if self._path is None else len(self._path)
+
+    def _message(self) -> Any:
+        if self._read is None:
+            came = self._came
+            self._read = read_message(came, JointTrajectory) if isinstance(came, bytes) else came
+        return self._read
+
+    def is_finite(self) -> bool:
+        """Whether every number is finite."""
         if self._path is None:
-            self._message = read_message(data, JointTrajectory)
-        self.points = len(self._message.points) if self._path is None else len(self._path)
+            return is_finite(self._message())
+        rows = [self._path.rows(field) for field in FIELDS]
+        return all(bool(np.isfinite(values).all()) for values in rows if values is not None)
 
     def command(self) -> TrajectoryCommand:
         """Build the session's command.
@@ -61,11 +63,11 @@ class PathMessage:
         """
         path = self._path
         if path is None:
-            return trajectory_command(self._message)
+            return trajectory_command(self._message())
         position, counts = path.rows(POSITIONS), path.places[0, :, 1]
         odd = any(count not in (0, len(path.names)) for count in counts[:EFFORTS])
         if position is None or odd or counts[ACCELERATIONS] > counts[VELOCITIES]:
-            return trajectory_command(deserialize_message(self._data, JointTrajectory))  # says why
+            return trajectory_command(self._message())  # says why
         efforts = path.rows(EFFORTS)
         if efforts is not None:
             require_finite(tuple(f"effort {i + 1}" for i in range(efforts.shape[1])), efforts)
@@ -74,24 +76,20 @@ class PathMessage:
             path.names, position, path.times_s, *rates, path.stamp_ns, path.frame_id
         )
 
-    def unchanged(self) -> bytes:
-        """The message as it came."""
-        return self._data
+    def unchanged(self) -> Any:
+        """What came, to publish."""
+        return self._came
 
-    def corrected(self, command: TrajectoryCommand) -> Any:
-        """Message to publish, with the command's positions, rates and mark."""
-        changed = {
-            POSITIONS: command.position,
-            VELOCITIES: command.velocity,
-            ACCELERATIONS: command.acceleration,
-        }
-        rows = {field: values for field, values in changed.items() if values is not None}
+    def changed(self, command: TrajectoryCommand) -> Any:
+        """What to publish: with the command's positions, rates and mark."""
         if self._path is not None and self._path.takes(command.mark):
+            changed = {
+                POSITIONS: command.position,
+                VELOCITIES: command.velocity,
+                ACCELERATIONS: command.acceleration,
+            }
+            rows = {field: values for field, values in changed.items() if values is not None}
             return self._path.changed(command.mark, rows)
-        message = self._message or deserialize_message(self._data, JointTrajectory)
-        message.header.frame_id = command.mark
-        names = ("positions", "velocities", "accelerations")
-        for field, values in rows.items():
-            for point, row in zip(message.points, values, strict=True):
-                setattr(point, names[field], row.tolist())
+        message = self._message()
+        fill_path(message, command)
         return message

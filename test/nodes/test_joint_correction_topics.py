@@ -130,8 +130,7 @@ def test_every_target_has_its_offset(graph: Any) -> None:
     assert len(streamed()) == count
     for target, told in zip(line.targets, streamed(), strict=True):
         assert told.joint_names == NAMES
-        # at the joints that were read last, at most some blend steps behind: second order
-        assert np.allclose(np.array(target.position) - HOME, told.offset, rtol=0.0, atol=1e-7)
+        assert np.array_equal(np.array(target.position) - HOME, told.offset)
         assert told.model_revision == 7
         assert told.tool_revision == 0
         assert not told.shadow
@@ -178,6 +177,25 @@ def test_nothing_is_told_of_offsets_before_a_command(graph: Any) -> None:
     causes = [JointOffset.STREAM, JointOffset.PERIODIC]
     graph.spin_until(lambda: [o.cause for o in line.offsets[:2]] == causes, "offsets go on")
     assert list(line.offsets[-1].offset) == [0.0] * 6
+
+
+def test_offsets_are_worked_out_for_who_listens(graph: Any) -> None:
+    node = graph.add(JointCorrectionNode, {"serial": "s1"})
+    targets = graph.collect(JointState, f"{NODE}/joint_targets")
+    state, target = (graph.publisher(JointState, t) for t in ("joint_states", "joint_targets"))
+    graph.spin_until(lambda: node._outputs["joint_targets"].get_subscription_count(), "the output")
+    state.publish(joints(HOME))
+    graph.spin_until(lambda: node.inputs["joint_states"].received, "where the robot is")
+    asked: list[float] = []
+    work_out = node._session.offset
+    node._session.offset = lambda now_s: (asked.append(now_s), work_out(now_s))[1]
+    target.publish(joints(HOME))
+    graph.spin_until(lambda: targets, "a target")
+    graph.spin_for(0.3)
+    assert not asked
+    offsets = graph.collect(JointOffset, f"{NODE}/correction")
+    graph.spin_until(lambda: offsets, "an offset")
+    assert asked
 
 
 def test_the_status_tells_what_is_in_use(graph: Any) -> None:

@@ -59,6 +59,12 @@ def test_each_node_has_its_own_file_by_default(text):
     assert set(re.findall(r"(\w+):=", text)) == set(declared)
 
 
+def test_the_correction_takes_model_and_tool_where_they_are_published(text):
+    tuples = [n.elts for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Tuple)]
+    pairs = [tuple(e.value for e in elements) for elements in tuples]
+    assert pairs == [("kinematic_model", MODEL), ("tool_frame", "/tcf_node/tool")]
+
+
 @pytest.mark.parametrize("name", NODES)
 def test_one_file_may_hold_both_nodes(graph, tmp_path, name):
     """Started with the arguments that ros2 launch gives: its file, its name, its remapping."""

@@ -59,7 +59,7 @@ def test_ros_reads_what_is_changed(frame_id):
     path = PathMessage(serialize_message(message))
     command = path.command()
     rows = {name: 2.0 * getattr(command, name) for name in ("position", "velocity", "acceleration")}
-    out = path.corrected(replace(command, mark="robocal_corrected", **rows))
+    out = path.changed(replace(command, mark="robocal_corrected", **rows))
     out = deserialize_message(out, JointTrajectory) if isinstance(out, bytes) else out
     for point in message.points:
         for field in FIELDS[:3]:

@@ -67,6 +67,7 @@ def test_messages_of_several_sources_are_told_apart():
     [
         JointState(name=["a"], position=[math.nan]),
         JointState(name=["a"], position=[math.inf]),
+        JointState(name=["a"], position=[0.0], velocity=[math.nan]),
         JointState(name=["a"], position=[0.0], effort=[math.nan]),
         JointState(name=["a", "b"], position=[0.0]),
         JointState(name=["a", "b"], position=[0.0, 0.0], velocity=[1.0]),

@@ -38,6 +38,7 @@ class Commands:
     Attributes
     ----------
     goal : (n,) taught joints that were commanded last, NaN before the first.
+    offset : (n,) what was added to the target corrected last; in shadow mode what would have been.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class Commands:
         self._out = np.full(joints.count, np.nan)  # of the last target
         self._out_s = -np.inf
         self.goal = np.full(joints.count, np.nan)
+        self.offset = np.zeros(joints.count)
 
     def streams(self, now_s: float) -> bool:
         """Whether a stream of targets is under way."""
@@ -101,8 +103,10 @@ class Commands:
             pause = 0.0
         if self._corrector.passing(now_s):
             self._corrector.pass_on(motion, now_s)
+            self.offset = np.zeros(self._joints.count)
             return command
         done = self._corrector.point(motion, now_s, pause)
+        self.offset = done.result.q[0] - motion.q[0]
         velocity = None if done.velocity is None else done.velocity[0, index]
         position = done.result.q[0, index]
         return replace(command, position=position, velocity=velocity, mark=CORRECTED)

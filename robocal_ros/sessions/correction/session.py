@@ -189,11 +189,15 @@ class CorrectionSession:
         return self._readings.taught(names, position, velocity, now_s)
 
     def offset(self, now_s: float) -> Offset:
-        """What is added to the taught joints now, where the robot was read last."""
+        """What is added to the taught joints now.
+
+        While targets stream: to the last of them; else where the robot was read last.
+        """
+        streams = self._commands.streams(now_s)
         tool = self._gate.tools.in_use if self._enabled else None
         return Offset(
             names=self._reference.joint_names,
-            offset=self._readings.offset(now_s),
+            offset=self._commands.offset if streams else self._readings.offset(now_s),
             revision=self._gate.revision if self._enabled and not self._gate.stale else None,
             tool_revision=None if tool is None else tool.revision,
             s=self._corrector.progress(now_s),

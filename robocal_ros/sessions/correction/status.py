@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Offset:
-    """What is added to the taught joints at an instant, where the robot was read last.
+    """What is added to the taught joints at an instant: where they were commanded, or read, last.
 
     Attributes
     ----------

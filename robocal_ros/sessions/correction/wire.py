@@ -58,8 +58,9 @@ class JointWire:
             np.frombuffer(data, np.float64, count, place)
             for (_, count), place in zip(layout.counts, layout.places, strict=True)
         )
-        if not np.isfinite(position).all() or (len(effort) and not np.isfinite(effort).all()):
-            return None
+        for numbers in (position, velocity, effort):
+            if len(numbers) and not np.isfinite(numbers).all():
+                return None
         sec, nanosec = struct.unpack_from("<iI", data, STAMP)
         rates = velocity.copy() if len(velocity) else None
         stamp = sec * NS + nanosec

@@ -1,0 +1,126 @@
+"""Joint messages that came in, and what goes out for them: irregular ones by way of a message."""
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.samples import CORRECTED
+from robocal_ros.nodes.path_messages import PathMessage
+from robocal_ros.nodes.stream_messages import ArrayMessage, JointMessage
+from robocal_ros.sessions.correction import Reason, RefusedError
+from robocal_ros.sessions.correction.wire import JointWire
+
+NAN = math.nan
+
+
+def a_state(**fields: Any) -> JointState:
+    given = {"name": ["a", "b"], "position": [1.0, 2.0], "velocity": [0.1, 0.2]}
+    return JointState(header=Header(frame_id="planner"), **(given | fields))
+
+
+def a_path(**fields: Any) -> JointTrajectory:
+    given = {"positions": [1.0, 2.0], "velocities": [0.1, 0.2], "effort": [5.0, 6.0]}
+    points = [JointTrajectoryPoint(**given), JointTrajectoryPoint(**(given | fields))]
+    points[1].time_from_start.sec = 1
+    return JointTrajectory(joint_names=["a", "b"], points=points)
+
+
+def came(state: JointState, *, is_reading: bool = False) -> JointMessage:
+    return JointMessage(JointWire(), serialize_message(state), is_reading=is_reading)
+
+
+def as_message(out: Any, kind: type) -> Any:
+    return deserialize_message(out, kind) if isinstance(out, bytes) else out
+
+
+@pytest.mark.parametrize("velocity", [[0.1, 0.2], []])
+@pytest.mark.parametrize("effort", [[], [3.0, 4.0], [NAN, 4.0]])
+def test_a_reading_goes_out_with_other_values(velocity: list[float], effort: list[float]) -> None:
+    state = a_state(velocity=velocity, effort=effort)
+    message = came(state, is_reading=True)
+    assert message.is_finite()
+    command = message.command()
+    faster = None if command.velocity is None else 2.0 * command.velocity
+    changed = replace(command, position=command.position + 1.0, velocity=faster, mark=CORRECTED)
+    expected = a_state(
+        position=[2.0, 3.0],
+        velocity=[2.0 * v for v in velocity],
+        effort=effort if np.isfinite(effort).all() else [],
+    )
+    expected.header.frame_id = CORRECTED
+    assert as_message(message.changed(changed), JointState) == expected
+
+
+def test_a_reading_without_efforts_goes_out_unchanged_but_for_them() -> None:
+    message = came(a_state(effort=[NAN, NAN]), is_reading=True)
+    assert message.unchanged() == a_state()
+
+
+def test_a_regular_message_stays_serialized() -> None:
+    data = serialize_message(a_state())
+    message = JointMessage(JointWire(), data)
+    assert message.unchanged() is data
+    assert isinstance(message.changed(message.command()), bytes)
+    path = PathMessage(serialize_message(a_path()))
+    assert isinstance(path.changed(path.command()), bytes)
+
+
+@pytest.mark.parametrize("field", ["position", "velocity", "effort"])
+def test_a_target_that_is_not_finite_is_seen_and_refused(field: str) -> None:
+    message = came(a_state(**{field: [1.0, NAN]}))
+    assert not message.is_finite()
+    if field != "velocity":  # which the session refuses, for the arm's joints
+        with pytest.raises(RefusedError) as refused:
+            message.command()
+        assert refused.value.reason is Reason.NOT_FINITE
+
+
+@pytest.mark.parametrize("field", ["positions", "velocities", "accelerations", "effort"])
+@pytest.mark.parametrize("ragged", [False, True])
+def test_a_path_that_is_not_finite_is_seen(field: str, ragged: bool) -> None:
+    for value, finite in ((1.0, True), (math.inf, False), (NAN, False)):
+        path = a_path(**{field: [1.0, value]})
+        if field == "accelerations":
+            path.points[0].accelerations = [0.0, 0.0]
+        if ragged:
+            path.points[0].effort = []
+        assert PathMessage(serialize_message(path)).is_finite() == finite
+        assert PathMessage(path).is_finite() == finite
+
+
+def test_a_path_may_be_a_message() -> None:
+    path = a_path()
+    message = PathMessage(path)
+    command = message.command()
+    assert message.points == 2
+    assert message.unchanged() is path
+    out = message.changed(replace(command, position=command.position + 1.0, mark=CORRECTED))
+    expected = a_path()
+    expected.header.frame_id = CORRECTED
+    for point in expected.points:
+        point.positions = [2.0, 3.0]
+    assert out == expected
+
+
+def test_an_array_has_the_configured_joints() -> None:
+    message = ArrayMessage(("a", "b"), Float64MultiArray(data=[1.0, 2.0]))
+    command = message.command()
+    assert command.names == ("a", "b")
+    assert message.is_finite()
+    assert list(message.changed(replace(command, position=np.array([3.0, 4.0]))).data) == [3.0, 4.0]
+    assert not ArrayMessage(("a",), Float64MultiArray(data=[NAN])).is_finite()
+
+
+@pytest.mark.parametrize("read", [partial(JointMessage, JointWire()), PathMessage])
+def test_what_is_no_message_is_told(read: Any) -> None:
+    with pytest.raises(InputError, match="this is no Joint"):
+        read(b"\0\1\0\0\1")
