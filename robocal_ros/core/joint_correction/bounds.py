@@ -175,7 +175,7 @@ def require_solved(result: StagedResult) -> None:
 def require_limits(q: Array, arm: SerialArm) -> None:
     """Refuse joints (m, n) beyond the arm's limits, and what is no number."""
     inside = (q >= arm.lower - ROUNDING) & (q <= arm.upper + ROUNDING)
-    if not np.all(inside):
+    if not inside.all():
         point, joint = np.argwhere(~inside)[0]
         raise RefusedError(
             Reason.JOINT_LIMIT,
@@ -187,7 +187,7 @@ def require_limits(q: Array, arm: SerialArm) -> None:
 def require_speeds(velocity: Array, limits: Array, arm: SerialArm) -> None:
     """Refuse velocities (m, n) beyond their limits (n,), rad/s (prismatic: m/s)."""
     within = np.abs(velocity) <= limits * (1.0 + ROUNDING)
-    if not np.all(within):
+    if not within.all():
         point, joint = np.argwhere(~within)[0]
         raise RefusedError(
             Reason.VELOCITY_LIMIT,

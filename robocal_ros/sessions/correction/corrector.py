@@ -199,7 +199,8 @@ class Corrector:
         limits = self._config.velocity_limits
         if limits is None:
             return
-        mean = np.diff(q, axis=0, prepend=motion.before[None]) / motion.dt_s[:, None]
+        before = np.concatenate([motion.before[None], q[:-1]])
+        mean = (q - before) / motion.dt_s[:, None]
         require_speeds(np.where(np.isfinite(mean), mean, 0.0), limits, self._arm)
         if velocity is not None:
             require_speeds(velocity, limits, self._arm)

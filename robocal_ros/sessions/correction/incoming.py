@@ -109,7 +109,7 @@ class JointBook:
     def _require_radians(self, index: Index, position: Array) -> None:
         """Refuse positions (m, k) that can only be degrees, or millimetres."""
         size = np.abs(position)
-        if not np.any(size > self._doubtful[index]):
+        if not (size > self._doubtful[index]).any():
             return
         if np.any(size > self._turns[index]):
             point, column = np.argwhere(size > self._turns[index])[0]

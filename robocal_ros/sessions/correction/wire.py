@@ -4,6 +4,7 @@ Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState`
 messages are laid out alike: where their numbers are is found once.
 """
 
+import math
 import struct
 from dataclasses import dataclass
 
@@ -58,9 +59,9 @@ class JointWire:
             np.frombuffer(data, np.float64, count, place)
             for (_, count), place in zip(layout.counts, layout.places, strict=True)
         )
-        for numbers in (position, velocity, effort):
-            if len(numbers) and not np.isfinite(numbers).all():
-                return None
+        # for so few numbers this takes a fifth of the time of NumPy's isfinite
+        if not all(all(map(math.isfinite, n.tolist())) for n in (position, velocity, effort)):
+            return None
         sec, nanosec = struct.unpack_from("<iI", data, STAMP)
         rates = velocity.copy() if len(velocity) else None
         stamp = sec * NS + nanosec
