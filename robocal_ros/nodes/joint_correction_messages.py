@@ -44,11 +44,15 @@ def fill_array(message: Any, command: JointCommand) -> None:
 
 
 def fill_joints(message: Any, command: JointCommand) -> None:
-    """Put positions and velocities into a ``JointState``; what they do not change stays."""
+    """Put positions and velocities into a ``JointState``; what they do not change stays.
+
+    Velocities of which one is not finite (that of another's joint: a gripper) go out empty.
+    """
     message.header.frame_id = command.mark
     message.position = doubles(command.position)
     if command.velocity is not None:
-        message.velocity = doubles(command.velocity)
+        known = np.all(np.isfinite(command.velocity))
+        message.velocity = doubles(command.velocity if known else np.empty(0))
 
 
 def fill_path(message: Any, command: TrajectoryCommand) -> None:

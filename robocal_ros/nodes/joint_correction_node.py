@@ -41,6 +41,7 @@ from robocal_ros.sessions.correction import (
     offered_model,
     offered_tool,
 )
+from robocal_ros.sessions.correction.periods import LONGEST_GAP_S
 from robocal_ros.sessions.correction.wire import JointWire
 
 TRAJECTORY = "joint_trajectory"
@@ -84,12 +85,12 @@ class JointCorrectionNode(HouseNode):
             nominal, reference, self.settings["reference"], serial, self._shadow
         )
         self._judge = CorrectionHealth()
-        self._streams, self._paths = (CommandSources(config.stream_gap_s) for _ in range(2))
+        self._streams = CommandSources(max(config.stream_gap_s, LONGEST_GAP_S))
+        self._paths = CommandSources(config.stream_gap_s)
         self._senders = {TARGETS: self._streams, COMMANDS: self._streams, TRAJECTORY: self._paths}
         self._sources = {topic: SourceGuard(self, topic) for topic in KINDS}
-        self._commanded = False
         self._told: tuple[CorrectionStatus, str] | None = None
-        self._told_s = 0.0
+        self._commanded, self._told_s = False, 0.0
         self._open_topics()
 
     def _open_topics(self) -> None:
@@ -118,9 +119,8 @@ class JointCorrectionNode(HouseNode):
         self.add_timer(LOOK_S, self._look, steady=True)
         if self.settings[ACTION]:
             if self._proxy is None:
-                self._proxy = TrajectoryProxy(
-                    self, f"~/{ACTION}", self._goal, self._taught, self._stop
-                )
+                acting = self._goal, self._taught, self._stop
+                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", *acting)
             self._proxy.open(self.settings[ACTION])
 
     def activate(self) -> None:
@@ -232,10 +232,11 @@ class JointCorrectionNode(HouseNode):
         message = PathMessage(trajectory)
         try:
             came, command = self._corrected(message)
-        except RefusedError:
-            if self._shadow:
-                return trajectory
-            raise
+        except RefusedError as fault:
+            held_back = fault.reason is Reason.OWN_OUTPUT or not message.is_finite()
+            if held_back or not self._shadow:
+                raise
+            return trajectory
         return trajectory if command is came else message.changed(command)
 
     def _taught(self, names: Any, position: Any, velocity: Any) -> Any:

@@ -193,6 +193,11 @@ def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
     nominal = load_robot(settings["robot"])
     chosen = settings["reference"]
     reference = nominal if chosen == NOMINAL else load_robot(chosen)
+    reference = replace(  # a calibrated file does not lift the robot's limits
+        reference,
+        lower=np.maximum(nominal.lower, reference.lower),
+        upper=np.minimum(nominal.upper, reference.upper),
+    )
     tool = settings["taught_tool"]
     if any(tool):
         reference = replace(reference, T_flange_tool=frames.transform_from_quat(tool[:3], tool[3:]))

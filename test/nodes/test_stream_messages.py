@@ -124,3 +124,12 @@ def test_an_array_has_the_configured_joints() -> None:
 def test_what_is_no_message_is_told(read: Any) -> None:
     with pytest.raises(InputError, match="this is no Joint"):
         read(b"\0\1\0\0\1")
+
+
+def test_a_velocity_of_another_joint_that_is_no_number_does_not_go_out() -> None:
+    """A gripper's, which the correction does not touch."""
+    message = came(a_state(velocity=[0.1, NAN]), is_reading=True)
+    command = message.command()
+    out = as_message(message.changed(replace(command, mark=CORRECTED)), JointState)
+    assert list(out.velocity) == []
+    assert list(out.position) == [1.0, 2.0]

@@ -75,9 +75,10 @@ class Commands:
         q, index = self._joints.complete(command.names, command.position[None], now_s)
         speeds = None if command.velocity is None else command.velocity[None]
         require_finite(command.names, speeds)
-        # two messages may come at once after a delay: each has the stream's own period
-        period = self._stream.period_s or self._config.longest_step_s
-        dt_s = np.array([max(now_s - self._out_s, period)])
+        # Messages may come at once after a delay: each has the stream's own period; and a pause
+        # does not allow a longer step than two of them.
+        period = self._stream.mean_s or self._config.longest_step_s
+        dt_s = np.array([np.clip(now_s - self._out_s, period, 2.0 * period)])
         motion = self._motion(q, index, dt_s, speeds)
         corrected = self._or_as_it_came(
             command, lambda: self._correct_target(command, motion, index, now_s)

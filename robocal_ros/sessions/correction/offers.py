@@ -97,9 +97,11 @@ class CorrectionGate:
         self.stale = ""
         if self._model is not None and limit_s > 0.0:
             age_ns = now_ns - self._model.stamp_ns
-            if age_ns > limit_s * 1e9:
-                named = f"model revision {self._model.revision}"
-                self.stale = f"{named} is {age_ns * 1e-9:.1f} s old, allowed {limit_s:g} s"
+            if abs(age_ns) > limit_s * 1e9:
+                old = f"{abs(age_ns) * 1e-9:.1f} s " + ("old" if age_ns > 0 else "in the future")
+                self.stale = (
+                    f"model revision {self._model.revision} is {old}, allowed {limit_s:g} s"
+                )
         return was != bool(self.stale)
 
     def look_again(self, places: Array) -> None:

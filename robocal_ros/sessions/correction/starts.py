@@ -35,6 +35,7 @@ class Starts:
         self._arm, self._config, self._corrector = arm, config, corrector
         self._sent: Sent | None = None
         self.started = False
+        self._bare = False  # the robot was seen without a correction, and none was put out since
         self.mismatch = ""
 
     def under_way(self, now_s: float) -> bool:
@@ -49,10 +50,13 @@ class Starts:
     def restart(self) -> None:
         """After a mismatch: the next command may begin where the robot stands."""
         if self.mismatch:
-            self.mismatch, self.started, self._sent = "", False, None
+            self.mismatch, self.started, self._bare, self._sent = "", False, False, None
 
     def must_start(self, now_s: float) -> bool:
-        """Whether a command must begin where the robot stands: not when passed on as it came.
+        """Whether a command must begin where the robot stands.
+
+        Not when it is passed on as it came, to a robot that shows no correction any more: what
+        should have taken it out may have been rejected.
 
         Raises
         ------
@@ -64,7 +68,7 @@ class Starts:
             return False
         if self.mismatch:
             raise RefusedError(Reason.START_MISMATCH, self.mismatch)
-        return not (self.started and self._corrector.passing(now_s))
+        return not (self.started and self._bare and self._corrector.passing(now_s))
 
     def start_at(self, begins: Array, where: Whereabouts, now_s: float) -> None:
         """A command begins at once, at where it should be now or was lately, ``begins`` (r, n).
@@ -79,7 +83,7 @@ class Starts:
             self._corrector.reference,
             *([] if self.started else [self._corrector.known]),
         ]
-        lag = where.travel if self.started else 0.0
+        lag = where.travel if self.started and self.under_way(now_s) else 0.0
         starts = [
             (self._corrector.shifted(begins, m), near + lag * (m is commanded)) for m in models
         ]
@@ -91,7 +95,7 @@ class Starts:
                 f"begins at {begins[0, far]:.6f}"
             )
         self._corrector.go_on_from(models[chosen], now_s)
-        self.started = True
+        self._bare = models[chosen] is self._corrector.reference
 
     def start_within(
         self, first: Array, index: Index, where: Whereabouts, now_s: float, lead_s: float
@@ -117,7 +121,6 @@ class Starts:
                     raise self._refuse_start(f"the robot is not where it was sent, and {detail}")
         if shows is Follows.NONE:
             self._corrector.go_on_from(self._corrector.reference, now_s)
-        self.started = True
 
     def _refuse_start(self, detail: str) -> RefusedError:
         self.mismatch = f"{detail}; call ~/enable when it may begin there"
@@ -125,6 +128,9 @@ class Starts:
 
     def note_sent(self, sent: Sent, now_s: float) -> None:
         """Remember what was put out."""
+        self.started = True
+        if not np.array_equal(sent.taught, sent.corrected):
+            self._bare = False
         earlier = self._sent
         if len(sent.times_s) > 1 or sent.times_s[0] > 0.0:
             same = earlier is not None and np.array_equal(earlier.index, sent.index)
