@@ -27,6 +27,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.nodes import conversions
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.sessions.correction.periods import LONGEST_GAP_S
 
 
 @pytest.fixture
@@ -50,7 +51,7 @@ def test_what_goes_out_is_what_came_in(shadow: Line) -> None:
         before = copy.deepcopy(message)
         publisher.publish(message)
         assert shadow.wait(inbox) == before
-    shadow.graph.spin_for(0.2)  # the stream of targets is over
+    shadow.graph.spin_for(LONGEST_GAP_S + 0.1)  # the stream of targets is over
     command = Float64MultiArray(data=array("d", HOME))
     shadow.to_array.publish(command)
     assert shadow.wait(shadow.arrays) == command
