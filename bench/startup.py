@@ -20,7 +20,7 @@ EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 NODES = ("thermal_node", "joint_correction_node", "replay_node")
 PROMISED_S = 1.5
 ROUNDS = 7
-GIVE_UP_S = 20.0
+GIVE_UP_S, ASK_AGAIN_S = 20.0, 1.0
 BARE = "import rclpy; rclpy.init(); n = rclpy.create_node('bare'); rclpy.spin(n)"
 
 
@@ -84,8 +84,10 @@ def _first_answer(name: str, command: list[str]) -> float:
             if not client.service_is_ready():
                 continue
             future = client.call_async(kind.Request())
-            rclpy.spin_until_future_complete(node, future, timeout_sec=GIVE_UP_S)
+            rclpy.spin_until_future_complete(node, future, timeout_sec=ASK_AGAIN_S)
             answer = future.result()
+            if answer is None:  # a server drops its answer to whom it has not discovered itself
+                continue
             if bare or answer.current_state.id == State.PRIMARY_STATE_ACTIVE:
                 return time.monotonic() - begin
         raise TimeoutError(f"{name} did not answer within {GIVE_UP_S} s")
