@@ -48,6 +48,7 @@ COMMANDS = {
     "thermal": "thermal",
     "tool": "tool",
     "hand-eye": "hand_eye",
+    "iso9283": "iso9283",
     "import-ur": "import_ur",
 }
 """Name of each command and its module, in the order of the help."""

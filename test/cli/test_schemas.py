@@ -233,6 +233,12 @@ CASES = {
         [*TRACKER, "--radius-mm", "19.05"],
         (3, "RANK_DEFICIENT"),
     ),
+    "iso9283": (
+        "iso9283.json",
+        ["iso9283", "--data", str(ROOT / "docs/examples/positions.csv"), "--commanded", "P1=1,2,3"],
+        ["iso9283", "--data", "edges.csv"],
+        (2, "BAD_INPUT"),
+    ),
     "import-ur": (
         "import-ur.json",
         ["import-ur", "--calibration", "c.conf", "--nominal", "n.conf", "--output", "ur.yaml"],
