@@ -44,6 +44,7 @@ COMMANDS = {
     "fk": "fk",
     "identify": "identify",
     "replay": "replay",
+    "validate": "validate",
     "history": "history",
     "thermal": "thermal",
     "tool": "tool",

@@ -1,23 +1,20 @@
 """``robocal replay``: a bag through the sessions of the live nodes, with the same results."""
 
 import argparse
-import contextlib
 import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, input_topic, warn
+from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, warn
 from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, Outcome, progress_console, tell
 from robocal_ros.cli.replay_view import show_replay
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, WrongRobotError
+from robocal_ros.core.errors import InputError
 
 if TYPE_CHECKING:
     from robocal_ros.cli.recording import Recording
-    from robocal_ros.core.kinematics import SerialArm
-    from robocal_ros.sessions.events import Command
     from robocal_ros.storage.bags import BagMessage
 
 NAME = "replay"
@@ -71,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
+    from robocal_ros.cli.recorded_robot import find_robot
     from robocal_ros.cli.replaying import Request, replay_bag
 
     if args.auto and (args.cold or args.warm):
@@ -80,7 +78,7 @@ def run(args: argparse.Namespace) -> Outcome:
     warnings: list[str] = []
     request = Request(
         bag=args.bag,
-        find_robot=partial(_robot, args.robot, warnings),
+        find_robot=partial(find_robot, args.robot, warnings),
         robot_named=args.robot is not None,
         cold=args.cold,
         warm=tuple(args.warm),
@@ -101,28 +99,6 @@ def _status(document: dict[str, Any]) -> int:
     error = document["error"]
     tell(error["code"], error["message"])
     return NO_ANSWER if error["code"] in _NO_ANSWER else BAD_REQUEST
-
-
-def _robot(name: str | None, warnings: list[str], configured: "Command | None") -> "SerialArm":
-    """The arm that the user named, else the shipped one that the bag was recorded with."""
-    if name is not None:
-        return describe_robot(name, warnings).arm
-    if configured is None:
-        raise InputError("the bag does not say which robot it is of: name it with --robot")
-    from robocal_ros.storage.robots import robot_folders
-
-    wanted = configured.arguments.get("model_hash")
-    for file in (file for folder in robot_folders() for file in sorted(folder.glob("*.yaml"))):
-        notes: list[str] = []
-        with contextlib.suppress(InputError):  # a broken file of another robot is no matter here
-            arm = describe_robot(str(file), notes).arm
-            if arm.model_hash == wanted:
-                warnings += notes
-                return arm
-    raise WrongRobotError(
-        f"recorded with robot '{configured.arguments.get('robot')}', nominal model {wanted}, which "
-        "is none of the shipped robots: give its file with --robot"
-    )
 
 
 def _watch(what: str, recording: "Recording") -> "Iterator[BagMessage]":

@@ -22,6 +22,7 @@ from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import (
     ReplayReport,
+    accepting,
     automatic_commands,
     feed,
     replay,
@@ -36,7 +37,8 @@ from robocal_ros.storage.calibrations import CalibrationHistory
 
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]
-Watch = Callable[[str, Recording], Iterator[BagMessage]]
+Samples = Iterator[BagMessage]
+Watch = Callable[[str, Recording], Samples]
 
 
 _OF_OTHER_NODES = (
@@ -56,6 +58,8 @@ class Request:
     cold, warm : windows, s from the first joint reading; without any the recorded commands.
     topics : input to topic of the bag, where given.
     state : folder of a history that is kept; None: one that is not.
+    accept : with ``auto``, accept each candidate that its verdict accepts.
+    beside : gets a thermal session and its samples, and hands these on.
     """
 
     bag: Path
@@ -66,6 +70,8 @@ class Request:
     auto: bool = False
     topics: Mapping[str, str] = field(default_factory=dict)
     state: Path | None = None
+    accept: bool = False
+    beside: Callable[[ThermalSession, Recording, Samples], Samples] | None = None
 
 
 def replay_bag(request: Request, watch: Watch) -> Document:
@@ -98,6 +104,8 @@ def replay_bag(request: Request, watch: Watch) -> Document:
             session = _session(recording, arm, history)
             commands = _commands(request, recording, arm, history, watch)
             samples = watch("replaying", recording)
+            if request.beside is not None:
+                samples = request.beside(session, recording, samples)
             report = replay(session, samples, commands, recording.inputs, take_message)
             used = commands is recording.commands
             document = _document(report, session, recording) | {"recorded": used}
@@ -153,7 +161,8 @@ def _commands(
         lost = scout.desk.ignored.words()
         words = "no measurement at standstill in this recording" + (f"; {lost}" if lost else "")
         raise InputError(words, file=str(request.bag))
-    return automatic_commands(observed)
+    commands = automatic_commands(observed)
+    return accepting(commands, by="replay") if request.accept else commands
 
 
 def _stamps(window: Window, recording: Recording) -> tuple[int, int]:

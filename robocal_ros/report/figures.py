@@ -1,7 +1,8 @@
 """Figures of reports, drawn without a display."""
 
 import io
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import matplotlib as mpl
 import numpy as np
@@ -123,7 +124,27 @@ def error_by_pose(report: DriftReport) -> Figure:
     return figure
 
 
-def parameter_drift(report: DriftReport) -> Figure:
+class Drifted(Protocol):
+    """How a model moved: parts of a `DriftReport`."""
+
+    @property
+    def hours(self) -> Array:
+        """Time (c,) of each model."""
+
+    @property
+    def parameter_names(self) -> Sequence[str]:
+        """Names of the k parameters, with their unit."""
+
+    @property
+    def drift(self) -> Array:
+        """Drift (c, k) in those units."""
+
+    @property
+    def sigma(self) -> Array:
+        """Its standard deviation (c, k)."""
+
+
+def parameter_drift(report: Drifted) -> Figure:
     """Drift of the parameters that moved most in units of their sigma, with two sigma."""
     with mpl.rc_context(STYLE | {"axes.titlesize": 9.5, "axes.titlepad": 5, "font.size": 8.5}):
         figure = Figure(figsize=(8.0, 3.8), layout="constrained")

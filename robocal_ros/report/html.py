@@ -51,10 +51,10 @@ def page(report: DriftReport) -> str:
         f'<p class="lead">{_answer(report)}</p>',
         _errors(report),
         "<h2>Over the shift</h2>",
-        _figure(figures.svg(figures.drift_over_time(report)), "Error over the shift"),
-        _figure(figures.svg(figures.error_by_pose(report)), "Error of each check pose"),
+        figure(figures.svg(figures.drift_over_time(report)), "Error over the shift"),
+        figure(figures.svg(figures.error_by_pose(report)), "Error of each check pose"),
         "<h2>How the model moved</h2>",
-        _figure(
+        figure(
             figures.svg(figures.parameter_drift(report)),
             "The parameters that moved most in units of their own standard deviation; the band "
             "is two standard deviations. Single parameters can trade with each other: the error "
@@ -65,10 +65,15 @@ def page(report: DriftReport) -> str:
         "<h2>Where this comes from</h2>",
         _origin(report),
     ]
+    return whole(report.title, parts)
+
+
+def whole(title: str, parts: Sequence[str]) -> str:
+    """A page of these elements."""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(report.title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n"
+        f"<title>{escape(title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n"
         + "\n".join(parts)
         + "\n</body>\n</html>\n"
     )
@@ -98,7 +103,7 @@ def _errors(report: DriftReport) -> str:
         "measured or used to solve. Before a cycle the model in force is at its oldest; after it, "
         "renewed where the verdict accepts.</p>"
     )
-    return _table(head, rows, good=1) + note
+    return table(head, rows, good=1) + note
 
 
 def _decisions(report: DriftReport) -> str:
@@ -118,7 +123,7 @@ def _decisions(report: DriftReport) -> str:
         '<p class="faint">Predicted: rms error at the check poses, expected from the covariance of '
         "the model in force; achieved: rms there; both in mm, after the decision.</p>"
     )
-    return _table(head, rows, words=(2, 6)) + note
+    return table(head, rows, words=(2, 6)) + note
 
 
 def _origin(report: DriftReport) -> str:
@@ -132,17 +137,23 @@ def _origin(report: DriftReport) -> str:
         ("software", origin.commit),
         ("date", origin.created),
     ]
+    return listed(facts)
+
+
+def listed(facts: Sequence[tuple[str, str]]) -> str:
+    """Names with what they stand for."""
     return "<dl>" + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in facts) + "</dl>"
 
 
-def _figure(svg: str, caption: str) -> str:
+def figure(svg: str, caption: str) -> str:
+    """A figure with its caption."""
     return (
         f'<figure role="img" aria-label="{escape(caption)}">{svg}'
         f"<figcaption>{escape(caption)}</figcaption></figure>"
     )
 
 
-def _table(
+def table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     *,

@@ -15,6 +15,7 @@ from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
 
 VERSION = 1
+OWN = "tracker"  # only a thermal session's configuration has it
 
 
 def _text(document: Mapping[str, Any]) -> str:
@@ -84,11 +85,16 @@ def configuration(session: ThermalSession, topics: Mapping[str, str] | None = No
             "config": asdict(session.config),
             "model": session.in_force.model,
             "reference": session.reference_model,
-            "tracker": None if session.follower is None else session.follower.state.document(),
+            OWN: None if session.follower is None else session.follower.state.document(),
         },
         session.desk.newest_ns.get(JOINTS, 0),
         session.desk.marks,
     )
+
+
+def is_thermal_session(configured: Command | None) -> bool:
+    """Whether a configuration was recorded by a thermal session."""
+    return configured is not None and OWN in configured.arguments
 
 
 def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:

@@ -11,6 +11,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import stamp_ns
 from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
+from robocal_ros.sessions.decisions import NEWEST
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.observation import Observation
 from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
@@ -248,6 +249,19 @@ def automatic_commands(
     last = [observations[i - 1].stamp_ns for i in starts[1:]] + [end]
     windows = list(zip(edges, last, strict=True))
     return window_commands(windows[0], windows[1:])
+
+
+def accepting(
+    commands: Iterable[tuple[Command, Mapping[str, Any]]], by: str
+) -> list[tuple[Command, Mapping[str, Any]]]:
+    """The same commands, with each candidate accepted where its own verdict accepts it."""
+    found: list[tuple[Command, Mapping[str, Any]]] = []
+    for command, outcome in commands:
+        found.append((command, outcome))
+        if command.name == events.IDENTIFY:
+            arguments = {"choose": NEWEST, "by": by, "reason": "its verdict accepts"}
+            found.append((Command(events.ACCEPT, arguments, command.stamp_ns), {}))
+    return found
 
 
 def _cycle_starts(observations: Sequence[Observation]) -> list[int]:

@@ -1,0 +1,217 @@
+"""``robocal validate``: any number of bags replayed and judged, with one report of them all."""
+
+import argparse
+import os
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from robocal_ros import __version__
+from robocal_ros.cli.arguments import ROBOT_HELP, count
+from robocal_ros.cli.output import (
+    DONE,
+    NO_ANSWER,
+    Document,
+    Outcome,
+    progress_console,
+    refusal,
+    tell,
+)
+from robocal_ros.core.codes import Code
+from robocal_ros.storage.files import write_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from robocal_ros.cli.validating import Job, Validated
+    from robocal_ros.report.validation_figures import Drawn
+
+NAME = "validate"
+HELP = "replay any number of bags, in parallel, and write one report: is it good, in mm?"
+
+TITLE = "Validation of recorded bags"
+LIBRARIES = ("numpy", "scipy", "numba", "rosbags", "mcap")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "bags", type=Path, nargs="+", metavar="BAG", help=".mcap files, or folders of bags"
+    )
+    parser.add_argument(
+        "--report", required=True, type=Path, metavar="DIR", help="folder of the report"
+    )
+    parser.add_argument(
+        "--robot", metavar="R.yaml", help=f"{ROBOT_HELP}; of bags that do not say which it is"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=count,
+        metavar="N",
+        help="bags at the same time; default: this machine's cores",
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="Dask cluster to use instead, tcp://HOST:8786"
+    )
+
+
+def run(args: argparse.Namespace) -> Outcome:
+    """Do it. Raises `RobocalError` for what a user can mend."""
+    from robocal_ros.cli.validating_many import validated
+    from robocal_ros.report.validation import summary_rows
+    from robocal_ros.report.validation_page import page
+
+    args.report.mkdir(parents=True, exist_ok=True)
+    jobs = _jobs(args.bags, args.robot)
+    workers = args.jobs or len(os.sched_getaffinity(0))
+    results: dict[int, Document] = {}
+    figures: dict[str, tuple[Drawn, ...]] = {}
+    with _progress(len(jobs)) as shown:
+        for number, result in validated(jobs, workers, args.scheduler):
+            results[number] = result.document
+            figures[jobs[number].name] = result.figures
+            _keep_figures(args.report, jobs[number].name, result)
+            shown.advance()
+    bags = [results[number] for number in range(len(jobs))]
+    report = _report(bags)
+    _write(args.report, report, page(report, figures))
+    told = {name: report[name] for name in ("created", "software", "versions", "tolerance_mm")}
+    document = _failure(bags) | told
+    document |= {"report": str(args.report / "report.html"), "bags": summary_rows(bags)}
+    if "error" in document:
+        tell(document["error"]["code"], document["error"]["message"])
+    status = NO_ANSWER if "error" in document else DONE
+    return Outcome(document, partial(_show, document=document), status)
+
+
+def _jobs(paths: Sequence[Path], robot: str | None) -> "list[Job]":
+    """A job for each bag, under a name that no other has."""
+    from robocal_ros.cli.validating import Job
+
+    jobs: list[Job] = []
+    for path in paths:
+        names = {job.name for job in jobs}
+        own = path.resolve().name
+        numbered = (f"{own} ({number})" for number in range(2, len(paths) + 1))
+        name = own if own not in names else next(n for n in numbered if n not in names)
+        jobs.append(Job(str(path.absolute()), name, robot))
+    return jobs
+
+
+def _report(bags: Sequence[Document]) -> Document:
+    from robocal_ros.report.drift import TOLERANCE_MM
+
+    return {
+        "title": TITLE,
+        "created": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "software": f"robocal_ros {__version__}",
+        "versions": {"python": platform.python_version()}
+        | {name: found for name in LIBRARIES if (found := _version(name)) is not None},
+        "tolerance_mm": TOLERANCE_MM,
+        "bags": list(bags),
+    }
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _failure(bags: Sequence[Document]) -> Document:
+    """``error`` and ``verdict`` when bags could not be validated; empty when all could."""
+    failed = [bag for bag in bags if "error" in bag]
+    if not failed:
+        return {}
+    words = "; ".join(f"{bag['bag']}: {bag['error']['message']}" for bag in failed)
+    message = f"{len(failed)} of {len(bags)} bags could not be validated: {words}"
+    return refusal(Code[failed[0]["error"]["code"]], message)
+
+
+def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
+    for drawn in result.figures:
+        (folder / f"{_stem(name)}-{drawn.name}.png").write_bytes(drawn.png)
+
+
+def _stem(name: str) -> str:
+    return name.replace(".mcap", "").replace(" ", "")
+
+
+def _write(folder: Path, report: Document, html: str) -> None:
+    import json
+
+    from robocal_ros.report.validation import bags_table, cycles_table, decisions_table
+
+    bags = report["bags"]
+    write_text(folder / "report.html", html)
+    write_text(folder / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
+    write_text(folder / "bags.csv", bags_table(bags))
+    write_text(folder / "cycles.csv", cycles_table(bags))
+    write_text(folder / "decisions.csv", decisions_table(bags))
+
+
+class _Progress(Protocol):
+    def advance(self) -> None:
+        """One bag more is done."""
+
+
+class _Quiet:
+    def advance(self) -> None:
+        pass
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[_Progress]:
+    """Bags done, on a terminal."""
+    if not sys.stderr.isatty():
+        yield _Quiet()
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
+
+    columns = ("validating", BarColumn(), MofNCompleteColumn(), "bags", TimeElapsedColumn())
+    with Progress(*columns, console=progress_console(), transient=True) as progress:
+        task = progress.add_task("validating", total=total)
+
+        class Shown:
+            def advance(self) -> None:
+                progress.advance(task)
+
+        yield Shown()
+
+
+def _show(console: "Console", document: Document) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title="Rms errors in mm", title_justify="left", box=None)
+    heads = ("bag", "what", "count", "without", "in force", "after", "below bound", "refused")
+    for head in heads:
+        table.add_column(head, justify="left" if head in heads[:2] else "right")
+    for row in document["bags"]:
+        table.add_row(Text(row["bag"]), *_cells(row))
+    console.print(table)
+    console.print(Text(document["report"]), soft_wrap=True)
+
+
+def _cells(row: dict[str, Any]) -> list[str]:
+    if "error" in row:
+        return [f"not validated: {row['error']['code']}"]
+    counted = {"thermal": "cycles", "tool": "runs", "hand_eye": "calibrations"}[row["kind"]]
+    errors = [row.get(f"rms_{name}_mm") for name in ("without", "in_force", "after")]
+    if row["kind"] == "hand_eye":
+        errors = [None, None, row["predicted_rms_mm"]]
+    share = row.get("share_below_bound")
+    return [
+        row["kind"].replace("_", "-"),
+        str(row[counted]),
+        *("" if error is None else f"{error:.3f}" for error in errors),
+        "" if share is None else f"{share:.1%}",
+        str(row["refused"]),
+    ]

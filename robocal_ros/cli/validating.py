@@ -1,0 +1,210 @@
+"""One bag through the code of ``robocal replay``, and judged, for ``robocal validate``.
+
+Runs in a process of its own: a `Job` goes in, a `Validated` comes out, no message between.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from robocal_ros import __version__
+from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, TRUTH, check_points, true_transforms
+from robocal_ros.cli.output import Document, refusal
+from robocal_ros.cli.recorded_robot import find_robot
+from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.cli.replaying import Request, replay_bag
+from robocal_ros.cli.validating_cycles import drift_report, thermal_document
+from robocal_ros.cli.validating_parts import calibrations, decisions, tool_runs
+from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.report.drift import Origin
+from robocal_ros.report.validation_figures import Drawn, thermal_figures, tool_figures
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
+from robocal_ros.sessions.records import is_thermal_session
+from robocal_ros.sessions.replay import EVENTS, read_events, topic_kind
+from robocal_ros.sessions.thermal_config import ThermalConfig
+from robocal_ros.sessions.tool_recorded import is_tool_session
+from robocal_ros.storage.bags import BagMessage, BagReader
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+_SESSIONS = (is_thermal_session, is_tool_session, is_hand_eye_session)
+ROUTINE = (events.START, events.CAPTURE, events.SAMPLE, events.TOOL_STEP, events.STEP_BEGINS)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A bag to validate, by a name of its own; ``robot`` is for a bag that names none."""
+
+    path: str
+    name: str
+    robot: str | None
+
+
+@dataclass(frozen=True)
+class Validated:
+    """What a bag gave: its document, with ``error`` where it gave nothing, and its figures."""
+
+    document: Document
+    figures: tuple[Drawn, ...] = ()
+
+
+def validate_bag(job: Job) -> Validated:
+    """Replay and judge a bag; one that cannot be is told, not raised."""
+    head: Document = {"bag": job.name, "path": job.path}
+    figures: list[Drawn] = []
+    try:
+        with BagReader(job.path) as reader:
+            head |= _about(reader)
+            sessions = [_Session(job, reader, topic) for topic in _replayable(reader)]
+            documents = [session.document(head, figures) for session in sessions]
+    except RobocalError as error:
+        return Validated(head | {"error": refusal(error.code, str(error))["error"]})
+    except OSError as error:
+        words = f"{error.filename or job.path}: {error.strerror}"
+        return Validated(head | {"error": refusal(RobocalError.code, words)["error"]})
+    return Validated(head | {"sessions": documents}, tuple(figures))
+
+
+def _about(reader: BagReader) -> Document:
+    info = reader.info
+    start_ns, end_ns = info.start_ns or 0, info.end_ns or 0
+    return {
+        "from": _utc(start_ns),
+        "to": _utc(end_ns),
+        "duration_s": (end_ns - start_ns) * 1e-9,
+        "topics": {topic: found.messages for topic, found in info.topics.items()},
+        "simulated": any(TRUTH in topic for topic in info.topics),
+    }
+
+
+def _utc(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def _replayable(reader: BagReader) -> list[str | None]:
+    """Topics of the sessions that were commanded; None: the bag's measurements alone.
+
+    Raises
+    ------
+    InputError
+        When an event cannot be read.
+    """
+    commanded: list[str | None] = []
+    for topic in (topic for topic in reader.info.topics if topic_kind(topic) == EVENTS):
+        configured, commands = read_events(reader.messages([topic]))
+        if commands and any(is_of(configured) for is_of in _SESSIONS):
+            commanded.append(topic)
+    return commanded or [None]
+
+
+class _Session:
+    """One node's session in a bag; the whole bag where ``topic`` is None."""
+
+    def __init__(self, job: Job, reader: BagReader, topic: str | None) -> None:
+        self._job, self._reader, self._topic = job, reader, topic
+        self._given = {} if topic is None else {EVENTS: topic}
+        self._recording = open_recording(reader, self._given)
+        self._forecasts = Forecasts()
+        self._warnings: list[str] = []
+        self._arm: SerialArm | None = None
+
+    def document(self, head: Document, figures: list[Drawn]) -> Document:
+        """Replay it; its figures are added to ``figures``."""
+        configured, reader = self._recording.configured, self._reader
+        with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
+            replayed = self._replayed(Path(folder))
+            common = self._common(replayed)
+            if is_tool_session(configured):
+                runs = tool_runs(replayed, true_transforms(reader, TOOL, "T_flange_tool"))
+                figures += tool_figures(runs)
+                return common | {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
+            if is_hand_eye_session(configured):
+                truth = true_transforms(reader, HAND_EYE, "T_flange_sensor")
+                found, final = calibrations(replayed, truth), replayed["final_sensor"]
+                return common | {"kind": "hand_eye", "calibrations": found, "final": final}
+            return common | self._thermal(Path(folder), common, head, figures)
+
+    def _replayed(self, folder: Path) -> Document:
+        auto = not self._recording.commands
+        request = Request(
+            bag=Path(self._job.path),
+            find_robot=self._robot,
+            auto=auto,
+            accept=auto,
+            topics=self._given,
+            state=folder,
+            beside=self._forecasts.beside,
+        )
+        replayed = replay_bag(request, _silent)
+        if "error" in replayed:
+            raise _ReplayError(replayed["error"])
+        return replayed
+
+    def _robot(self, configured: Command | None) -> SerialArm:
+        """The recorded robot, else the one that the user names."""
+        name = self._job.robot
+        if name is not None and configured is not None:
+            notes: list[str] = []
+            arm = find_robot(name, notes, None)
+            if arm.model_hash != configured.arguments.get("model_hash"):
+                name = None
+        self._arm = find_robot(name, self._warnings, configured)
+        return self._arm
+
+    def _thermal(
+        self, folder: Path, common: Document, head: Document, figures: list[Drawn]
+    ) -> Document:
+        arm, serial = self._arm, Path(self._job.path).resolve().stem
+        if arm is None:
+            raise ValueError("replayed without a robot")
+        with CalibrationHistory.open(serial, state_dir=folder, create=False) as history:
+            made = ThermalHistory(history, arm, self._recording.start_ns)
+            sigma_m = float(common["settings"]["sigma_m"])
+            cycles = made.cycles(self._forecasts, check_points(self._reader), sigma_m)
+        document = thermal_document(cycles, arm)
+        origin = Origin(
+            simulated=head["simulated"],
+            data=self._job.name,
+            robot=arm.name,
+            serial="",
+            model_hash=arm.model_hash,
+            commit=__version__,
+            created="",
+        )
+        truth = drift_report(self._job.name, origin, cycles, arm)
+        figures += thermal_figures(document["cycles"], truth)
+        return {"kind": "thermal", **document}
+
+    def _common(self, replayed: Document) -> Document:
+        configured, recorded = self._recording.configured, bool(self._recording.commands)
+        settings = asdict(ThermalConfig()) if configured is None else configured.arguments["config"]
+        return {
+            "node": self._topic,
+            "robot": replayed["robot"],
+            "model_hash": replayed["model_hash"],
+            "as_recorded": recorded,
+            "differs": replayed["differs"] if recorded else [],
+            "settings": settings,
+            "decisions": decisions(replayed, ROUTINE, asked=recorded),
+            "ignored": replayed["ignored_reasons"],
+            "gaps": replayed["gaps"],
+            "warnings": [*self._warnings, *replayed["warnings"]],
+        }
+
+
+class _ReplayError(RobocalError):
+    """What a replay told in its document, as an error."""
+
+    def __init__(self, told: Document) -> None:
+        super().__init__(told["message"])
+        self.code = Code[told["code"]]
+
+
+def _silent(what: str, recording: Recording) -> Iterator[BagMessage]:
+    return recording.samples()

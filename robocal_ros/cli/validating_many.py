@@ -1,0 +1,77 @@
+"""Many bags beside each other: Dask runs `validate_bag`, jobs go out and results come back."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from robocal_ros.cli.output import refusal
+from robocal_ros.cli.validating import Job, Validated, validate_bag
+from robocal_ros.core.errors import InputError, RobocalError
+
+Numbered = tuple[int, Validated]
+
+
+def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Iterator[Numbered]:
+    """Each job's number and result, as they become ready.
+
+    Parameters
+    ----------
+    workers : processes on this machine; with one, or one bag, all is done in this process.
+    scheduler : address of a running cluster, which is used instead; it must see the bags by the
+        same paths, and have this software.
+
+    Raises
+    ------
+    InputError
+        When Dask is not there, or the cluster does not answer.
+    """
+    if scheduler is None and min(workers, len(jobs)) <= 1:
+        yield from ((number, validate_bag(job)) for number, job in enumerate(jobs))
+        return
+    with _client(min(workers, len(jobs)), scheduler) as client:
+        yield from _gathered(client, jobs)
+
+
+def _gathered(client: Any, jobs: Sequence[Job]) -> Iterator[Numbered]:
+    from distributed import as_completed
+
+    # A bag is read once: two jobs are never the same one to Dask.
+    number = {client.submit(validate_bag, job, pure=False): i for i, job in enumerate(jobs)}
+    for future in as_completed(list(number)):
+        i = number.pop(future)  # and with it, when it was read, its result in the cluster
+        error = future.exception()
+        yield i, future.result() if error is None else _lost(jobs[i], error)
+        future.release()
+
+
+def _lost(job: Job, error: BaseException) -> Validated:
+    """A bag whose worker was killed, or whose replay crashed: the others go on."""
+    words = f"{job.path}: its worker ended without a result, {type(error).__name__}: {error}"
+    told = refusal(RobocalError.code, words)["error"]
+    return Validated({"bag": job.name, "path": job.path, "error": told})
+
+
+@contextmanager
+def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise InputError(
+            "several bags at once need Dask: install 'distributed' (docs/install.md), or say "
+            "--jobs 1"
+        ) from error
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=10)
+        except (OSError, ValueError) as error:
+            raise InputError(f"--scheduler {scheduler} does not answer: {error}") from error
+        with client:
+            yield client
+        return
+    # One thread each, for linear algebra too (Dask sets it): the same bits as in one process.
+    local = {"n_workers": workers, "threads_per_worker": 1, "processes": True}
+    with (
+        LocalCluster(**local, dashboard_address=None, memory_limit=0) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client

@@ -1,0 +1,158 @@
+"""What many validated bags say together: one row for each, and the tables beside the page."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+Document = dict[str, Any]
+
+ERROR_KEYS = ("mean_mm", "rms_mm", "p95_mm", "max_mm", "share_within_tolerance")
+
+
+def summary_rows(bags: Sequence[Document]) -> list[Document]:
+    """A row for each session of each bag; one with ``error`` for a bag that gave none."""
+    rows = []
+    for bag in bags:
+        if "error" in bag:
+            rows.append({"bag": bag["bag"], "kind": None, "error": bag["error"]})
+        rows += [_row(bag, session) for session in bag.get("sessions", [])]
+    return rows
+
+
+def _row(bag: Document, session: Document) -> Document:
+    refused = [d for d in session["decisions"] if d["code"] != "ACCEPT"]
+    own = {"thermal": _thermal, "tool": _tool, "hand_eye": _hand_eye}[session["kind"]](session)
+    return {
+        "bag": bag["bag"],
+        "kind": session["kind"],
+        "node": session["node"],
+        "robot": session["robot"],
+        "simulated": bag["simulated"],
+        "duration_s": bag["duration_s"],
+        "as_recorded": session["as_recorded"],
+        "differs": len(session["differs"]),
+        "decisions": len(session["decisions"]),
+        "refused": len(refused),
+        "warnings": len(session["warnings"]),
+        **own,
+    }
+
+
+def _thermal(session: Document) -> Document:
+    """Errors by the truth where the bag has one, else as measured; after: of the candidates."""
+    cycles, judged_by = session["cycles"], "truth" if session["true"] else "measurements"
+    errors = session["true"] or session["measured"] or {}
+    after = errors.get("after") or {"rms_mm": pooled_rms_mm(cycles, "candidate")}
+    return {
+        "cycles": len(cycles),
+        "accepted": sum(cycle["revision"] > 0 for cycle in cycles),
+        "judged_by": judged_by,
+        "rms_without_mm": errors["without"]["rms_mm"] if errors else None,
+        "rms_in_force_mm": errors["in_force"]["rms_mm"] if errors else None,
+        "rms_after_mm": after["rms_mm"],
+        "lambda_without": errors["without"]["share_within_tolerance"] if errors else None,
+        "lambda_in_force": errors["in_force"]["share_within_tolerance"] if errors else None,
+        "lambda_after": after.get("share_within_tolerance"),
+        "share_below_bound": session["bound"][
+            "true_share" if judged_by == "truth" else "measured_share"
+        ],
+    }
+
+
+def pooled_rms_mm(cycles: Sequence[Document], key: str) -> float | None:
+    """Rms over the held-out measurements of all cycles; None without cycles."""
+    if not cycles:
+        return None
+    n = np.array([cycle[key]["n"] for cycle in cycles])
+    rms = np.array([cycle[key]["rms_mm"] for cycle in cycles])
+    return float(np.sqrt(np.sum(n * rms**2) / np.sum(n)))
+
+
+def _tool(session: Document) -> Document:
+    changes = [run["change_mm"] for run in session["runs"] if run["change_mm"] is not None]
+    errors = [run["true_error_mm"] for run in session["runs"] if run["true_error_mm"] is not None]
+    return {
+        "runs": len(session["runs"]),
+        "largest_change_mm": max(changes, default=None),
+        "largest_true_error_mm": max(errors, default=None),
+    }
+
+
+def _hand_eye(session: Document) -> Document:
+    found = session["calibrations"]
+    last = found[-1] if found else {}
+    keys = ("residual_rms_mm", "predicted_rms_mm", "true_error_mm")
+    return {"calibrations": len(found)} | {key: last.get(key) for key in keys}
+
+
+def bags_table(bags: Sequence[Document]) -> str:
+    """The rows as CSV."""
+    rows = [
+        {**row, "error": f"{row['error']['code']}: {row['error']['message']}"}
+        if "error" in row
+        else row
+        for row in summary_rows(bags)
+    ]
+    return _csv(rows)
+
+
+def cycles_table(bags: Sequence[Document]) -> str:
+    """Every thermal cycle as CSV."""
+    return _csv([_cycle(bag, cycle) for bag, cycle in thermal_cycles(bags)])
+
+
+def thermal_cycles(bags: Sequence[Document]) -> list[tuple[Document, Document]]:
+    """Every bag's thermal cycles, each with its bag."""
+    return [
+        (bag, cycle)
+        for bag in bags
+        for session in bag.get("sessions", [])
+        if session["kind"] == "thermal"
+        for cycle in session["cycles"]
+    ]
+
+
+def _cycle(bag: Document, cycle: Document) -> Document:
+    row = {name: cycle[name] for name in ("cycle", "stamp", "hours", "samples")}
+    row |= {"code": cycle["verdict"]["code"], "revision": cycle["revision"]}
+    for name in ("nominal", "in_force", "candidate"):
+        row[f"{name}_rms_mm"] = cycle[name]["rms_mm"]
+    row |= {
+        "predicted_rms_mm": cycle["predicted_rms_mm"],
+        "bound_mm": (cycle["forecast"] or {}).get("bound_mm"),
+    }
+    for judge in ("measured", "true"):
+        for name in ("without", "in_force", "after"):
+            found = (cycle[judge] or {}).get(name) or {}
+            row |= {f"{judge}_{name}_{key}": found.get(key) for key in ERROR_KEYS}
+    row |= {f"drift_{name}": value for name, value in cycle["drift"].items()}
+    row |= {f"sigma_{name}": value for name, value in cycle["sigma"].items()}
+    return {"bag": bag["bag"], **row, "reason": cycle["verdict"]["reason"]}
+
+
+def decisions_table(bags: Sequence[Document]) -> str:
+    """Every decision as CSV."""
+    return _csv(
+        [
+            {"bag": bag["bag"], "node": session["node"], **decision}
+            for bag in bags
+            for session in bag.get("sessions", [])
+            for decision in session["decisions"]
+        ]
+    )
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows([{name: _cell(row.get(name)) for name in columns} for row in rows])
+    return stream.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    return f"{value:.9g}" if isinstance(value, float) and abs(value) < 1e6 else value

@@ -1,0 +1,220 @@
+"""Many validated bags as one HTML page that needs nothing else."""
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from html import escape
+from typing import Any
+
+from robocal_ros.report.drift import TOLERANCE_MM
+from robocal_ros.report.html import figure, listed, table, whole
+from robocal_ros.report.validation import Document, summary_rows
+from robocal_ros.report.validation_figures import Drawn
+
+Figures = Mapping[str, Sequence[Drawn]]
+
+NOTHING = "–"  # noqa: RUF001
+OVER_BOUND = "95 % of the errors are to be below the bound that was expected before the cycle"
+ERRORS_NOTE = (
+    "mm. In force: the model from before a cycle, at its oldest. After: with what was decided at "
+    "it; by measurements the candidate, each pose predicted from the others. λ: share of all "
+    f"directions within {TOLERANCE_MM:g} mm. Judged by measurements, errors hold the sensor's "
+    f"noise of both visits. Below bound: {OVER_BOUND}."
+)
+
+
+def page(report: Document, figures: Figures) -> str:
+    """The whole page.
+
+    ``report``: what report.json holds; ``figures``: of each bag, by its name.
+    """
+    rows, bags = summary_rows(report["bags"]), report["bags"]
+    simulated = any(bag.get("simulated") for bag in bags)
+    mark = '<span class="mark">simulated data</span>' if simulated else ""
+    parts = [
+        f"<h1>{escape(report['title'])}</h1>",
+        f'<p class="faint">{escape(report["created"])} · {escape(report["software"])} {mark}</p>',
+        f'<p class="lead">{_answer(rows)}</p>',
+        *_overview(rows),
+    ]
+    for bag in bags:
+        parts += _bag(bag, figures.get(bag["bag"], ()))
+    parts += ["<h2>Where this comes from</h2>", _origin(report)]
+    return whole(report["title"], parts)
+
+
+def _answer(rows: Sequence[Document]) -> str:
+    """Is it good, in mm? In one or two sentences."""
+    failed = sum("error" in row for row in rows)
+    told = []
+    for row in rows:
+        if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
+            true = "true " if row["judged_by"] == "truth" else ""
+            told.append(
+                f"{escape(row['bag'])}: {true}rms error {_mm(row['rms_without_mm'])} mm without "
+                f"correction, <b>{_mm(row['rms_after_mm'])} mm</b> after each cycle."
+            )
+    if failed:
+        told.append(f"{failed} of {len({row['bag'] for row in rows})} bags could not be validated.")
+    return "<br>".join(told) or "No thermal cycle in these bags."
+
+
+def _overview(rows: Sequence[Document]) -> list[str]:
+    parts = []
+    failed = [row for row in rows if "error" in row]
+    if failed:
+        cells = [[row["bag"], row["error"]["code"], row["error"]["message"]] for row in failed]
+        parts += ["<h2>Not validated</h2>", table(["bag", "code", "why"], cells, words=(1, 2))]
+    for kind, title, heads, cells_of, note in (
+        ("thermal", "Accuracy over the cycles", _THERMAL, _thermal_cells, ERRORS_NOTE),
+        ("tool", "Tools", _TOOL, _tool_cells, ""),
+        ("hand_eye", "Sensors on the robot", _HAND_EYE, _hand_eye_cells, ""),
+    ):
+        chosen = [row for row in rows if row["kind"] == kind]
+        if chosen:
+            body = [[row["bag"], row["robot"], *cells_of(row), *_common(row)] for row in chosen]
+            head = ["bag", "robot", *heads, "live", "refused", "warnings"]
+            parts += [f"<h2>{title}</h2>", table(head, body, words=(1,))]
+            parts += [f'<p class="faint">{note}</p>'] if note else []
+    return parts
+
+
+_THERMAL = (
+    "judged by", "cycles", "accepted", "rms without", "in force", "after", "λ without", "in force",
+    "after", "below bound",
+)  # fmt: skip
+_TOOL = ("runs", "largest change, mm", "largest true error, mm")
+_HAND_EYE = ("calibrations", "residual, mm", "expected error, mm", "true error, mm")
+
+
+def _thermal_cells(row: Document) -> list[str]:
+    return [
+        row["judged_by"],
+        str(row["cycles"]),
+        str(row["accepted"]),
+        *(_mm(row[f"rms_{name}_mm"]) for name in ("without", "in_force", "after")),
+        *(_share(row[f"lambda_{name}"]) for name in ("without", "in_force", "after")),
+        _share(row["share_below_bound"]),
+    ]
+
+
+def _tool_cells(row: Document) -> list[str]:
+    return [str(row["runs"]), _mm(row["largest_change_mm"]), _mm(row["largest_true_error_mm"])]
+
+
+def _hand_eye_cells(row: Document) -> list[str]:
+    keys = ("residual_rms_mm", "predicted_rms_mm", "true_error_mm")
+    return [str(row["calibrations"]), *(_mm(row[key]) for key in keys)]
+
+
+def _common(row: Document) -> list[str]:
+    """Does the replay give what was live? What was refused, what is to be known?"""
+    live = NOTHING
+    if row["as_recorded"]:
+        live = f"{row['differs']} differ" if row["differs"] else "equal"
+    return [live, str(row["refused"]), str(row["warnings"])]
+
+
+def _bag(bag: Document, figures: Sequence[Drawn]) -> list[str]:
+    if "error" in bag:
+        return []
+    mark = ' <span class="mark">simulated</span>' if bag["simulated"] else ""
+    parts = [
+        f"<h2>{escape(bag['bag'])}{mark}</h2>",
+        f'<p class="faint">{bag["from"]} to {bag["to"]}, {bag["duration_s"] / 3600.0:.2f} h</p>',
+        *(figure(drawn.svg, drawn.caption) for drawn in figures),
+    ]
+    for session in bag["sessions"]:
+        parts += _session(session)
+    return parts
+
+
+def _session(session: Document) -> list[str]:
+    own = {"thermal": _cycles, "tool": _runs, "hand_eye": _calibrations}[session["kind"]](session)
+    words = session["node"] or "no recorded commands: cycles found by their recurring poses, each "
+    words += "" if session["node"] else "candidate accepted where its verdict accepts it"
+    facts = [("session", words), ("robot", f"{session['robot']}, model {session['model_hash']}")]
+    if session["as_recorded"]:
+        equal = "every recorded result comes out equal, bit for bit"
+        facts.append(("replay", "; ".join(session["differs"]) or equal))
+    gaps = session["gaps"]
+    if gaps["count"]:
+        facts.append(("pauses of joints", f"{gaps['count']}, longest {gaps['longest_s']:.2f} s"))
+    facts += [("warning", words) for words in session["warnings"]]
+    facts += [
+        ("not used", f"{number} of {topic}: {why}")
+        for topic, reasons in session["ignored"].items()
+        for why, number in reasons.items()
+    ]
+    settings = [(name, str(value)) for name, value in session["settings"].items()]
+    return [
+        own,
+        "<details><summary>Every decision and its reason</summary>",
+        _decisions(session["decisions"]),
+        "</details>",
+        listed(facts),
+        f"<details><summary>Settings</summary>{listed(settings)}</details>",
+    ]
+
+
+def _cycles(session: Document) -> str:
+    head = ["cycle", "hour", "code", "revision", "without", "in force", "candidate", "expected",
+            "bound", "true after", "why"]  # fmt: skip
+    body = []
+    for cycle in session["cycles"]:
+        true, forecast = cycle["true"] or {}, cycle["forecast"] or {}
+        why = cycle["verdict"]["reason"]
+        if cycle["rejected"]:
+            why += "; samples rejected: " + ", ".join(cycle["rejected"])
+        body.append([
+            cycle["cycle"], f"{cycle['hours']:.2f}", cycle["verdict"]["code"],
+            str(cycle["revision"] or NOTHING),
+            *(_mm(cycle[name]["rms_mm"]) for name in ("nominal", "in_force", "candidate")),
+            _mm(cycle["predicted_rms_mm"]), _mm(forecast.get("bound_mm")),
+            _mm((true.get("after") or {}).get("rms_mm")), why,
+        ])  # fmt: skip
+    return table(head, body, words=(2, 10))
+
+
+def _runs(session: Document) -> str:
+    head = ["run", "answer", "code", "change, mm", "deg", "sigma, mm", "true error, mm", "why"]
+    body = [
+        [str(run["run"]), run["answer"], run["verdict"]["code"], _mm(run["change_mm"]),
+         _mm(run["change_deg"]), _mm(run["sigma_mm"]), _mm(run["true_error_mm"]),
+         run["verdict"]["reason"]]
+        for run in session["runs"]
+    ]  # fmt: skip
+    return table(head, body, words=(1, 2, 7))
+
+
+def _calibrations(session: Document) -> str:
+    head = ["target", "method", "code", "residual, mm", "expected, mm", "true, mm", "why"]
+    body = [
+        [one["kind"], one["method"], one["verdict"]["code"], _mm(one["residual_rms_mm"]),
+         _mm(one["predicted_rms_mm"]), _mm(one["true_error_mm"]), one["verdict"]["reason"]]
+        for one in session["calibrations"]
+    ]  # fmt: skip
+    return table(head, body, words=(1, 2, 6))
+
+
+def _decisions(decisions: Sequence[Document]) -> str:
+    body = [
+        [datetime.fromtimestamp(one["stamp"], UTC).strftime("%H:%M:%S"), one["command"],
+         one["code"], one["message"]]
+        for one in decisions
+    ]  # fmt: skip
+    return table(["time (UTC)", "command", "code", "reason"], body, words=(1, 2, 3))
+
+
+def _origin(report: Document) -> str:
+    facts = [("software", report["software"]), ("date", report["created"])]
+    facts += [(name, version) for name, version in report["versions"].items()]
+    facts += [("tables", "bags.csv, cycles.csv, decisions.csv, report.json beside this page")]
+    return listed(facts)
+
+
+def _mm(value: Any) -> str:
+    return NOTHING if value is None else f"{value:.3f}"
+
+
+def _share(value: Any) -> str:
+    return NOTHING if value is None else f"{value:.1%}"
