@@ -1,5 +1,6 @@
 """Many bags beside each other: Dask runs `validate_bag`, jobs go out and results come back."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -69,9 +70,12 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             yield client
         return
     # One thread each, for linear algebra too (Dask sets it): the same bits as in one process.
-    local = {"n_workers": workers, "threads_per_worker": 1, "processes": True}
-    with (
-        LocalCluster(**local, dashboard_address=None, memory_limit=0) as cluster,
-        Client(cluster) as client,
-    ):
+    cluster = LocalCluster(
+        n_workers=workers,
+        threads_per_worker=1,
+        memory_limit=0,
+        dashboard_address=None,
+        silence_logs=logging.ERROR,
+    )
+    with cluster, Client(cluster) as client:
         yield client
