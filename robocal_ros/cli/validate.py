@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> Outcome:
     jobs = _jobs(args.bags, args.robot)
     workers = args.jobs or len(os.sched_getaffinity(0))
     results: dict[int, Document] = {}
-    figures: dict[str, tuple[Drawn, ...]] = {}
+    figures: dict[str, tuple[tuple[Drawn, ...], ...]] = {}
     with _progress(len(jobs)) as shown:
         for number, result in validated(jobs, workers, args.scheduler):
             results[number] = result.document
@@ -96,10 +96,11 @@ def _jobs(paths: Sequence[Path], robot: str | None) -> "list[Job]":
 
     jobs: list[Job] = []
     for path in paths:
-        names = {job.name for job in jobs}
-        own = path.resolve().name
-        numbered = (f"{own} ({number})" for number in range(2, len(paths) + 1))
-        name = own if own not in names else next(n for n in numbered if n not in names)
+        place = path.resolve()
+        stems = {Path(job.name).stem for job in jobs}
+        numbered = (f"{place.stem}-{number}" for number in range(2, len(paths) + 1))
+        stem = next(name for name in (place.stem, *numbered) if name not in stems)
+        name = f"{stem}{place.suffix}"
         jobs.append(Job(str(path.absolute()), name, robot))
     return jobs
 
@@ -136,12 +137,10 @@ def _failure(bags: Sequence[Document]) -> Document:
 
 
 def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
-    for drawn in result.figures:
-        (folder / f"{_stem(name)}-{drawn.name}.png").write_bytes(drawn.png)
-
-
-def _stem(name: str) -> str:
-    return name.replace(".mcap", "").replace(" ", "")
+    for number, session in enumerate(result.figures, start=1):
+        which = f"-{number}" if number > 1 else ""
+        for drawn in session:
+            (folder / f"{Path(name).stem}{which}-{drawn.name}.png").write_bytes(drawn.png)
 
 
 def _write(folder: Path, report: Document, html: str) -> None:

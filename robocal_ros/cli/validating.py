@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from robocal_ros import __version__
 from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, TRUTH, check_points, true_transforms
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
@@ -21,7 +20,6 @@ from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.report.drift import Origin
 from robocal_ros.report.validation_figures import Drawn, thermal_figures, tool_figures
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
@@ -48,27 +46,26 @@ class Job:
 
 @dataclass(frozen=True)
 class Validated:
-    """What a bag gave: its document, with ``error`` where it gave nothing, and its figures."""
+    """What a bag gave: its document, in it ``error`` or ``sessions``; each session's figures."""
 
     document: Document
-    figures: tuple[Drawn, ...] = ()
+    figures: tuple[tuple[Drawn, ...], ...] = ()
 
 
 def validate_bag(job: Job) -> Validated:
     """Replay and judge a bag; one that cannot be is told, not raised."""
     head: Document = {"bag": job.name, "path": job.path}
-    figures: list[Drawn] = []
     try:
         with BagReader(job.path) as reader:
             head |= _about(reader)
-            sessions = [_Session(job, reader, topic) for topic in _replayable(reader)]
-            documents = [session.document(head, figures) for session in sessions]
+            sessions = [_Session(job, reader, topic).judged() for topic in _replayable(reader)]
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:
         words = f"{error.filename or job.path}: {error.strerror}"
         return Validated(head | {"error": refusal(RobocalError.code, words)["error"]})
-    return Validated(head | {"sessions": documents}, tuple(figures))
+    documents = [document for document, _ in sessions]
+    return Validated(head | {"sessions": documents}, tuple(tuple(drawn) for _, drawn in sessions))
 
 
 def _about(reader: BagReader) -> Document:
@@ -114,21 +111,23 @@ class _Session:
         self._warnings: list[str] = []
         self._arm: SerialArm | None = None
 
-    def document(self, head: Document, figures: list[Drawn]) -> Document:
-        """Replay it; its figures are added to ``figures``."""
+    def judged(self) -> tuple[Document, list[Drawn]]:
+        """Replay it: what it gave, and its figures."""
         configured, reader = self._recording.configured, self._reader
         with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
             replayed = self._replayed(Path(folder))
             common = self._common(replayed)
             if is_tool_session(configured):
                 runs = tool_runs(replayed, true_transforms(reader, TOOL, "T_flange_tool"))
-                figures += tool_figures(runs)
-                return common | {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
+                found = {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
+                return common | found, tool_figures(runs)
             if is_hand_eye_session(configured):
                 truth = true_transforms(reader, HAND_EYE, "T_flange_sensor")
-                found, final = calibrations(replayed, truth), replayed["final_sensor"]
-                return common | {"kind": "hand_eye", "calibrations": found, "final": final}
-            return common | self._thermal(Path(folder), common, head, figures)
+                made = {"calibrations": calibrations(replayed, truth)}
+                made |= {"final": replayed["final_sensor"]}
+                return common | {"kind": "hand_eye", **made}, []
+            document, figures = self._thermal(Path(folder), common)
+            return common | document, figures
 
     def _replayed(self, folder: Path) -> Document:
         auto = not self._recording.commands
@@ -157,9 +156,7 @@ class _Session:
         self._arm = find_robot(name, self._warnings, configured)
         return self._arm
 
-    def _thermal(
-        self, folder: Path, common: Document, head: Document, figures: list[Drawn]
-    ) -> Document:
+    def _thermal(self, folder: Path, common: Document) -> tuple[Document, list[Drawn]]:
         arm, serial = self._arm, Path(self._job.path).resolve().stem
         if arm is None:
             raise ValueError("replayed without a robot")
@@ -168,18 +165,8 @@ class _Session:
             sigma_m = float(common["settings"]["sigma_m"])
             cycles = made.cycles(self._forecasts, check_points(self._reader), sigma_m)
         document = thermal_document(cycles, arm)
-        origin = Origin(
-            simulated=head["simulated"],
-            data=self._job.name,
-            robot=arm.name,
-            serial="",
-            model_hash=arm.model_hash,
-            commit=__version__,
-            created="",
-        )
-        truth = drift_report(self._job.name, origin, cycles, arm)
-        figures += thermal_figures(document["cycles"], truth)
-        return {"kind": "thermal", **document}
+        truth = drift_report(self._job.name, cycles, arm)
+        return {"kind": "thermal", **document}, thermal_figures(document["cycles"], truth)
 
     def _common(self, replayed: Document) -> Document:
         configured, recorded = self._recording.configured, bool(self._recording.commands)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros import __version__
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.validating_thermal import CycleErrors, ReplayedCycle
 from robocal_ros.core.kinematics import SerialArm
@@ -83,17 +84,18 @@ def _share(
     return float(np.mean(np.concatenate(below))) if below else None
 
 
-def drift_report(
-    title: str, origin: Origin, cycles: Sequence[ReplayedCycle], arm: SerialArm
-) -> DriftReport | None:
-    """The cycles that a truth judges, as a report of their true errors; None without any."""
+def drift_report(title: str, cycles: Sequence[ReplayedCycle], arm: SerialArm) -> DriftReport | None:
+    """The cycles that a truth judges, as a report of their true errors; None without any.
+
+    Only what is simulated has a truth.
+    """
     judged = [(c, c.true) for c in cycles if c.true is not None and c.true.after is not None]
     if not judged:
         return None
     unit = arm.parameters.to_display
     return DriftReport(
         title=title,
-        origin=origin,
+        origin=Origin(True, title, arm.name, "", arm.model_hash, __version__, ""),
         hours=np.array([c.hours for c, _ in judged]),
         decisions=[
             Decided(c.entry.cycle_id, c.entry.code.name, c.entry.reason, c.entry.revision)

@@ -1,13 +1,14 @@
 """Many bags beside each other: Dask runs `validate_bag`, jobs go out and results come back."""
 
 import logging
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from robocal_ros.cli.output import refusal
+from robocal_ros.cli.output import crash
 from robocal_ros.cli.validating import Job, Validated, validate_bag
-from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.errors import InputError
 
 Numbered = tuple[int, Validated]
 
@@ -27,7 +28,7 @@ def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Itera
         When Dask is not there, or the cluster does not answer.
     """
     if scheduler is None and min(workers, len(jobs)) <= 1:
-        yield from ((number, validate_bag(job)) for number, job in enumerate(jobs))
+        yield from ((number, _alone(job)) for number, job in enumerate(jobs))
         return
     with _client(min(workers, len(jobs)), scheduler) as client:
         yield from _gathered(client, jobs)
@@ -45,11 +46,17 @@ def _gathered(client: Any, jobs: Sequence[Job]) -> Iterator[Numbered]:
         future.release()
 
 
+def _alone(job: Job) -> Validated:
+    try:
+        return validate_bag(job)
+    except Exception as error:
+        return _lost(job, error)
+
+
 def _lost(job: Job, error: BaseException) -> Validated:
-    """A bag whose worker was killed, or whose replay crashed: the others go on."""
-    words = f"{job.path}: its worker ended without a result, {type(error).__name__}: {error}"
-    told = refusal(RobocalError.code, words)["error"]
-    return Validated({"bag": job.name, "path": job.path, "error": told})
+    """A bag whose replay crashed, or whose worker was killed: the others go on."""
+    traceback.print_exception(error)
+    return Validated({"bag": job.name, "path": job.path, "error": crash(error)["error"]})
 
 
 @contextmanager

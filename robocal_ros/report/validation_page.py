@@ -10,7 +10,7 @@ from robocal_ros.report.html import figure, listed, table, whole
 from robocal_ros.report.validation import Document, summary_rows
 from robocal_ros.report.validation_figures import Drawn
 
-Figures = Mapping[str, Sequence[Drawn]]
+Figures = Mapping[str, Sequence[Sequence[Drawn]]]
 
 NOTHING = "–"  # noqa: RUF001
 OVER_BOUND = "95 % of the errors are to be below the bound that was expected before the cycle"
@@ -25,7 +25,7 @@ ERRORS_NOTE = (
 def page(report: Document, figures: Figures) -> str:
     """The whole page.
 
-    ``report``: what report.json holds; ``figures``: of each bag, by its name.
+    ``report``: what report.json holds; ``figures``: by the bag's name, of each of its sessions.
     """
     rows, bags = summary_rows(report["bags"]), report["bags"]
     simulated = any(bag.get("simulated") for bag in bags)
@@ -114,16 +114,16 @@ def _common(row: Document) -> list[str]:
     return [live, str(row["refused"]), str(row["warnings"])]
 
 
-def _bag(bag: Document, figures: Sequence[Drawn]) -> list[str]:
+def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
     if "error" in bag:
         return []
     mark = ' <span class="mark">simulated</span>' if bag["simulated"] else ""
     parts = [
         f"<h2>{escape(bag['bag'])}{mark}</h2>",
         f'<p class="faint">{bag["from"]} to {bag["to"]}, {bag["duration_s"] / 3600.0:.2f} h</p>',
-        *(figure(drawn.svg, drawn.caption) for drawn in figures),
     ]
-    for session in bag["sessions"]:
+    for session, shown in zip(bag["sessions"], figures, strict=True):
+        parts += [figure(drawn.svg, drawn.caption) for drawn in shown]
         parts += _session(session)
     return parts
 
@@ -158,10 +158,11 @@ def _session(session: Document) -> list[str]:
 
 def _cycles(session: Document) -> str:
     head = ["cycle", "hour", "code", "revision", "without", "in force", "candidate", "expected",
-            "bound", "true after", "why"]  # fmt: skip
+            "bound", "true after", "λ", "why"]  # fmt: skip
     body = []
     for cycle in session["cycles"]:
         true, forecast = cycle["true"] or {}, cycle["forecast"] or {}
+        found = true.get("after") or (cycle["measured"] or {}).get("in_force") or {}
         why = cycle["verdict"]["reason"]
         if cycle["rejected"]:
             why += "; samples rejected: " + ", ".join(cycle["rejected"])
@@ -170,9 +171,16 @@ def _cycles(session: Document) -> str:
             str(cycle["revision"] or NOTHING),
             *(_mm(cycle[name]["rms_mm"]) for name in ("nominal", "in_force", "candidate")),
             _mm(cycle["predicted_rms_mm"]), _mm(forecast.get("bound_mm")),
-            _mm((true.get("after") or {}).get("rms_mm")), why,
+            _mm((true.get("after") or {}).get("rms_mm")),
+            _share(found.get("share_within_tolerance")), why,
         ])  # fmt: skip
-    return table(head, body, words=(2, 10))
+    note = (
+        '<p class="faint">Rms in mm. Candidate: each pose predicted from the others; expected: the '
+        "same from the covariances. Bound: below it 95 % of the tool's errors were expected before "
+        "the cycle, throughout the workspace. λ: of the true errors after the cycle where they are "
+        "known, else of those measured with the model in force before it.</p>"
+    )
+    return table(head, body, words=(2, 11)) + note
 
 
 def _runs(session: Document) -> str:

@@ -95,6 +95,12 @@ CASES = {
         ["replay", "hand_eye.mcap", "--robot", "kr150_r3100"],
         (2, "WRONG_ROBOT"),
     ),
+    "validate": (
+        "validate.json",
+        ["validate", "hand_eye.mcap", "--report", "report"],
+        ["validate", "nowhere.mcap", "--report", "report"],
+        (3, "BAD_INPUT"),
+    ),
     "history list": (
         "history.list.json",
         ["history", "list", "--state", "state"],
@@ -283,7 +289,7 @@ def test_every_command_and_schema_has_a_case() -> None:
 def placed(folder: Path, arguments: list[str]) -> list[str]:
     """Names of files, and of folders after an option for one, become paths in the folder."""
     files = (".csv", ".mcap", ".conf", ".yaml")
-    folders = ("--state", "--profiles", "--sphere", "--step", "--line")
+    folders = ("--state", "--report", "--profiles", "--sphere", "--step", "--line")
     return [
         str(folder / word) if word.endswith(files) or before in folders else word
         for before, word in zip(["", *arguments], arguments, strict=False)

@@ -1,0 +1,261 @@
+"""``robocal validate``: what the page says is what the replay and the truth say."""
+
+import contextlib
+import csv
+import io
+import json
+import re
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from campaign import POINTS, ROBOT, postures, true_arm
+from command import ROOT, conforms
+from recordings import NS, plain_bag, recorded_bag, shift, warmed, write_samples
+
+from robocal_ros.cli.main import main
+from robocal_ros.cli.validating import Job
+from robocal_ros.cli.validating_many import validated
+from robocal_ros.storage.bags import BagWriter
+
+TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
+SPHERE = ROOT / "bags/hand_eye_sphere.mcap"
+CHECK = postures(true_arm(), 20, 77)
+
+
+def judged_bag(path: Path, visits) -> Path:
+    """The plain bag, and where the tool truly was at other poses at the end of each visit."""
+    with BagWriter(path) as bag:
+        for part, kelvin in zip(visits, (0.0, 20.0, 30.0, 0.0), strict=True):
+            write_samples(bag, part)
+            flange = warmed(true_arm(), kelvin).fk(CHECK)
+            truth = {
+                "simulated": True,
+                "tool_in_flange_m": POINTS["ball"],
+                "q_rad": CHECK.tolist(),
+                "position_m": (flange @ [*POINTS["ball"], 1.0])[:, :3].tolist(),
+            }
+            told = {"data": json.dumps(truth)}
+            end_ns = part[-1].stamp_ns + NS // 10
+            bag.write("/truth/check_points", "std_msgs/msg/String", told, end_ns)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, visits = tmp_path_factory.mktemp("validated"), shift()
+    plain_bag(folder / "plain.mcap", visits)
+    judged_bag(folder / "judged.mcap", visits)
+    recorded_bag(folder / "live.mcap", folder / "state", visits)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def validate(tmp_path_factory: pytest.TempPathFactory):
+    """Run the command in this process: status, its document, the report's folder and document.
+
+    The same words are run once.
+    """
+
+    @cache
+    def run(*words: object, jobs: str = "1") -> tuple[int, Any, Path, Any]:
+        out = tmp_path_factory.mktemp("report") / "new"
+        given = [*map(str, words), "--report", str(out), "--jobs", jobs]
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            status = main(["validate", *given, "--json"])
+        document = json.loads(printed.getvalue())
+        conforms(document, "validate.json" if "bags" in document else "error.json")
+        report = out / "report.json"
+        return status, document, out, json.loads(report.read_text()) if report.exists() else None
+
+    return run
+
+
+def judged(bags: Path) -> tuple[object, ...]:
+    """Words for a bag with a truth, and one of another robot."""
+    return bags / "judged.mcap", TOOL_RUNS, "--robot", ROBOT
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+class TestRecordedSession:
+    def test_it_is_the_live_one(self, bags, validate) -> None:
+        status, document, _, report = validate(bags / "live.mcap")
+        assert status == 0
+        (row,) = document["bags"]
+        assert (row["as_recorded"], row["differs"]) == (True, 0)
+        assert (row["cycles"], row["accepted"]) == (2, 1)
+        (session,) = report["bags"][0]["sessions"]
+        commands = [decision["command"] for decision in session["decisions"]]
+        assert commands == ["capture_reference", "identify", "accept", "identify"]
+        assert session["settings"]["drift_parameters"] == []
+        assert [c["based_on"] for c in session["cycles"]] == [0, 1]
+
+    def test_errors_are_those_of_the_verdicts(self, bags, validate, capsys) -> None:
+        """Against ``robocal replay``, which prints the same candidates."""
+        _, _, _, report = validate(bags / "live.mcap")
+        main(["replay", str(bags / "live.mcap"), "--json"])
+        candidates = json.loads(capsys.readouterr().out)["candidates"]
+        cycles = report["bags"][0]["sessions"][0]["cycles"]
+        for cycle, candidate in zip(cycles, candidates, strict=True):
+            assert cycle["in_force"] == candidate["in_force"]["held_out"]
+            assert cycle["candidate"] == candidate["calibrated"]["held_out"]
+            assert cycle["verdict"] == candidate["verdict"]
+            for name, found in candidate["parameters"].items():
+                moved = found["value"] - found["nominal"]
+                assert cycle["drift"][name] == pytest.approx(moved, abs=1e-9)
+                assert cycle["sigma"][name] == pytest.approx(found["sigma"] or 0.0)
+
+    def test_the_accepted_model_forecasts_the_next_cycle(self, bags, validate) -> None:
+        _, _, _, report = validate(bags / "live.mcap")
+        first, second = report["bags"][0]["sessions"][0]["cycles"]
+        assert first["measured"]["in_force"] == first["measured"]["without"]
+        without, in_force = (second["measured"][k]["rms_mm"] for k in ("without", "in_force"))
+        assert in_force < 0.6 * without  # 20 of 30 K are known
+        assert second["forecast"]["bound_mm"] > second["forecast"]["rms_mm"] > 0.0
+
+
+class TestTruth:
+    def test_true_errors_of_a_drift_that_was_made(self, bags, validate) -> None:
+        status, document, _, report = validate(*judged(bags))
+        assert status == 0
+        row, _ = document["bags"]
+        assert (row["judged_by"], row["simulated"]) == ("truth", True)
+        cold, warm = (
+            (warmed(true_arm(), kelvin).fk(CHECK) @ [*POINTS["ball"], 1.0])[:, :3]
+            for kelvin in (0.0, 20.0)
+        )
+        first = report["bags"][0]["sessions"][0]["cycles"][0]
+        drift_mm = np.linalg.norm(warm - cold, axis=1) * 1e3
+        assert first["true"]["without"]["max_mm"] == pytest.approx(drift_mm.max())
+        assert first["true"]["without"]["mean_mm"] == pytest.approx(drift_mm.mean())
+        assert first["true"]["in_force"] == first["true"]["without"]
+        assert first["verdict"]["accept"]
+        assert first["true"]["after"]["rms_mm"] < 0.5 * first["true"]["without"]["rms_mm"]
+
+    def test_a_bag_without_a_truth_is_judged_by_measurements(self, bags, validate) -> None:
+        _, document, _, report = validate(bags / "plain.mcap", "--robot", ROBOT)
+        (row,) = document["bags"]
+        assert (row["judged_by"], row["simulated"]) == ("measurements", False)
+        (session,) = report["bags"][0]["sessions"]
+        assert session["true"] is None
+        assert session["as_recorded"] is False
+        taken = [c for c in session["cycles"] if c["revision"]]
+        assert len(taken) == row["accepted"] > 0
+        assert all(cycle["verdict"]["accept"] for cycle in taken)
+        codes = [d["code"] for d in session["decisions"] if d["command"] == "accept"]
+        assert codes == ["ACCEPT"] * len(taken)
+
+
+def test_tools_and_sensors(validate) -> None:
+    status, document, out, _ = validate(TOOL_RUNS, SPHERE)
+    assert status == 0
+    tool, sensor = document["bags"]
+    assert (tool["kind"], tool["runs"], tool["differs"]) == ("tool", 5, 0)
+    assert tool["largest_change_mm"] == pytest.approx(np.sqrt(3**2 + 2**2 + 1**2), abs=0.2)
+    assert tool["largest_true_error_mm"] < 0.2
+    assert (sensor["kind"], sensor["differs"]) == ("hand_eye", 0)
+    assert sensor["true_error_mm"] < 3.0 * sensor["predicted_rms_mm"]
+    assert {path.name for path in out.glob("*.png")} == {"tool_runs-tool.png"}
+    codes = {row["code"] for row in rows(out / "decisions.csv")}
+    assert {"LIMIT_EXCEEDED", "BEAM_EDGES_WRONG"} <= codes
+
+
+class TestBadBags:
+    def test_one_is_told_and_the_others_go_on(self, bags, validate, tmp_path) -> None:
+        bad = tmp_path / "bad.mcap"
+        bad.write_bytes(b"no bag at all")
+        status, document, out, report = validate(TOOL_RUNS, bad, tmp_path / "none.mcap")
+        assert status == 3
+        assert document["error"]["code"] == "BAD_INPUT"
+        assert "2 of 3 bags" in document["error"]["message"]
+        assert [row["bag"] for row in document["bags"]] == [
+            "tool_runs.mcap", "bad.mcap", "none.mcap"
+        ]  # fmt: skip
+        assert [row["kind"] for row in document["bags"]] == ["tool", None, None]
+        assert str(bad) in document["bags"][1]["error"]["message"]
+        assert "bad.mcap" in (out / "report.html").read_text()
+        assert len(report["bags"]) == 3
+
+    def test_a_bag_that_does_not_say_its_robot(self, bags, validate) -> None:
+        status, document, _, _ = validate(bags / "plain.mcap")
+        assert status == 3
+        assert "--robot" in document["error"]["message"]
+
+    def test_a_robot_is_named_for_those_alone_that_do_not_say(self, bags, validate) -> None:
+        status, document, _, _ = validate(*judged(bags))
+        assert status == 0
+        assert [row["robot"] for row in document["bags"]] == ["KR 150 R3100 prime", "UR10"]
+
+    def test_a_crash_is_that_of_its_bag(self) -> None:
+        """A path of a wrong type stands for a bug that one bag meets."""
+        jobs = [Job(3.5, "x.mcap", None), Job(str(TOOL_RUNS), "tool_runs.mcap", None)]  # type: ignore[arg-type]
+        crashed, good = (result for _, result in validated(jobs, 1, None))
+        assert crashed.document["error"]["code"] == "NONE"
+        assert "TypeError" in crashed.document["error"]["message"]
+        assert "sessions" in good.document
+
+
+def test_bags_of_one_name_are_told_apart(validate, tmp_path) -> None:
+    (tmp_path / "other").mkdir()
+    other = tmp_path / "other" / TOOL_RUNS.name
+    other.symlink_to(TOOL_RUNS)  # a link is followed: its name is that of the bag
+    _, document, out, _ = validate(TOOL_RUNS, other)
+    assert [row["bag"] for row in document["bags"]] == ["tool_runs.mcap", "tool_runs-2.mcap"]
+    assert {p.name for p in out.glob("*.png")} == {"tool_runs-tool.png", "tool_runs-2-tool.png"}
+
+
+class TestInParallel:
+    def test_two_processes_give_the_same_report(self, bags, validate, tmp_path) -> None:
+        given = (bags / "live.mcap", TOOL_RUNS, tmp_path / "none.mcap")
+        _, alone, one, _ = validate(*given)
+        _, beside, two, _ = validate(*given, jobs="2")
+        assert beside["bags"] == alone["bags"]
+        names = sorted(path.name for path in one.iterdir())
+        assert sorted(path.name for path in two.iterdir()) == names
+
+        def undated(path: Path) -> bytes:
+            return re.sub(rb"20\d\d-\d\d-\d\d \d\d:\d\d UTC", b"", path.read_bytes())
+
+        for name in names:
+            assert undated(one / name) == undated(two / name), name
+
+    def test_a_cluster_that_is_there_is_used(self, bags, validate) -> None:
+        from distributed import LocalCluster
+
+        options = {"dashboard_address": None, "processes": False, "threads_per_worker": 1}
+        with LocalCluster(n_workers=1, **options) as cluster:
+            words = ("--scheduler", cluster.scheduler_address)
+            status, document, _, _ = validate(TOOL_RUNS, *words)
+        assert status == 0
+        assert document["bags"][0]["runs"] == 5
+
+    def test_a_cluster_that_is_not_there(self, validate) -> None:
+        status, document, _, _ = validate(TOOL_RUNS, "--scheduler", "nonsense://nowhere:1")
+        assert status == 2
+        assert "--scheduler nonsense://nowhere:1" in document["error"]["message"]
+
+
+def test_the_page_and_its_tables(bags, validate) -> None:
+    _, document, out, report = validate(*judged(bags))
+    html = (out / "report.html").read_text()
+    assert html.count("<svg") == 5
+    assert not re.search(r"<(script|link|img|iframe)\b", html)
+    for bag in report["bags"]:
+        for session in bag["sessions"]:
+            for decision in session["decisions"]:
+                assert decision["message"].replace("'", "&#x27;") in html
+    cycles = report["bags"][0]["sessions"][0]["cycles"]
+    table = rows(out / "cycles.csv")
+    assert [row["cycle"] for row in table] == [cycle["cycle"] for cycle in cycles]
+    for row, cycle in zip(table, cycles, strict=True):
+        assert float(row["candidate_rms_mm"]) == pytest.approx(cycle["candidate"]["rms_mm"])
+        assert float(row["true_after_rms_mm"]) == pytest.approx(cycle["true"]["after"]["rms_mm"])
+        assert float(row["drift_a2_mm"]) == pytest.approx(cycle["drift"]["a2_mm"])
+    assert [row["bag"] for row in rows(out / "bags.csv")] == [r["bag"] for r in document["bags"]]
