@@ -1,0 +1,153 @@
+"""The rows, tables and page of a validation: numbers that can be counted by hand."""
+
+import csv
+import io
+import json
+import re
+
+import numpy as np
+import pytest
+
+from robocal_ros.report import figures
+from robocal_ros.report.validation import (
+    bags_table,
+    cycles_table,
+    decisions_table,
+    pooled_rms_mm,
+    summary_rows,
+)
+from robocal_ros.report.validation_figures import accuracy_by_cycle, thermal_figures, tool_figures
+from robocal_ros.report.validation_page import page
+
+
+def errors(rms_mm, share=None, n=6):
+    found = {"mean_mm": rms_mm, "rms_mm": rms_mm, "p95_mm": rms_mm, "max_mm": rms_mm, "n": n}
+    return found if share is None else found | {"share_within_tolerance": share}
+
+
+def cycle(number, code="ACCEPT", revision=0, n=6):
+    reason = f"<because> of {number}"
+    return {
+        "cycle": f"c{number}", "stamp": 1e9 + number, "hours": float(number), "samples": n,
+        "nominal": errors(0.4), "in_force": errors(0.2), "candidate": errors(0.1 * number, n=n),
+        "predicted_rms_mm": 0.06, "forecast": {"rms_mm": 0.1, "bound_mm": 0.3},
+        "measured": {"without": errors(0.4, 0.2), "in_force": errors(0.2, 0.5)}, "true": None,
+        "verdict": {"accept": code == "ACCEPT", "code": code, "reason": reason},
+        "revision": revision, "based_on": 0, "rejected": ["17"], "unobservable": [],
+        "drift": {"d1_mm": 0.1 * number, "a2_mm": -0.2}, "sigma": {"d1_mm": 0.02, "a2_mm": 0.03},
+    }  # fmt: skip
+
+
+def session(**own):
+    return {
+        "node": None, "robot": "KR & <150>", "model_hash": "0123456789abcdef", "as_recorded": True,
+        "differs": [], "settings": {"sigma_m": 2e-5}, "ignored": {"joint_states": {"late": 3}},
+        "gaps": {"count": 1, "longest_s": 2.5, "damaged": []}, "warnings": ["a <warning>"],
+        "decisions": [
+            {"stamp": 1e9, "command": "identify", "code": "ACCEPT", "message": "good"},
+            {"stamp": 1e9, "command": "accept", "code": "CONFLICT", "message": "too <late>"},
+        ],
+    } | own  # fmt: skip
+
+
+def bag(name, *sessions, simulated=False):
+    return {
+        "bag": name, "path": f"/x/{name}", "from": "a", "to": "b", "duration_s": 7200.0,
+        "topics": {}, "simulated": simulated, "sessions": list(sessions),
+    }  # fmt: skip
+
+
+CYCLES = [cycle(1, revision=1), cycle(2, "SENSOR_OR_ROBOT_MOVED", n=2)]
+THERMAL = session(
+    kind="thermal", cycles=CYCLES, tolerance_mm=0.1, true=None,
+    measured={"without": errors(0.4, 0.2), "in_force": errors(0.2, 0.5)},
+    bound={"measured_share": 0.9, "true_share": None},
+)  # fmt: skip
+RUN = {
+    "run": 1, "stamp": 1e9, "answer": "recalibrate", "tcp_mm": None, "change_mm": 3.5,
+    "change_deg": 1.0, "sigma_mm": 0.05, "misfit_mm": 0.02, "true_error_mm": None,
+    "verdict": {"accept": False, "code": "LIMIT_EXCEEDED", "reason": "bent"},
+}  # fmt: skip
+TOOL = session(kind="tool", runs=[RUN], final={})
+BAD = {"bag": "bad.mcap", "error": {"code": "BAD_INPUT", "message": "no <bag>"}}
+BAGS = [bag("one.mcap", THERMAL), bag("two.mcap", TOOL, simulated=True), BAD]
+REPORT = {
+    "title": "T <1>", "created": "today", "software": "robocal 0", "versions": {"numpy": "2"},
+    "bags": BAGS,
+}  # fmt: skip
+
+
+def test_a_row_for_each_session_and_each_bad_bag():
+    thermal, tool, bad = summary_rows(BAGS)
+    assert (thermal["cycles"], thermal["accepted"], thermal["refused"]) == (2, 1, 1)
+    assert (thermal["lambda_without"], thermal["lambda_in_force"]) == (0.2, 0.5)
+    assert thermal["share_below_bound"] == 0.9
+    assert thermal["lambda_after"] is None
+    # 6 measurements at 0.1 mm and 2 at 0.2 mm: sqrt((6 * 0.01 + 2 * 0.04) / 8)
+    assert thermal["rms_after_mm"] == pytest.approx(np.sqrt(0.14 / 8))
+    assert tool["largest_change_mm"] == 3.5
+    assert tool["largest_true_error_mm"] is None
+    assert bad == {"bag": "bad.mcap", "kind": None, "error": BAD["error"]}
+
+
+def test_the_truth_judges_where_there_is_one():
+    true = {"without": errors(0.3, 0.1), "in_force": errors(0.1, 0.8), "after": errors(0.05, 1.0)}
+    judged = THERMAL | {"true": true, "bound": {"measured_share": 0.9, "true_share": 1.0}}
+    (row,) = summary_rows([bag("one.mcap", judged)])
+    assert row["judged_by"] == "truth"
+    assert (row["rms_after_mm"], row["lambda_after"], row["share_below_bound"]) == (0.05, 1.0, 1.0)
+
+
+def test_a_session_without_cycles_has_no_errors():
+    empty = THERMAL | {"cycles": [], "measured": None}
+    (row,) = summary_rows([bag("one.mcap", empty)])
+    assert row["rms_without_mm"] is row["rms_after_mm"] is None
+    assert pooled_rms_mm([], "candidate") is None
+    assert thermal_figures([], None) == []
+    json.dumps(row, allow_nan=False)
+
+
+def test_the_tables():
+    rows = list(csv.DictReader(io.StringIO(cycles_table(BAGS))))
+    assert [(row["bag"], row["cycle"], row["code"]) for row in rows] == [
+        ("one.mcap", "c1", "ACCEPT"), ("one.mcap", "c2", "SENSOR_OR_ROBOT_MOVED"),
+    ]  # fmt: skip
+    assert float(rows[1]["drift_d1_mm"]) == pytest.approx(0.2)
+    assert rows[0]["true_after_rms_mm"] == ""
+    assert float(rows[0]["measured_in_force_share_within_tolerance"]) == 0.5
+    rows = list(csv.DictReader(io.StringIO(bags_table(BAGS))))
+    assert rows[2]["error"] == "BAD_INPUT: no <bag>"
+    rows = list(csv.DictReader(io.StringIO(decisions_table(BAGS))))
+    assert len(rows) == 4
+    assert rows[1]["message"] == "too <late>"
+
+
+def test_the_page_needs_nothing_else_and_says_all():
+    shown = {"one.mcap": [thermal_figures(CYCLES, None)], "two.mcap": [tool_figures([RUN])]}
+    html = page(REPORT, shown)
+    assert html.count("<svg") == 3
+    assert not re.search(r"<(script|link|img|iframe|object)\b|@import", html)
+    words = ("&lt;because&gt; of 2", "too &lt;late&gt;", "a &lt;warning&gt;", "no &lt;bag&gt;",
+             "KR &amp; &lt;150&gt;", "3 of joint_states: late", "samples rejected: 17",
+             "LIMIT_EXCEEDED", "bit for bit", "sigma_m", "90.0%")  # fmt: skip
+    for said in words:
+        assert said in html
+    assert "<because>" not in html
+    assert 'class="mark">simulated' in html
+
+
+def test_what_is_measured_is_not_called_simulated():
+    html = page(REPORT | {"bags": [bag("one.mcap", THERMAL)]}, {"one.mcap": [[]]})
+    assert "simulated" not in html
+
+
+def test_the_curves_are_the_numbers_of_the_cycles():
+    (axes,) = accuracy_by_cycle(CYCLES).axes
+    drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}
+    np.testing.assert_allclose(drawn["without correction"], [0.4, 0.4])
+    np.testing.assert_allclose(drawn["candidate"], [0.1, 0.2])
+    np.testing.assert_allclose(drawn["95 % bound"], [0.3, 0.3])
+    np.testing.assert_allclose(drawn["refused"], [0.2])  # the one that is a fault
+    accepted = next(line for line in axes.lines if line.get_marker() == "^")
+    np.testing.assert_allclose(np.asarray(accepted.get_xdata()), [1.0])
+    assert figures.svg(accuracy_by_cycle(CYCLES)) == figures.svg(accuracy_by_cycle(CYCLES))
