@@ -60,4 +60,9 @@ def show(report: DriftReport, folder: Path, seconds: float) -> None:
     console.print(f"{accepted} of {cycles} candidates accepted; the report says why:")
     page = folder / "report.html"
     console.print(str(page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page))
+    console.print(
+        "[dim]The same from the bag alone: .venv/bin/robocal validate bags/demo_shift.mcap "
+        "--robot kr150_r3100 --report out/validation[/dim]",
+        soft_wrap=True,
+    )
     console.print(f"[dim]{seconds:.0f} s, through three nodes as processes over DDS[/dim]")

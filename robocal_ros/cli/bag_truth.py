@@ -13,7 +13,6 @@ from robocal_ros.storage.bags import BagReader
 Array = NDArray[np.float64]
 
 CHECK_POINTS, TOOL, HAND_EYE = "/truth/check_points", "/truth/tool", "/truth/hand_eye"
-TRUTH = "/truth/"
 NEAREST_NS = 120_000_000_000  # a truth is told within two minutes of its cycle
 
 
@@ -41,6 +40,11 @@ class CheckPoints:
         if away[nearest] > NEAREST_NS:
             return None
         return np.asarray(self.position[nearest] - self.position[0])
+
+
+def is_simulated(reader: BagReader) -> bool:
+    """Whether a bag tells any truth: what is measured has none."""
+    return any("truth" in topic.split("/") for topic in reader.info.topics)
 
 
 def check_points(reader: BagReader) -> CheckPoints | None:

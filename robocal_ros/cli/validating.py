@@ -9,13 +9,19 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, TRUTH, check_points, true_transforms
+from robocal_ros.cli.bag_truth import (
+    HAND_EYE,
+    TOOL,
+    check_points,
+    is_simulated,
+    true_transforms,
+)
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
 from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.cli.replaying import Request, replay_bag
 from robocal_ros.cli.validating_cycles import drift_report, thermal_document
-from robocal_ros.cli.validating_parts import calibrations, decisions, tool_runs
+from robocal_ros.cli.validating_parts import as_recorded, calibrations, decisions, tool_runs
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -58,14 +64,16 @@ def validate_bag(job: Job) -> Validated:
     try:
         with BagReader(job.path) as reader:
             head |= _about(reader)
-            sessions = [_Session(job, reader, topic).judged() for topic in _replayable(reader)]
+            replayable, others = _event_topics(reader)
+            sessions = [_Session(job, reader, topic).judged() for topic in replayable or [None]]
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:
         words = f"{error.filename or job.path}: {error.strerror}"
         return Validated(head | {"error": refusal(RobocalError.code, words)["error"]})
     documents = [document for document, _ in sessions]
-    return Validated(head | {"sessions": documents}, tuple(tuple(drawn) for _, drawn in sessions))
+    head |= {"sessions": documents, "other_decisions": others}
+    return Validated(head, tuple(tuple(drawn) for _, drawn in sessions))
 
 
 def _about(reader: BagReader) -> Document:
@@ -76,7 +84,7 @@ def _about(reader: BagReader) -> Document:
         "to": _utc(end_ns),
         "duration_s": (end_ns - start_ns) * 1e-9,
         "topics": {topic: found.messages for topic, found in info.topics.items()},
-        "simulated": any(TRUTH in topic for topic in info.topics),
+        "simulated": is_simulated(reader),
     }
 
 
@@ -84,20 +92,25 @@ def _utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def _replayable(reader: BagReader) -> list[str | None]:
-    """Topics of the sessions that were commanded; None: the bag's measurements alone.
+def _event_topics(reader: BagReader) -> tuple[list[str], dict[str, list[Document]]]:
+    """Sessions that were commanded and can be replayed, and what other nodes' events decided.
 
     Raises
     ------
     InputError
         When an event cannot be read.
     """
-    commanded: list[str | None] = []
+    replayable: list[str] = []
+    others: dict[str, list[Document]] = {}
     for topic in (topic for topic in reader.info.topics if topic_kind(topic) == EVENTS):
         configured, commands = read_events(reader.messages([topic]))
-        if commands and any(is_of(configured) for is_of in _SESSIONS):
-            commanded.append(topic)
-    return commanded or [None]
+        if not commands:
+            continue
+        if any(is_of(configured) for is_of in _SESSIONS):
+            replayable.append(topic)
+        else:
+            others[topic] = [as_recorded(*event) for event in commands]
+    return replayable, others
 
 
 class _Session:

@@ -1,14 +1,16 @@
 """Replayed tool and hand-eye sessions: their results, and how far they are from the truth."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cli.output import Document
+from robocal_ros.cli.replay_parts import seconds
 from robocal_ros.core import frames
-from robocal_ros.sessions.events import ACCEPT
+from robocal_ros.core.codes import Code
+from robocal_ros.sessions.events import ACCEPT, Command
 
 Array = NDArray[np.float64]
 Truth = Sequence[tuple[int, Array]]
@@ -86,6 +88,16 @@ def decisions(replayed: Document, routine: Sequence[str], *, asked: bool) -> lis
             entry["command"] in routine if entry["code"] == "ACCEPT" else _unasked(entry, asked)
         )
     ]
+
+
+def as_recorded(command: Command, outcome: Mapping[str, Any]) -> Document:
+    """A decision of a node that is not replayed."""
+    return {
+        "stamp": seconds(command.stamp_ns),
+        "command": command.name,
+        "code": Code(outcome["status"]).name,
+        "message": str(outcome["message"]),
+    }
 
 
 def _unasked(entry: Document, asked: bool) -> bool:

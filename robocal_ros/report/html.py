@@ -13,6 +13,8 @@ body { margin: 0 auto; max-width: 58rem; padding: 2.5rem 1.5rem 4rem; color: var
   font: 16px/1.55 system-ui, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
 h1 { font-size: 1.75rem; line-height: 1.2; margin: 0 0 .3rem; letter-spacing: -.01em; }
 h2 { font-size: 1.15rem; margin: 2.6rem 0 .6rem; }
+h3 { font-size: 1rem; margin: 1.6rem 0 .4rem; }
+summary { cursor: pointer; color: var(--faint); margin: 1rem 0; }
 p { max-width: 46rem; }
 .lead { font-size: 1.15rem; margin: 1.2rem 0; }
 .lead b { color: var(--accent); white-space: nowrap; }

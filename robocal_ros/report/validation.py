@@ -137,12 +137,18 @@ def decisions_table(bags: Sequence[Document]) -> str:
     """Every decision as CSV."""
     return _csv(
         [
-            {"bag": bag["bag"], "node": session["node"], **decision}
+            {"bag": bag["bag"], "node": node, **decision}
             for bag in bags
-            for session in bag.get("sessions", [])
-            for decision in session["decisions"]
+            for node, decisions in _decided(bag)
+            for decision in decisions
         ]
     )
+
+
+def _decided(bag: Document) -> list[tuple[str | None, Sequence[Document]]]:
+    """Each node of a bag with its decisions."""
+    sessions = [(session["node"], session["decisions"]) for session in bag.get("sessions", [])]
+    return [*sessions, *bag.get("other_decisions", {}).items()]
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> str:

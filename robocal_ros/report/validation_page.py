@@ -125,6 +125,8 @@ def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
     for session, shown in zip(bag["sessions"], figures, strict=True):
         parts += [figure(drawn.svg, drawn.caption) for drawn in shown]
         parts += _session(session)
+    for node, decisions in bag["other_decisions"].items():
+        parts += [f"<h3>Decisions of {escape(node)}</h3>", _decisions(decisions)]
     return parts
 
 
@@ -148,9 +150,8 @@ def _session(session: Document) -> list[str]:
     settings = [(name, str(value)) for name, value in session["settings"].items()]
     return [
         own,
-        "<details><summary>Every decision and its reason</summary>",
+        "<h3>Every decision and its reason</h3>",
         _decisions(session["decisions"]),
-        "</details>",
         listed(facts),
         f"<details><summary>Settings</summary>{listed(settings)}</details>",
     ]
@@ -158,29 +159,27 @@ def _session(session: Document) -> list[str]:
 
 def _cycles(session: Document) -> str:
     head = ["cycle", "hour", "code", "revision", "without", "in force", "candidate", "expected",
-            "bound", "true after", "λ", "why"]  # fmt: skip
+            "bound", "true after", "λ", "rejected"]  # fmt: skip
     body = []
     for cycle in session["cycles"]:
         true, forecast = cycle["true"] or {}, cycle["forecast"] or {}
         found = true.get("after") or (cycle["measured"] or {}).get("in_force") or {}
-        why = cycle["verdict"]["reason"]
-        if cycle["rejected"]:
-            why += "; samples rejected: " + ", ".join(cycle["rejected"])
         body.append([
             cycle["cycle"], f"{cycle['hours']:.2f}", cycle["verdict"]["code"],
             str(cycle["revision"] or NOTHING),
             *(_mm(cycle[name]["rms_mm"]) for name in ("nominal", "in_force", "candidate")),
             _mm(cycle["predicted_rms_mm"]), _mm(forecast.get("bound_mm")),
             _mm((true.get("after") or {}).get("rms_mm")),
-            _share(found.get("share_within_tolerance")), why,
+            _share(found.get("share_within_tolerance")), ", ".join(cycle["rejected"]),
         ])  # fmt: skip
     note = (
         '<p class="faint">Rms in mm. Candidate: each pose predicted from the others; expected: the '
         "same from the covariances. Bound: below it 95 % of the tool's errors were expected before "
         "the cycle, throughout the workspace. λ: of the true errors after the cycle where they are "
-        "known, else of those measured with the model in force before it.</p>"
+        "known, else of those measured with the model in force before it. Rejected: samples that "
+        "the others contradict.</p>"
     )
-    return table(head, body, words=(2, 11)) + note
+    return table(head, body, words=(2,)) + note
 
 
 def _runs(session: Document) -> str:

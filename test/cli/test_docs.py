@@ -55,7 +55,7 @@ def test_the_hand_eye_page_runs_as_typed(tmp_path: Path, monkeypatch: pytest.Mon
     assert printed[0].splitlines()[0] in page
 
 
-@pytest.mark.parametrize("page", [*PAGES, "docs/replay.md", "docs/iso9283.md"])
+@pytest.mark.parametrize("page", [*PAGES, "docs/replay.md", "docs/iso9283.md", "docs/validate.md"])
 def test_commands_run_as_typed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("docs", "bags"):
         (tmp_path / name).symlink_to(ROOT / name)

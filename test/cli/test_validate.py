@@ -13,12 +13,27 @@ import numpy as np
 import pytest
 from campaign import POINTS, ROBOT, postures, true_arm
 from command import ROOT, conforms
-from recordings import NS, plain_bag, recorded_bag, shift, warmed, write_samples
+from recordings import (
+    BETWEEN_S,
+    EVENTS,
+    NS,
+    START_NS,
+    TYPES,
+    plain_bag,
+    recorded_bag,
+    shift,
+    warmed,
+    write_samples,
+)
 
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validating import Job
 from robocal_ros.cli.validating_many import validated
-from robocal_ros.storage.bags import BagWriter
+from robocal_ros.core.codes import Code
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.records import arguments_text, outcome_text
+from robocal_ros.storage.bag_writer import ros_time
+from robocal_ros.storage.bags import BagWriter, read_bag
 
 TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
 SPHERE = ROOT / "bags/hand_eye_sphere.mcap"
@@ -119,6 +134,39 @@ class TestRecordedSession:
         without, in_force = (second["measured"][k]["rms_mm"] for k in ("without", "in_force"))
         assert in_force < 0.6 * without  # 20 of 30 K are known
         assert second["forecast"]["bound_mm"] > second["forecast"]["rms_mm"] > 0.0
+
+    def test_a_recording_that_begins_late(self, bags, validate, tmp_path) -> None:
+        """In mid-shift; another node's events, which nothing can replay, are told as recorded."""
+        late_ns = START_NS + 2 * BETWEEN_S * NS + NS // 7
+        path, before = tmp_path / "late.mcap", None
+        with BagWriter(path, latched=[EVENTS]) as bag:
+            for recorded in read_bag(bags / "live.mcap"):
+                given = recorded.topic, recorded.msgtype, recorded.message
+                if recorded.log_time_ns < late_ns:
+                    before = given if recorded.topic == EVENTS else before
+                    continue
+                if before is not None:
+                    bag.write(*before, late_ns)
+                    before = None
+                bag.write(*given, recorded.log_time_ns)
+            command = Command("run", {}, recorded.log_time_ns)
+            event = {
+                "stamp": ros_time(recorded.log_time_ns),
+                "command": command.name,
+                "arguments": arguments_text(command),
+                "outcome": outcome_text(Outcome(command, Code.LIMIT_EXCEEDED, "too short")),
+            }
+            bag.write("/plc/session_events", TYPES[EVENTS], event, recorded.log_time_ns)
+        _, document, _, report = validate(path)
+        (row,) = document["bags"]
+        assert (row["cycles"], row["accepted"], row["differs"]) == (1, 0, 0)
+        (told,) = report["bags"]
+        (decision,) = told["other_decisions"]["/plc/session_events"]
+        assert (decision["code"], decision["message"]) == ("LIMIT_EXCEEDED", "too short")
+        _, _, _, whole = validate(bags / "live.mcap")
+        (late,), (_, second) = (r["bags"][0]["sessions"][0]["cycles"] for r in (report, whole))
+        for name in ("in_force", "candidate", "measured", "drift", "sigma", "verdict"):
+            assert late[name] == second[name], name
 
 
 class TestTruth:

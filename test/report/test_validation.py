@@ -50,10 +50,15 @@ def session(**own):
     } | own  # fmt: skip
 
 
+OTHER = {"/plc/session_events": [
+    {"stamp": 1e9, "command": "run", "code": "LIMIT_EXCEEDED", "message": "gap <too> short"}
+]}  # fmt: skip
+
+
 def bag(name, *sessions, simulated=False):
     return {
         "bag": name, "path": f"/x/{name}", "from": "a", "to": "b", "duration_s": 7200.0,
-        "topics": {}, "simulated": simulated, "sessions": list(sessions),
+        "topics": {}, "simulated": simulated, "sessions": list(sessions), "other_decisions": OTHER,
     }  # fmt: skip
 
 
@@ -118,7 +123,8 @@ def test_the_tables():
     rows = list(csv.DictReader(io.StringIO(bags_table(BAGS))))
     assert rows[2]["error"] == "BAD_INPUT: no <bag>"
     rows = list(csv.DictReader(io.StringIO(decisions_table(BAGS))))
-    assert len(rows) == 4
+    assert len(rows) == 6
+    assert rows[2]["node"] == "/plc/session_events"
     assert rows[1]["message"] == "too <late>"
 
 
@@ -127,12 +133,12 @@ def test_the_page_needs_nothing_else_and_says_all():
     html = page(REPORT, shown)
     assert html.count("<svg") == 3
     assert not re.search(r"<(script|link|img|iframe|object)\b|@import", html)
-    words = ("&lt;because&gt; of 2", "too &lt;late&gt;", "a &lt;warning&gt;", "no &lt;bag&gt;",
-             "KR &amp; &lt;150&gt;", "3 of joint_states: late", "samples rejected: 17",
+    words = ("too &lt;late&gt;", "a &lt;warning&gt;", "no &lt;bag&gt;",
+             "gap &lt;too&gt; short", "KR &amp; &lt;150&gt;", "3 of joint_states: late", "<td>17</td>",
              "LIMIT_EXCEEDED", "bit for bit", "sigma_m", "90.0%")  # fmt: skip
     for said in words:
         assert said in html
-    assert "<because>" not in html
+    assert "<late>" not in html
     assert 'class="mark">simulated' in html
 
 
