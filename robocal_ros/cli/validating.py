@@ -65,7 +65,8 @@ def validate_bag(job: Job) -> Validated:
         with BagReader(job.path) as reader:
             head |= _about(reader)
             replayable, others = _event_topics(reader)
-            sessions = [_Session(job, reader, topic).judged() for topic in replayable or [None]]
+            topics: list[str | None] = [*replayable] or [None]
+            sessions = [_Session(job, reader, topic).judged() for topic in topics]
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:
