@@ -9,6 +9,7 @@ import numpy as np
 
 Document = dict[str, Any]
 
+ERRORS = {"without": "nominal", "in_force": "in_force", "after": "candidate"}
 ERROR_KEYS = ("mean_mm", "rms_mm", "p95_mm", "max_mm", "share_within_tolerance")
 
 
@@ -42,23 +43,22 @@ def _row(bag: Document, session: Document) -> Document:
 
 
 def _thermal(session: Document) -> Document:
-    """Errors by the truth where the bag has one, else as measured; after: of the candidates."""
-    cycles, judged_by = session["cycles"], "truth" if session["true"] else "measurements"
-    errors = session["true"] or session["measured"] or {}
-    after = errors.get("after") or {"rms_mm": pooled_rms_mm(cycles, "candidate")}
+    """Errors by the truth where the bag has one, else those of the verdicts; after: candidates."""
+    cycles, true, measured = session["cycles"], session["true"], session["measured"] or {}
+    if true is not None:
+        rms = {name: true[name]["rms_mm"] for name in ERRORS}
+    else:
+        rms = {name: pooled_rms_mm(cycles, judged) for name, judged in ERRORS.items()}
+    shares = {
+        name: (true or measured).get(name, {}).get("share_within_tolerance") for name in ERRORS
+    }
     return {
         "cycles": len(cycles),
         "accepted": sum(cycle["revision"] > 0 for cycle in cycles),
-        "judged_by": judged_by,
-        "rms_without_mm": errors["without"]["rms_mm"] if errors else None,
-        "rms_in_force_mm": errors["in_force"]["rms_mm"] if errors else None,
-        "rms_after_mm": after["rms_mm"],
-        "lambda_without": errors["without"]["share_within_tolerance"] if errors else None,
-        "lambda_in_force": errors["in_force"]["share_within_tolerance"] if errors else None,
-        "lambda_after": after.get("share_within_tolerance"),
-        "share_below_bound": session["bound"][
-            "true_share" if judged_by == "truth" else "measured_share"
-        ],
+        "judged_by": "truth" if true is not None else "measurements",
+        **{f"rms_{name}_mm": value for name, value in rms.items()},
+        **{f"lambda_{name}": value for name, value in shares.items()},
+        "share_below_bound": session["bound"]["measured_share" if true is None else "true_share"],
     }
 
 
@@ -125,7 +125,7 @@ def _cycle(bag: Document, cycle: Document) -> Document:
         "bound_mm": (cycle["forecast"] or {}).get("bound_mm"),
     }
     for judge in ("measured", "true"):
-        for name in ("without", "in_force", "after"):
+        for name in ERRORS:
             found = (cycle[judge] or {}).get(name) or {}
             row |= {f"{judge}_{name}_{key}": found.get(key) for key in ERROR_KEYS}
     row |= {f"drift_{name}": value for name, value in cycle["drift"].items()}

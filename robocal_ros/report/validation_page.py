@@ -17,8 +17,8 @@ OVER_BOUND = "95 % of the errors are to be below the bound that was expected bef
 ERRORS_NOTE = (
     "mm. In force: the model from before a cycle, at its oldest. After: with what was decided at "
     "it; by measurements the candidate, each pose predicted from the others. λ: share of all "
-    f"directions within {TOLERANCE_MM:g} mm. Judged by measurements, errors hold the sensor's "
-    f"noise of both visits. Below bound: {OVER_BOUND}."
+    f"directions within {TOLERANCE_MM:g} mm; by measurements with the noise of the cold and of the "
+    f"warm visit. Below bound: {OVER_BOUND}."
 )
 
 

@@ -85,6 +85,8 @@ REPORT = {
 def test_a_row_for_each_session_and_each_bad_bag():
     thermal, tool, bad = summary_rows(BAGS)
     assert (thermal["cycles"], thermal["accepted"], thermal["refused"]) == (2, 1, 1)
+    assert thermal["rms_without_mm"] == pytest.approx(0.4)
+    assert thermal["rms_in_force_mm"] == pytest.approx(0.2)
     assert (thermal["lambda_without"], thermal["lambda_in_force"]) == (0.2, 0.5)
     assert thermal["share_below_bound"] == 0.9
     assert thermal["lambda_after"] is None
