@@ -12,6 +12,11 @@ from robocal_ros.report.validation_figures import Drawn
 
 Figures = Mapping[str, Sequence[Sequence[Drawn]]]
 
+TITLES = {
+    "thermal": "Accuracy over the cycles",
+    "tool": "Tools",
+    "hand_eye": "Sensors on the robot",
+}
 NOTHING = "–"  # noqa: RUF001
 OVER_BOUND = "95 % of the errors are to be below the bound that was expected before the cycle"
 ERRORS_NOTE = (
@@ -64,16 +69,16 @@ def _overview(rows: Sequence[Document]) -> list[str]:
     if failed:
         cells = [[row["bag"], row["error"]["code"], row["error"]["message"]] for row in failed]
         parts += ["<h2>Not validated</h2>", table(["bag", "code", "why"], cells, words=(1, 2))]
-    for kind, title, heads, cells_of, note in (
-        ("thermal", "Accuracy over the cycles", _THERMAL, _thermal_cells, ERRORS_NOTE),
-        ("tool", "Tools", _TOOL, _tool_cells, ""),
-        ("hand_eye", "Sensors on the robot", _HAND_EYE, _hand_eye_cells, ""),
+    for kind, heads, cells_of, note in (
+        ("thermal", _THERMAL, _thermal_cells, ERRORS_NOTE),
+        ("tool", _TOOL, _tool_cells, ""),
+        ("hand_eye", _HAND_EYE, _hand_eye_cells, ""),
     ):
         chosen = [row for row in rows if row["kind"] == kind]
         if chosen:
             body = [[row["bag"], row["robot"], *cells_of(row), *_common(row)] for row in chosen]
             head = ["bag", "robot", *heads, "live", "refused", "warnings"]
-            parts += [f"<h2>{title}</h2>", table(head, body, words=(1,))]
+            parts += [f"<h2>{TITLES[kind]}</h2>", table(head, body, words=(1,))]
             parts += [f'<p class="faint">{note}</p>'] if note else []
     return parts
 
@@ -123,6 +128,7 @@ def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
         f'<p class="faint">{bag["from"]} to {bag["to"]}, {bag["duration_s"] / 3600.0:.2f} h</p>',
     ]
     for session, shown in zip(bag["sessions"], figures, strict=True):
+        parts.append(f"<h3>{TITLES[session['kind']]}</h3>")
         parts += [figure(drawn.svg, drawn.caption) for drawn in shown]
         parts += _session(session)
     for node, decisions in bag["other_decisions"].items():

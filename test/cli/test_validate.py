@@ -215,6 +215,24 @@ def test_tools_and_sensors(validate) -> None:
     assert {"LIMIT_EXCEEDED", "BEAM_EDGES_WRONG"} <= codes
 
 
+def test_a_bag_of_two_nodes(bags, validate, tmp_path) -> None:
+    """Each session takes its own robot's joints from the topic that both write to."""
+    path = tmp_path / "both.mcap"
+    with BagWriter(path) as bag:
+        for source in (bags / "live.mcap", TOOL_RUNS):
+            for recorded in read_bag(source):
+                given = recorded.topic, recorded.msgtype, recorded.message
+                bag.write(*given, recorded.log_time_ns)
+    status, document, out, _ = validate(path)
+    assert status == 0
+    rows = {row["kind"]: row for row in document["bags"]}
+    assert {kind: row["differs"] for kind, row in rows.items()} == {"tool": 0, "thermal": 0}
+    assert (rows["tool"]["runs"], rows["thermal"]["cycles"]) == (5, 2)
+    assert {path.name for path in out.glob("*.png")} == {
+        "both-tool.png", "both-2-cycles.png", "both-2-drift.png"
+    }  # fmt: skip
+
+
 class TestBadBags:
     def test_one_is_told_and_the_others_go_on(self, bags, validate, tmp_path) -> None:
         bad = tmp_path / "bad.mcap"
