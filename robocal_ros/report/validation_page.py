@@ -76,16 +76,16 @@ def _overview(rows: Sequence[Document]) -> list[str]:
     ):
         chosen = [row for row in rows if row["kind"] == kind]
         if chosen:
-            body = [[row["bag"], row["robot"], *cells_of(row), *_common(row)] for row in chosen]
-            head = ["bag", "robot", *heads, "live", "refused", "warnings"]
-            parts += [f"<h2>{TITLES[kind]}</h2>", table(head, body, words=(1,))]
+            body = [[row["bag"], *cells_of(row), *_common(row)] for row in chosen]
+            head = ["bag", *heads, "live", "refused", "warnings"]
+            parts += [f"<h2>{TITLES[kind]}</h2>", table(head, body)]
             parts += [f'<p class="faint">{note}</p>'] if note else []
     return parts
 
 
 _THERMAL = (
-    "judged by", "cycles", "accepted", "rms without", "in force", "after", "λ without", "in force",
-    "after", "below bound",
+    "judged by", "cycles", "accepted", "rms without", "rms in force", "rms after", "λ without",
+    "λ in force", "λ after", "below bound",
 )  # fmt: skip
 _TOOL = ("runs", "largest change, mm", "largest true error, mm")
 _HAND_EYE = ("calibrations", "residual, mm", "expected error, mm", "true error, mm")
@@ -176,7 +176,7 @@ def _cycles(session: Document) -> str:
             *(_mm(cycle[name]["rms_mm"]) for name in ("nominal", "in_force", "candidate")),
             _mm(cycle["predicted_rms_mm"]), _mm(forecast.get("bound_mm")),
             _mm((true.get("after") or {}).get("rms_mm")),
-            _share(found.get("share_within_tolerance")), ", ".join(cycle["rejected"]),
+            _share(found.get("share_within_tolerance")), _of(cycle),
         ])  # fmt: skip
     note = (
         '<p class="faint">Rms in mm. Candidate: each pose predicted from the others; expected: the '
@@ -186,6 +186,12 @@ def _cycles(session: Document) -> str:
         "the others contradict.</p>"
     )
     return table(head, body, words=(2,)) + note
+
+
+def _of(cycle: Document) -> str:
+    """How many samples were rejected; their names are in the JSON."""
+    rejected = len(cycle["rejected"])
+    return f"{rejected} of {cycle['samples']}" if rejected else ""
 
 
 def _runs(session: Document) -> str:
