@@ -1,6 +1,6 @@
 """Plays a recording through live estimators on the clock of the recording.
 
-ros2 launch robocal_ros replay.launch.py bag:=recordings/robocal_2026-11-21T06-00-00Z params:=cell.yaml
+ros2 launch robocal_ros replay.launch.py bag:=/data/recordings/robocal_X params:=cell.yaml
 
 Without a graph, faster, and with a report: ``robocal validate``.
 """
