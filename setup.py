@@ -44,6 +44,7 @@ setup(
             "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
             "cell_sim_node = robocal_ros.nodes.cell_sim_node:main",
             "replay_node = robocal_ros.nodes.replay_node:main",
+            "recorder_node = robocal_ros.nodes.recorder_node:main",
         ]
     },
 )

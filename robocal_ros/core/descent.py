@@ -91,7 +91,8 @@ class Descent(Generic[S]):
             scale = self._scale(residual, keep, huber)
             normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
             step = _damped_step(normal, gradient, 0.0)
-            if float(step @ normal @ step) < tolerance**2 * k:
+            to_go = float(step @ normal @ step)
+            if to_go < tolerance**2 * k:
                 near = residual + jacobian @ step  # exact enough so near
                 return Run(self.problem.retract(state, step), near, jacobian, iterations, True)
             for damping in DAMPINGS:
@@ -101,8 +102,9 @@ class Descent(Generic[S]):
                 new_residual, new_jacobian = self.problem.linearise(trial)
                 if self._cost(trial, new_residual, keep, scale, huber) <= cost:
                     break
-            else:  # no step of any length helps: not a minimum that can be trusted
-                return Run(state, residual, jacobian, iterations, False)
+            else:  # no step of any length helps: trusted only where all of it is far below a sigma
+                found = to_go < FIRST_TOLERANCE**2 * k
+                return Run(state, residual, jacobian, iterations, found)
             state, residual, jacobian = trial, new_residual, new_jacobian
         return Run(state, residual, jacobian, iterations, False)
 

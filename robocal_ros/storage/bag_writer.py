@@ -1,5 +1,6 @@
 """Bags of ROS 2 messages (MCAP) that ``ros2 bag play`` accepts, written without ROS."""
 
+import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import IO, Any, Literal, Self
@@ -48,7 +49,8 @@ class BagWriter:
     ----------
     path : str or Path
         An existing file is replaced.
-    latched : topics that are published latched (transient-local).
+    latched : topics that are published latched (transient-local); looked up with a topic's first
+        message.
     compression : of the chunks.
 
     Raises
@@ -73,7 +75,7 @@ class BagWriter:
             self._stream, chunk_size=CHUNK_BYTES, compression=_COMPRESSIONS[compression]
         )
         self._writer.start(profile="ros2", library=f"robocal_ros {__version__}")
-        self._latched = frozenset(latched)
+        self._latched = latched
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._count: dict[int, int] = {}
@@ -82,8 +84,22 @@ class BagWriter:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Write the index: the file is complete."""
         with self._stream:
             self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def flush(self) -> None:
+        """Bring everything to the disk: neither a kill nor a power cut loses it any more."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        os.fsync(self._stream.fileno())
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file, without the chunk that is being filled."""
+        return self._stream.tell()
 
     def write(
         self,

@@ -1,0 +1,32 @@
+"""Starts the nodes of two robots, each in a namespace and with a parameter file of its own.
+
+ros2 launch robocal_ros two_robots.launch.py left_params:=left.yaml right_params:=right.yaml
+"""
+
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
+
+ROBOTS = ("left", "right")
+
+
+def share(*path):
+    """Path of a file that the package installs."""
+    return PathJoinSubstitution([FindPackageShare("robocal_ros"), *path])
+
+
+def generate_launch_description():
+    """Describe both cells."""
+    actions = []
+    for robot in ROBOTS:
+        params = f"{robot}_params"
+        given = {"namespace": robot, "params": LaunchConfiguration(params)}
+        actions += [
+            DeclareLaunchArgument(params, default_value=share("config", "cell.yaml")),
+            IncludeLaunchDescription(
+                share("launch", "cell.launch.py"), launch_arguments=given.items()
+            ),
+        ]
+    return LaunchDescription(actions)

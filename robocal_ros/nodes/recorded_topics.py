@@ -1,0 +1,103 @@
+"""Topics that are recorded: found by name, subscribed as they are offered, taken serialized."""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from robocal_ros.core.errors import InputError
+from robocal_ros.nodes.replay_topics import message_class
+from robocal_ros.storage.bag_types import definition
+
+DEPTH = 1000
+
+
+@dataclass
+class Recorded:
+    """A topic that is subscribed."""
+
+    topic: str
+    msgtype: str
+    messages: int = 0
+    subscription: Any = None
+
+
+class RecordedTopics:
+    """Subscriptions of the wanted topics, as they appear.
+
+    Parameters
+    ----------
+    wanted : topics; relative ones are in the node's namespace, ``~/`` is the node's own.
+    take : is given topic, type and serialized message.
+
+    Attributes
+    ----------
+    found : by resolved name.
+    latched : those that are offered latched; grows.
+    unknown : topics whose type cannot be recorded, and why.
+    """
+
+    def __init__(
+        self, node: Node, wanted: Collection[str], take: Callable[[Recorded, bytes], None]
+    ) -> None:
+        self._node, self._take = node, take
+        self._wanted = [node.resolve_topic_name(topic) for topic in wanted]
+        self.found: dict[str, Recorded] = {}
+        self.latched: set[str] = set()
+        self.unknown: dict[str, str] = {}
+
+    @property
+    def missing(self) -> list[str]:
+        """Wanted topics that nobody has offered yet."""
+        return [t for t in self._wanted if t not in self.found and t not in self.unknown]
+
+    def look(self) -> None:
+        """Subscribe what is offered by now."""
+        if not (missing := self.missing):
+            return
+        offered = dict(self._node.get_topic_names_and_types())
+        for topic in missing:
+            if topic in offered and self._node.count_publishers(topic):
+                self._add(topic, offered[topic][0])
+
+    def _add(self, topic: str, msgtype: str) -> None:
+        try:
+            kind = message_class(msgtype)
+            definition(msgtype)
+        except InputError as error:
+            self.unknown[topic] = str(error)
+            return
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
+        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+        profile = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+        )
+        recorded = self.found[topic] = Recorded(topic, msgtype)
+        if latched:
+            self.latched.add(topic)
+
+        def receive(data: bytes) -> None:
+            recorded.messages += 1
+            self._take(recorded, data)
+
+        recorded.subscription = self._node.create_subscription(
+            kind, topic, receive, profile, raw=True
+        )
+
+    def renew_latched(self) -> None:
+        """Subscribe latched topics afresh: their publishers send what is in force once more."""
+        for topic in self.latched & set(self.found):
+            self._node.destroy_subscription(self.found.pop(topic).subscription)
+        self.look()
+
+    def close(self) -> None:
+        """Take the subscriptions down."""
+        for recorded in self.found.values():
+            self._node.destroy_subscription(recorded.subscription)
+        self.found.clear()

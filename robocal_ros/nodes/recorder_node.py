@@ -1,0 +1,212 @@
+"""Records what a dispute needs, for as long as there is room (docs/recorder_node.md)."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, StorageError
+from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.conversions import trigger_text
+from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.parameters import Setting
+from robocal_ros.nodes.recorded_topics import Recorded, RecordedTopics
+from robocal_ros.nodes.run import run
+from robocal_ros.storage.bag_recording import MB, BagRecording, delete_oldest, keep, next_folder
+from robocal_ros.storage.history_paths import state_folder
+
+LOOK_S = 0.5
+ROOM_S = 5.0
+AGAIN_S = 10.0  # after a recording broke off
+HOUR_S = 3600.0
+
+TOPICS = (
+    "joint_states",
+    "beam_events",
+    "sphere_cloud",
+    "sphere_center",
+    "reference_sphere_center",
+    "measured_point",
+    "measured_pose",
+    "motor_temperatures",
+    "gap_open",
+    "accuracy_state",
+    "thermal_node/session_events",
+    "thermal_node/model",
+    "thermal_node/quality",
+    "thermal_node/accuracy",
+    "tcf_node/session_events",
+    "tcf_node/tool",
+    "tcf_node/quality",
+    "hand_eye_node/session_events",
+    "joint_correction_node/correction",
+    "joint_correction_node/status",
+    "maintenance_node/status",
+    "maintenance_node/session_events",
+)
+
+SETTINGS = (
+    Setting("topics", list(TOPICS), "What is recorded; relative names are in the namespace"),
+    Setting("folder", "", "Where recordings are kept; empty: recordings/ in the state folder"),
+    Setting("file_mb", 50.0, "A file is this large", unit="MB", low=0.1, high=10000.0),
+    Setting("hours", 8.0, "A recording is this long", unit="h", low=1e-3, high=168.0),
+    Setting("keep_mb", 20000.0, "All recordings together", unit="MB", low=1.0, high=1e7),
+    Setting("flush_s", 1.0, "A crash loses no more than this", unit="s", low=0.1, high=60.0),
+)
+
+
+class RecorderNode(HouseNode):
+    """Writes one recording after another; the oldest are deleted."""
+
+    NAME = "recorder_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._recording: BagRecording | None = None
+        self._topics: RecordedTopics | None = None
+        self._fault = ""
+
+    def configure(self) -> None:
+        """Find the folder; nothing is recorded before activation."""
+        given = self.settings["folder"]
+        self._folder = Path(given) if given else state_folder() / "recordings"
+        self.add_service(Trigger, "~/keep", self._keep)
+        self.add_service(Trigger, "~/split", self._split)
+        self.add_timer(LOOK_S, self._look, steady=True)
+        self.add_timer(self.settings["flush_s"], self._flush, steady=True)
+        self.add_timer(ROOM_S, self._make_room, steady=True)
+
+    def activate(self) -> None:
+        """Begin a recording."""
+        self._fault, self._lost, self._deleted, self._again_s = "", 0, 0, 0.0
+        self._topics = RecordedTopics(self, self.settings["topics"], self._take)
+        self._topics.look()
+
+    def deactivate(self) -> None:
+        """Complete the recording."""
+        if self._topics is not None:
+            self._topics.close()
+        self._topics = None
+        self._complete()
+
+    # ---- what comes in --------------------------------------------------------------------------
+
+    def _take(self, recorded: Recorded, data: bytes) -> None:
+        if not self.is_active:
+            return
+        try:
+            recording = self._recording or self._begin()
+            recording.write(recorded.topic, recorded.msgtype, data, self.now_ns())
+        except StorageError as error:
+            self._lost += 1
+            self._break_off(error)
+
+    def _begin(self) -> BagRecording:
+        if time.monotonic() < self._again_s:
+            raise StorageError(self._fault)
+        latched = set() if self._topics is None else self._topics.latched
+        self._recording = BagRecording(
+            next_folder(self._folder),
+            latched=latched,
+            file_bytes=round(self.settings["file_mb"] * MB),
+        )
+        self._begun_s, self._fault = time.monotonic(), ""
+        return self._recording
+
+    def _break_off(self, error: StorageError) -> None:
+        self._recording = None
+        if not self._fault:
+            self.get_logger().error(str(error))
+        if time.monotonic() >= self._again_s:
+            self._fault, self._again_s = str(error), time.monotonic() + AGAIN_S
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        topics = self._topics
+        if topics is None:
+            return
+        topics.look()
+        over_s = self.settings["hours"] * HOUR_S
+        if self._recording is not None and time.monotonic() - self._begun_s >= over_s:
+            self._next()
+
+    def _make_room(self) -> None:
+        spared = None if self._recording is None else self._recording.folder
+        most = round(self.settings["keep_mb"] * MB)
+        try:
+            self._deleted += len(delete_oldest(self._folder, most, spared))
+        except OSError as error:
+            self.get_logger().error(f"no room is made: {error}")
+
+    def _next(self) -> None:
+        """Begin another recording, which opens with all that is in force."""
+        self._complete()
+        if self._topics is not None:
+            self._topics.renew_latched()
+
+    def _flush(self) -> None:
+        try:
+            if self._recording is not None:
+                self._recording.flush()
+        except StorageError as error:
+            self._break_off(error)
+
+    def _complete(self) -> None:
+        recording, self._recording = self._recording, None
+        try:
+            if recording is not None:
+                recording.close()
+        except StorageError as error:
+            self._break_off(error)
+
+    # ---- services -------------------------------------------------------------------------------
+
+    def _keep(self, request: Any, response: Any) -> Any:
+        recording = self._recording
+        if recording is None:
+            raise ConflictError("nothing is being recorded: there is nothing to keep")
+        keep(recording.folder, f"kept at {time.strftime('%Y-%m-%d %H:%M:%SZ', time.gmtime())}")
+        response.success = True
+        response.message = trigger_text(0, Code.ACCEPT, f"{recording.folder} is kept for good")
+        return response
+
+    def _split(self, request: Any, response: Any) -> Any:
+        recording = self._recording
+        if recording is None:
+            raise ConflictError("nothing is being recorded: there is nothing to complete")
+        self._next()
+        response.success = True
+        response.message = trigger_text(0, Code.ACCEPT, f"{recording.folder} is complete")
+        return response
+
+    def health(self) -> Health:
+        """Tell what is recorded, and what is not."""
+        health, topics, recording = Health(), self._topics, self._recording
+        if self._fault:
+            health.worsen(ERROR, f"{self._fault}; {self._lost} messages are not recorded")
+        if topics is None:
+            return health
+        if topics.unknown:
+            told = "; ".join(f"{topic}: {why}" for topic, why in topics.unknown.items())
+            health.worsen(WARN, f"not recorded: {told}")
+        if not topics.found:
+            health.worsen(WARN, "none of the topics is there yet")
+        counts: dict[str, object] = {
+            f"{r.topic} recorded": r.messages for r in topics.found.values()
+        }
+        health.values = counts | {
+            "folder": "" if recording is None else recording.folder,
+            "messages": 0 if recording is None else recording.messages,
+            "not there": ", ".join(topics.missing),
+            "recordings deleted": self._deleted,
+        }
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(RecorderNode)

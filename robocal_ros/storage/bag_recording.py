@@ -1,0 +1,224 @@
+"""A recording that grows: a folder of MCAP files as ``ros2 bag`` makes it, and how many are kept.
+
+Each file has an index once it is full; of one that a crash left behind, `BagReader` reads
+everything up to the last flush.
+"""
+
+import shutil
+import time
+from collections.abc import Collection
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+
+from robocal_ros.core.errors import InputError, StorageError
+from robocal_ros.storage.bag_writer import BagWriter, offered_qos
+from robocal_ros.storage.files import write_text
+
+PREFIX = "robocal_"
+KEEP = "KEEP"  # a file of this name in a recording's folder: it is never deleted
+MB = 1_000_000
+
+
+class BagRecording:
+    """Writes one recording; a context manager.
+
+    A new file is begun when one is full. ``metadata.yaml``, which ``ros2 bag play`` looks for,
+    names each file from its begin on, so that a crash hides none; its counts are of that time.
+
+    Parameters
+    ----------
+    folder : made anew.
+    latched : topics that are published latched; may grow.
+    file_bytes : size of a file.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be written; what was written before stays readable.
+    """
+
+    def __init__(self, folder: Path, *, latched: Collection[str], file_bytes: int) -> None:
+        self.folder, self._latched, self._file_bytes = folder, latched, file_bytes
+        self._types: dict[str, str] = {}
+        self._counts: dict[str, int] = {}
+        self._files: list[dict[str, Any]] = []
+        self._writer: BagWriter | None = None
+        try:
+            folder.mkdir(parents=True)
+        except OSError as error:
+            raise StorageError(f"{folder}: cannot be made: {error.strerror or error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def messages(self) -> int:
+        """Number of messages so far."""
+        return sum(self._counts.values())
+
+    def write(self, topic: str, msgtype: str, cdr: bytes, log_time_ns: int) -> None:
+        """Append a serialized message.
+
+        Raises
+        ------
+        StorageError
+            When it cannot be written.
+        InputError
+            When the type is not known.
+        """
+        try:
+            if self._writer is not None and self._writer.size_bytes >= self._file_bytes:
+                self._finish()
+            writer = self._writer or self._begin(log_time_ns)
+            writer.write(topic, msgtype, cdr, log_time_ns)
+        except OSError as error:
+            raise self._broken(error) from error
+        file = self._files[-1]
+        file["start_ns"] = min(file["start_ns"], log_time_ns)
+        file["end_ns"] = max(file["end_ns"], log_time_ns)
+        file["count"] += 1
+        self._types[topic] = msgtype
+        self._counts[topic] = self._counts.get(topic, 0) + 1
+
+    def flush(self) -> None:
+        """Bring everything to the disk: from here on a crash loses none of it."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.flush()
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def close(self) -> None:
+        """Complete the last file."""
+        try:
+            self._finish()
+        except OSError as error:
+            raise self._broken(error) from error
+
+    def _begin(self, log_time_ns: int) -> BagWriter:
+        name = f"{self.folder.name}_{len(self._files)}.mcap"
+        try:
+            self._writer = BagWriter(self.folder / name, latched=self._latched)
+        except InputError as error:
+            raise StorageError(str(error)) from error
+        self._files.append(
+            {"path": name, "start_ns": log_time_ns, "end_ns": log_time_ns, "count": 0}
+        )
+        self._describe()
+        return self._writer
+
+    def _finish(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
+            self._describe()
+
+    def _broken(self, error: OSError) -> StorageError:
+        self._writer = None
+        return StorageError(f"{self.folder}: recording broke off: {error.strerror or error}")
+
+    def _describe(self) -> None:
+        try:
+            write_text(self.folder / "metadata.yaml", yaml.safe_dump(self._metadata()))
+        except InputError as error:
+            raise StorageError(str(error)) from error
+
+    def _metadata(self) -> dict[str, Any]:
+        files = self._files
+        start, end = min(f["start_ns"] for f in files), max(f["end_ns"] for f in files)
+        topics = [
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": msgtype,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": offered_qos(topic in self._latched),
+                },
+                "message_count": self._counts[topic],
+            }
+            for topic, msgtype in sorted(self._types.items())
+        ]
+        return {
+            "rosbag2_bagfile_information": {
+                "version": 5,
+                "storage_identifier": "mcap",
+                **_times(start, end),
+                "message_count": self.messages,
+                "topics_with_message_count": topics,
+                "compression_format": "",
+                "compression_mode": "",
+                "relative_file_paths": [f["path"] for f in files],
+                "files": [
+                    {"path": f["path"], **_times(f["start_ns"], f["end_ns"]),
+                     "message_count": f["count"]}
+                    for f in files
+                ],
+            }
+        }  # fmt: skip
+
+
+def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:
+    return {
+        "duration": {"nanoseconds": end_ns - start_ns},
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+    }
+
+
+def next_folder(parent: Path, wall_ns: int | None = None) -> Path:
+    """A folder for a recording that begins now: named by UTC, never one that exists."""
+    wall_ns = time.time_ns() if wall_ns is None else wall_ns
+    stamp = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
+    folder, number = parent / f"{PREFIX}{stamp}", 1
+    while folder.exists():
+        number += 1
+        folder = parent / f"{PREFIX}{stamp}_{number}"
+    return folder
+
+
+def recordings(parent: Path) -> list[Path]:
+    """Folders of recordings, the oldest first."""
+    found = [path for path in parent.glob(f"{PREFIX}*") if path.is_dir()]
+    return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+
+
+def size_bytes(folder: Path) -> int:
+    """What a recording takes."""
+    return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+
+
+def delete_oldest(parent: Path, most_bytes: int, spared: Path | None) -> list[Path]:
+    """Delete whole recordings, the oldest first, until the rest fits; those that were deleted.
+
+    ``spared`` and recordings that are marked by `keep` stay.
+    """
+    sizes = {folder: size_bytes(folder) for folder in recordings(parent)}
+    left, deleted = sum(sizes.values()), []
+    for folder, size in sizes.items():
+        if left <= most_bytes:
+            break
+        if folder == spared or (folder / KEEP).exists():
+            continue
+        shutil.rmtree(folder)
+        deleted.append(folder)
+        left -= size
+    return deleted
+
+
+def keep(folder: Path, why: str) -> None:
+    """Mark a recording: it is never deleted.
+
+    Raises
+    ------
+    InputError
+        When it cannot be marked.
+    """
+    if not folder.is_dir():
+        raise InputError("no such recording", file=str(folder))
+    write_text(folder / KEEP, f"{why}\n")

@@ -1,0 +1,64 @@
+"""When a descent counts as converged."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from robocal_ros.core.descent import FIRST_TOLERANCE, Descent, Run
+
+
+@dataclass(frozen=True)
+class Rough:
+    """Two numbers measured ten times, in units of sigma, with a Jacobian that misses a ripple.
+
+    As a flange's path through noisy joint readings is: the ripple's slope is the Jacobian's error.
+    """
+
+    ripple: float
+    pitch: float = 1e-5
+
+    names = ("x", "y")
+    scale_components = 2
+
+    def linearise(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        angle = state / self.pitch + np.arange(10)[:, None]
+        residual = state - np.linspace(-1.0, 1.0, 10)[:, None] + self.ripple * np.sin(angle)
+        return residual, np.tile(np.eye(2), (10, 1, 1))
+
+    def retract(self, state: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return state + step
+
+    def deviation(self, state: np.ndarray) -> np.ndarray:
+        return np.zeros(2)
+
+
+def descended(ripple: float, start: float) -> Run:
+    problem = Rough(ripple)
+    descent = Descent(problem, np.zeros((2, 2)), 0, np.full(10, 2))
+    state = np.full(2, start)
+    return descent.run(Run(state, *problem.linearise(state), 0, False), np.ones(10, dtype=bool))
+
+
+def test_a_smooth_problem_converges():
+    run = descended(0.0, start=3.0)
+    assert run.converged
+    assert run.state == pytest.approx([0.0, 0.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("start", [-2.0, 0.3, 5.0])
+def test_where_no_step_helps_a_place_far_below_a_sigma_is_found(start):
+    """A ripple of 1e-3 sigma lets the full step wander by 1e-3 / sqrt(10) sigma for ever."""
+    run = descended(1e-3, start)
+    assert run.converged
+    sigma = 1.0 / np.sqrt(10.0)
+    assert np.all(np.abs(run.state) < 2.0 * FIRST_TOLERANCE * sigma)
+
+
+def test_where_no_step_helps_far_away_nothing_is_found():
+    """Ripples of a sigma hold it where the full step is still a part of a sigma."""
+    found = [descended(2.0, start) for start in np.linspace(-3.0, 3.0, 13)]
+    to_go = [np.linalg.norm(run.residual.mean(axis=0)) for run in found]
+    held = [run for run, step in zip(found, to_go, strict=True) if step > 0.1]
+    assert held
+    assert not any(run.converged for run in held)

@@ -1,0 +1,105 @@
+"""The launch files of a cell, without ros2 launch: what they name is there, and nodes take it.
+
+They are read, not run: launch and launch_ros come with a ROS installation only.
+"""
+
+import ast
+import re
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from trajectory_msgs.msg import JointTrajectory
+
+ROOT = Path(__file__).parents[2]
+SHARE = ROOT / "install" / "robocal_ros" / "share" / "robocal_ros"
+FILES = ("cell", "two_robots", "replay")
+CONTROLLER = "/robot_1/joint_trajectory_controller/joint_trajectory"
+
+
+def tree(name: str) -> ast.Module:
+    return ast.parse((ROOT / "launch" / f"{name}.launch.py").read_text())
+
+
+def words(module: ast.Module) -> set[str]:
+    nodes = (n.value for n in ast.walk(module) if isinstance(n, ast.Constant))
+    return {value for value in nodes if isinstance(value, str)}
+
+
+def first_arguments(module: ast.Module, call: str) -> list[Any]:
+    calls = [n for n in ast.walk(module) if isinstance(n, ast.Call)]
+    named = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == call]
+    return [c.args[0].value for c in named if isinstance(c.args[0], ast.Constant)]
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_it_is_installed_and_names_what_exists(name):
+    file = SHARE / "launch" / f"{name}.launch.py"
+    assert file.read_text() == (ROOT / "launch" / file.name).read_text()
+    compile(file.read_text(), str(file), "exec")
+    found = words(tree(name))
+    scripts = {e.name for e in metadata.distribution("robocal-ros").entry_points}
+    executables = {word for word in found if re.fullmatch(r"\w+_node", word)}
+    assert executables <= scripts
+    assert all((SHARE.parents[1] / "lib" / "robocal_ros" / node).is_file() for node in executables)
+    files = {word for word in found if re.fullmatch(r"\w+\.yaml", word)}
+    files |= {f"{node}.yaml" for node in executables} if name == "cell" else set()
+    assert all((SHARE / "config" / word).is_file() for word in files)
+
+
+@pytest.mark.parametrize("name", ["cell", "replay"])
+def test_what_it_takes_is_declared_and_shown(name):
+    module = tree(name)
+    declared = set(first_arguments(module, "DeclareLaunchArgument"))
+    assert set(first_arguments(module, "LaunchConfiguration")) == declared
+    shown = set(re.findall(r"(\w+):=", ast.get_docstring(module) or ""))
+    assert shown <= declared
+
+
+def test_all_nodes_of_a_cell_are_started():
+    scripts = {e.name for e in metadata.distribution("robocal-ros").entry_points}
+    nodes = {name for name in scripts if name.endswith("_node")} - {"replay_node"}
+    assert nodes <= words(tree("cell"))
+
+
+def test_a_cell_of_one_robot_in_its_namespace(graph, tmp_path):
+    """Started as the launch file does: its file, then that of the cell, names and remappings."""
+    mine = tmp_path / "mine.yaml"
+    text = (ROOT / "config" / "cell.yaml").read_text()
+    mine.write_text(text.replace('serial: ""', "serial: R7"))
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    nodes = sorted(w for w in words(tree("cell")) if w.endswith("_node"))
+    for name in nodes:
+        trajectories = "joint_trajectory" if name == "cell_sim_node" else "~/joint_trajectory"
+        graph.start(
+            name,
+            None,
+            {
+                "__node": name,
+                "__ns": "/robot_1",
+                trajectories: CONTROLLER.removeprefix("/robot_1/"),
+                "kinematic_model": "thermal_node/model",
+                "tool_frame": "tcf_node/tool",
+            },
+            "--ros-args", "--params-file", str(ROOT / "config" / f"{name}.yaml"),
+            "--params-file", str(mine),
+        )  # fmt: skip
+
+    def active() -> set[str]:
+        statuses = [s for a in said for s in a.status if s.hardware_id == "R7"]
+        told = {s.name: v.value for s in statuses for v in s.values if v.key == "state"}
+        return {name for name, state in told.items() if state == "active"}
+
+    # Without a laser file, measuring poses or a hand-eye target some wait for their set-up.
+    ready = {f"robot_1/{n}" for n in ("thermal_node", "joint_correction_node", "recorder_node")}
+    graph.spin_until(lambda: active() >= ready, "they are active, for this robot", 30.0)
+    senders = {i.node_name for i in graph.probe.get_publishers_info_by_topic(CONTROLLER)}
+    assert senders >= {"joint_correction_node"}
+    takers = {i.node_name for i in graph.probe.get_subscriptions_info_by_topic(CONTROLLER)}
+    assert takers == {"cell_sim_node"}
+    models = graph.probe.get_subscriptions_info_by_topic("/robot_1/thermal_node/model")
+    assert {i.node_name for i in models} >= {"joint_correction_node", "recorder_node"}
+    types = dict(graph.probe.get_topic_names_and_types())
+    assert types[CONTROLLER] == [f"trajectory_msgs/msg/{JointTrajectory.__name__}"]

@@ -1,0 +1,59 @@
+"""The layouts of config/ show topics and fields that exist."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from robocal_ros.nodes.replay_topics import message_class
+
+LAYOUTS = Path(__file__).parents[2] / "config" / "layouts"
+# Without the namespace; that nodes offer them is shown by the tests of the cell.
+TYPES = {
+    "/accuracy_state": "robocal_msgs/msg/AccuracyState",
+    "/beam_events": "robocal_msgs/msg/BeamEvent",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/joint_correction_node/correction": "robocal_msgs/msg/JointOffset",
+    "/joint_correction_node/status": "robocal_msgs/msg/CorrectionStatus",
+    "/maintenance_node/status": "robocal_msgs/msg/MaintenanceStatus",
+    "/motor_temperatures": "sensor_msgs/msg/Temperature",
+    "/tcf_node/tool": "robocal_msgs/msg/ToolFrame",
+    "/thermal_node/accuracy": "robocal_msgs/msg/AccuracyState",
+    "/thermal_node/quality": "robocal_msgs/msg/CalibrationQuality",
+}
+
+
+def foxglove() -> list[str]:
+    """Message paths of all panels, fields after dots."""
+    content = json.loads((LAYOUTS / "foxglove_cell.json").read_text())
+    panels = content["configById"]
+    shown = set(re.findall(r'"([A-Z]\w+!\w+)"', json.dumps(content["layout"])))
+    assert shown == set(panels)  # each panel has its place
+    paths = [path["value"] for panel in panels.values() for path in panel.get("paths", [])]
+    topics = [p.get("topicPath", p.get("topicToRender")) for p in panels.values()]
+    return paths + [topic for topic in topics if topic]
+
+
+def plotjuggler() -> list[str]:
+    """Curves of all plots, fields after slashes."""
+    root = ET.parse(LAYOUTS / "plotjuggler_cell.xml").getroot()
+    return [curve.attrib["name"] for curve in root.iter("curve")]
+
+
+PATHS = [*foxglove(), *plotjuggler()]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_the_field_exists(path):
+    topic = next(t for t in sorted(TYPES, key=len, reverse=True) if path.startswith(t))
+    value = message_class(TYPES[topic])()
+    for field in re.findall(r"[^./]+", path.removeprefix(topic)):
+        name = field.split("[")[0]
+        assert name in value.get_fields_and_field_types(), f"{path}: no field {name}"
+        value = getattr(value, name)
+
+
+def test_each_type_is_shown():
+    assert {t for t in TYPES if any(p.startswith(t) for p in PATHS)} == set(TYPES)

@@ -1,0 +1,96 @@
+"""The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
+
+from std_msgs.msg import Bool, String
+from std_srvs.srv import Trigger
+
+from robocal_ros.nodes import qos
+from robocal_ros.storage.bag_recording import KEEP, recordings
+from robocal_ros.storage.bags import BagReader
+
+NODE = "recorder_node"
+
+
+def started(graph, **parameters):
+    defaults = {"topics": "[words, model, missing]", "folder": graph.state / "rec", "flush_s": 0.1}
+    return graph.start(NODE, defaults | parameters)
+
+
+def words(folder, topic: str) -> list[str]:
+    with BagReader(folder) as bag:
+        return [m.message.data for m in bag.messages([topic])]
+
+
+def said(graph, publisher, kind, data) -> None:
+    publisher.publish(kind(data=data))
+    graph.spin_for(0.02)
+
+
+def test_a_killed_recorder_keeps_what_it_flushed_and_the_next_begins_anew(graph):
+    recorder = started(graph)
+    publisher = graph.publisher(String, "/words", qos.SENSOR)
+    for i in range(50):
+        said(graph, publisher, String, f"{i}")
+    graph.spin_for(0.5)  # five times as long as between two flushes
+    recorder.kill()
+    (first,) = recordings(graph.state / "rec")
+    assert words(first, "/words") == [f"{i}" for i in range(50)]
+    recorder = started(graph)
+
+    def recorded_again() -> bool:
+        said(graph, publisher, String, "again")  # the killed one still counts as a subscriber
+        return len(recordings(graph.state / "rec")) == 2
+
+    graph.spin_until(recorded_again, "a second recording")
+    assert recorder.stop() == 0
+    second = recordings(graph.state / "rec")[-1]
+    with BagReader(second) as bag:
+        assert not bag.info.notes
+    assert set(words(second, "/words")) == {"again"}
+
+
+def test_each_recording_opens_with_what_is_in_force(graph):
+    started(graph)
+    model = graph.probe.create_publisher(String, "/model", qos.own(qos.LATCHED))
+    model.publish(String(data="revision 3"))  # long before anybody listens
+    publisher = graph.publisher(String, "/words")
+    said(graph, publisher, String, "before")
+    kept = graph.call(Trigger, f"/{NODE}/keep")
+    assert kept.success, kept.message
+    assert kept.message.startswith("0 ACCEPT ")
+    split = graph.call(Trigger, f"/{NODE}/split")
+    assert split.success, split.message
+    said(graph, publisher, String, "after")
+    graph.spin_until(lambda: len(recordings(graph.state / "rec")) == 2, "a second recording")
+    graph.spin_for(0.5)
+    first, second = recordings(graph.state / "rec")
+    assert (first / KEEP).read_text().startswith("kept at ")
+    assert not (second / KEEP).exists()
+    for folder, expected in ((first, "before"), (second, "after")):
+        assert words(folder, "/model") == ["revision 3"]
+        assert words(folder, "/words") == [expected]
+    with BagReader(second) as bag:
+        assert not bag.info.topics.keys() - {"/model", "/words"}
+
+
+def test_what_it_cannot_write_is_told_and_it_lives_on(graph):
+    (graph.state).mkdir(exist_ok=True)
+    (graph.state / "rec").write_text("a file where the folder should be")
+    recorder = started(graph)
+    publisher = graph.publisher(String, "/words")
+    said(graph, publisher, String, "lost")
+    answer = graph.call(Trigger, f"/{NODE}/keep")
+    assert not answer.success
+    assert "nothing is being recorded" in answer.message
+    assert recorder.process.poll() is None
+    assert "cannot be made" in recorder.output
+
+
+def test_two_types_do_not_mix(graph):
+    """Who publishes another type under a name does not end the recording."""
+    started(graph)
+    publisher = graph.publisher(Bool, "/words")
+    said(graph, publisher, Bool, True)
+    graph.spin_until(lambda: recordings(graph.state / "rec"), "a recording")
+    graph.spin_for(0.5)
+    (folder,) = recordings(graph.state / "rec")
+    assert words(folder, "/words") == [True]

@@ -1,0 +1,129 @@
+"""Recordings: complete and broken off, split, kept and deleted."""
+
+import os
+import resource
+
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from robocal_ros.core.errors import StorageError
+from robocal_ros.storage.bag_recording import (
+    BagRecording,
+    delete_oldest,
+    keep,
+    next_folder,
+    recordings,
+    size_bytes,
+)
+from robocal_ros.storage.bag_types import encode
+from robocal_ros.storage.bags import BagReader
+
+BOOL, TEXT = "std_msgs/msg/Bool", "std_msgs/msg/String"
+FILE_BYTES = 20_000
+
+
+def text(number: int) -> bytes:
+    noise = os.urandom(200).hex()  # does not compress away
+    return bytes(encode(TEXT, {"data": f"{number} {noise}"}))
+
+
+def fill(recording: BagRecording, count: int, start: int = 0) -> None:
+    for i in range(start, start + count):
+        recording.write("/words", TEXT, text(i), 1_000_000_000 + i)
+        if i % 20 == 0:
+            recording.flush()
+
+
+def numbers(folder) -> list[int]:
+    with BagReader(folder) as bag:
+        return [int(m.message.data.split()[0]) for m in bag.messages(["/words"])]
+
+
+def test_nothing_is_lost_between_files_and_each_is_of_its_size(tmp_path):
+    latched = set()
+    with BagRecording(tmp_path / "r", latched=latched, file_bytes=FILE_BYTES) as recording:
+        fill(recording, 300)
+        latched.add("/open")
+        recording.write("/open", BOOL, bytes(encode(BOOL, {"data": True})), 2_000_000_000)
+    files = sorted((tmp_path / "r").glob("*.mcap"))
+    assert len(files) > 3
+    # a file is full with the first chunk that passes the size: twenty messages, each below 600 B
+    assert all(file.stat().st_size < FILE_BYTES + 20 * 600 + 4000 for file in files)
+    assert numbers(tmp_path / "r") == list(range(300))
+    with BagReader(tmp_path / "r") as bag:
+        assert not bag.info.notes
+        assert bag.info.messages == recording.messages == 301
+
+
+def test_another_reader_of_ros2_bags_takes_the_folder(tmp_path):
+    with BagRecording(tmp_path / "r", latched={"/words"}, file_bytes=FILE_BYTES) as recording:
+        fill(recording, 120)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with AnyReader([tmp_path / "r"], default_typestore=store) as reader:
+        assert reader.message_count == 120
+        found = [reader.deserialize(raw, c.msgtype).data for c, _, raw in reader.messages()]
+        profile = reader.connections[0].ext.offered_qos_profiles[0]
+    assert [int(words.split()[0]) for words in found] == list(range(120))
+    assert profile.durability.name == "TRANSIENT_LOCAL"
+
+
+def test_what_was_flushed_is_there_after_a_crash(tmp_path):
+    recording = BagRecording(tmp_path / "r", latched=(), file_bytes=FILE_BYTES)
+    fill(recording, 130)
+    recording.flush()
+    fill(recording, 7, start=130)  # neither flushed nor closed
+    found = numbers(tmp_path / "r")
+    assert found == list(range(len(found)))
+    assert len(found) >= 130
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="file/r: cannot be made"):
+        BagRecording(tmp_path / "file" / "r", latched=(), file_bytes=1)
+
+
+def test_a_disk_that_takes_no_more_is_told_and_what_it_took_is_read(tmp_path):
+    """A limit on the size of files stands for a full disk."""
+    recording = BagRecording(tmp_path / "r", latched=(), file_bytes=10 * FILE_BYTES)
+    fill(recording, 40)
+    recording.flush()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_BYTES, before[1]))
+    try:
+        with pytest.raises(StorageError, match="recording broke off: File too large"):
+            fill(recording, 200, start=40)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    found = numbers(tmp_path / "r")
+    assert found == list(range(len(found)))
+    assert len(found) >= 40
+
+
+def made(tmp_path, name: str, age_s: int) -> int:
+    with BagRecording(tmp_path / name, latched=(), file_bytes=FILE_BYTES) as recording:
+        fill(recording, 20)
+    os.utime(tmp_path / name, (1e9 - age_s, 1e9 - age_s))
+    return size_bytes(tmp_path / name)
+
+
+def test_the_oldest_go_first_but_for_those_that_are_kept(tmp_path):
+    sizes = [made(tmp_path, f"robocal_{i}", age_s=100 - i) for i in range(5)]
+    keep(tmp_path / "robocal_0", "a dispute")
+    os.utime(tmp_path / "robocal_0", (1e9 - 100, 1e9 - 100))
+    (tmp_path / "mine").mkdir()
+    room = sum(sizes) - sizes[1] - sizes[2] + 100
+    deleted = delete_oldest(tmp_path, room, spared=tmp_path / "robocal_4")
+    assert [path.name for path in deleted] == ["robocal_1", "robocal_2"]
+    assert [p.name for p in recordings(tmp_path)] == ["robocal_0", "robocal_3", "robocal_4"]
+    deleted = delete_oldest(tmp_path, 0, spared=tmp_path / "robocal_4")
+    assert [path.name for path in deleted] == ["robocal_3"]
+    assert (tmp_path / "mine").is_dir()
+
+
+def test_two_recordings_of_one_second_have_two_folders(tmp_path):
+    first = next_folder(tmp_path, 1_800_000_000_123_000_000)
+    assert first.name == "robocal_2027-01-15T08-00-00Z"
+    first.mkdir()
+    assert next_folder(tmp_path, 1_800_000_000_900_000_000).name == f"{first.name}_2"
