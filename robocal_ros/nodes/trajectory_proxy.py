@@ -143,6 +143,8 @@ class TrajectoryProxy:
             code = Result.INVALID_JOINTS if about_joints else Result.INVALID_GOAL
             self._fail(goal, str(error), code)
         except Exception as error:
+            if goal.course is not None:  # it never went out
+                goal.course.reject()
             self._node.get_logger().error(traceback.format_exc())
             self._fail(goal, f"a defect of this software, please report it: {error!r}")
 

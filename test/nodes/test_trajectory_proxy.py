@@ -224,6 +224,38 @@ def test_a_blend_ends_where_its_goal_was_cancelled(cell: Any) -> None:
     assert np.abs(cell.taught() - HOME).max() < 0.5 / 4.0 * whole
 
 
+def test_a_rejected_goal_leaves_the_blend_of_the_one_that_runs(cell: Any) -> None:
+    cell.begin(settled=False)
+    first = cell.send(HOME, HOME, lasts_s=4.0)
+    cell.graph.spin_until(lambda: np.abs(cell.robot.q - HOME).max() > 1e-5, "the blend")
+    cell.robot.rejects = True
+    cell.send(HOME, HOME, lasts_s=4.0).ends(GoalStatus.STATUS_ABORTED, AT_ONCE_S)
+    cell.graph.spin_for(1.5)
+    assert first.answer is None
+    whole = np.abs(np.array(cell.robot.goals[0].trajectory.points[-1].positions) - HOME).max()
+    assert np.abs(cell.robot.q - HOME).max() > 1.0 / 4.0 * whole  # it went on
+    # Half a second of it for a busy machine; a believed blend that stays were 1.5 s behind.
+    assert np.abs(cell.taught() - HOME).max() < 0.5 / 4.0 * whole
+    first.ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_goal_that_ends_stops_no_trajectory_of_the_topic(cell: Any) -> None:
+    cell.begin(settled=False)
+    paths = cell.graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
+    planner = cell.graph.publisher(JointTrajectory, "joint_trajectory")
+    output = cell.node._outputs["joint_trajectory"]
+    cell.graph.spin_until(output.get_subscription_count, "the output")
+    sent = cell.send(HOME, HOME, lasts_s=100.0).moves()
+    planner.publish(goal_of(HOME, HOME, lasts_s=4.0).trajectory)
+    cell.graph.spin_until(lambda: paths, "the trajectory of the topic")
+    sent.handle.cancel_goal_async()
+    sent.ends(GoalStatus.STATUS_CANCELED)
+    whole = np.abs(np.array(paths[-1].points[-1].positions) - HOME).max()
+    before = cell.taught()  # of a robot that stands: what is believed is commanded goes on
+    cell.graph.spin_for(1.5)
+    assert np.abs(cell.taught() - before).max() > 1.0 / 4.0 * whole
+
+
 def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=0.8).moves()
