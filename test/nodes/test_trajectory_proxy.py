@@ -13,24 +13,20 @@ from builtin_interfaces.msg import Duration
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance
 from follower import ACTION, HOME, NAMES, Follower
+from joint_correction_live import NODE, NOMINAL, drifted, model_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from robocal_msgs.msg import KinematicModel
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.nodes import conversions, qos, trajectory_proxy
+from robocal_ros.nodes import qos, trajectory_proxy
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
-from robocal_ros.storage.robots import load_robot
 
-NOMINAL = load_robot("kr150_r3100")
-NODE = "/joint_correction_node"
 OWN = f"{NODE}/follow_joint_trajectory"
 Result = FollowJointTrajectory.Result
 MOVED = HOME + np.array([0.2, 0.1, -0.1, 0.2, -0.1, 0.3])
@@ -42,15 +38,6 @@ SETTINGS = {
     "blend_deg_s": 5.0,
     "joint_state_age_s": 5.0,
 }
-
-
-def drifted() -> SerialArm:
-    rng = np.random.default_rng(0)
-    chosen = NOMINAL.parameters
-    size = np.where(chosen.is_length, 1e-4, 5e-5)
-    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
-
-
 ACTUAL = drifted()
 
 
@@ -112,11 +99,7 @@ class Cell:
     def begin(self, settled: bool = True) -> None:
         self.graph.spin_until(self.client.server_is_ready, "the action")
         publisher = self.graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
-        fields = {"serial": "s1", "model_hash": NOMINAL.model_hash, "revision": 1}
-        stamp = Header(frame_id="base")
-        state = KinematicModel.ACCEPTED
-        document = model_document(ACTUAL)
-        publisher.publish(conversions.kinematic_model(document, stamp=stamp, state=state, **fields))
+        publisher.publish(model_message(ACTUAL))
         self.graph.spin_until(lambda: len(self.states) > 5, "joint states")
         if settled:
             self.send(HOME, HOME).ends(GoalStatus.STATUS_SUCCEEDED)

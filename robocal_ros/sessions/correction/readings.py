@@ -35,15 +35,7 @@ class Readings:
     def taught(
         self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float
     ) -> tuple[Array, Array | None]:
-        """Un-correct joints (k,) of the arm as `take` does, and remember nothing.
-
-        Joints that are left out are where they were read last.
-
-        Raises
-        ------
-        RefusedError
-            When a value is not finite, a joint is named twice, or numbers differ.
-        """
+        """Un-correct joints as `take` does, remembering nothing; see `CorrectionSession.taught`."""
         state = JointCommand(names, position, velocity)
         index, place = self._joints.find(state)
         return self._un_corrected(state, index, place, now_s)[1:]
