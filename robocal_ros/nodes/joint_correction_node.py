@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -22,7 +21,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.command_sources import CommandSources
 from robocal_ros.nodes.diagnostics import Health
-from robocal_ros.nodes.joint_correction_health import CorrectionHealth
+from robocal_ros.nodes.joint_correction_report import LOOK_S, CorrectionReport
 from robocal_ros.nodes.joint_correction_settings import (
     SETTINGS,
     arms,
@@ -36,7 +35,7 @@ from robocal_ros.nodes.stream_messages import ArrayMessage, JointMessage
 from robocal_ros.nodes.trajectory_proxy import TrajectoryProxy
 from robocal_ros.sessions.correction import (
     CorrectionSession,
-    CorrectionStatus,
+    Course,
     TrajectoryCommand,
     offered_model,
     offered_tool,
@@ -58,9 +57,6 @@ KINDS = {
     STATES: JointState,
 }
 
-LOOK_S = 0.1  # between two looks at the clock: stale models, blends that go on, what changed
-TELL_S = 1.0  # the status goes out at least so often
-
 
 class JointCorrectionNode(HouseNode):
     """Drives a `CorrectionSession` with live messages."""
@@ -81,17 +77,15 @@ class JointCorrectionNode(HouseNode):
         load_kernels(reference)  # the first command must not wait for it
         serialized_path.load_kernels()
         self._session.enable(self.settings["enable_on_start"])
-        self._messages = messages.CorrectionMessages(
-            nominal, reference, self.settings["reference"], serial, self._shadow
-        )
-        self._judge = CorrectionHealth()
         self._streams = CommandSources(max(config.stream_gap_s, LONGEST_GAP_S))
         self._paths = CommandSources(config.stream_gap_s)
         self._senders = {TARGETS: self._streams, COMMANDS: self._streams, TRAJECTORY: self._paths}
         self._sources = {topic: SourceGuard(self, topic) for topic in KINDS}
-        self._told: tuple[CorrectionStatus, str] | None = None
-        self._commanded, self._told_s = False, 0.0
+        self._commanded = False
         self._open_topics()
+        told = self._session, self.settings, nominal, reference
+        self._report = CorrectionReport(*told, self._offsets, self._statuses, self.now_ns)
+        self._release.append(self._report.close)
 
     def _open_topics(self) -> None:
         self._outputs = {
@@ -210,16 +204,20 @@ class JointCorrectionNode(HouseNode):
     def _on_path(self, message: PathMessage) -> None:
         if message.points:
             self._put_out(TRAJECTORY, message, *self._corrected(message))
+            if self._session.course is not None:
+                self._session.course.begin(time.monotonic())
             self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
         else:
             self._put_out(TRAJECTORY, message, _STOP, _STOP)
             self._stop()
 
-    def _corrected(self, message: PathMessage) -> tuple[TrajectoryCommand, TrajectoryCommand]:
+    def _corrected(
+        self, message: PathMessage, *, is_goal: bool = False
+    ) -> tuple[TrajectoryCommand, TrajectoryCommand]:
         """What is commanded by a message, as it came and corrected."""
-        command = self._session.counted(message.command)
+        command, act = self._session.counted(message.command), self._session.trajectory
         starts_in = (command.stamp_ns - self.now_ns()) * 1e-9 if command.stamp_ns else 0.0
-        return command, self._session.trajectory(command, time.monotonic(), starts_in)
+        return command, act(command, time.monotonic(), starts_in, may_be_rejected=is_goal)
 
     def _put_out(self, topic: str, message: Any, came: Any, command: Any) -> None:
         """Publish a message with another command than came; in shadow mode it has gone out."""
@@ -227,17 +225,18 @@ class JointCorrectionNode(HouseNode):
             same = command is came
             self._outputs[topic].publish(message.unchanged() if same else message.changed(command))
 
-    def _goal(self, trajectory: JointTrajectory) -> JointTrajectory:
-        """A goal's trajectory, corrected; as it came in shadow mode."""
+    def _goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, Course | None]:
+        """A goal's trajectory, corrected, and its course; as it came in shadow mode."""
         message = PathMessage(trajectory)
         try:
-            came, command = self._corrected(message)
+            came, command = self._corrected(message, is_goal=True)
         except RefusedError as fault:
             held_back = fault.reason is Reason.OWN_OUTPUT or not message.is_finite()
             if held_back or not self._shadow:
                 raise
-            return trajectory
-        return trajectory if command is came else message.changed(command)
+            return trajectory, None
+        out = trajectory if command is came else message.changed(command)
+        return out, self._session.course
 
     def _taught(self, names: Any, position: Any, velocity: Any) -> Any:
         return self._session.taught(names, position, velocity, time.monotonic())
@@ -249,9 +248,7 @@ class JointCorrectionNode(HouseNode):
 
     def _tell_offset(self, cause: int, now_s: float) -> None:
         self._commanded = True
-        if self._offsets.get_subscription_count():
-            offset = self._session.offset(now_s)
-            self._offsets.publish(self._messages.offset(offset, cause, self.now_ns()))
+        self._report.offset(cause, now_s)
 
     def _look_at_graph(self) -> None:
         for guard in self._sources.values():
@@ -267,14 +264,8 @@ class JointCorrectionNode(HouseNode):
         self._tell(only_news=True)
 
     def _tell(self, *, only_news: bool = False) -> None:
-        """Publish the status; a figure of the last command alone is no news."""
-        status, now = self._session.status(), time.monotonic()
         sources = "; ".join([*self._faults(), *self._rivals()])
-        told = (replace(status, tcp_shift_m=0.0, largest_shift=0.0, remaining_m=0.0), sources)
-        if only_news and told == self._told and now - self._told_s < TELL_S - 0.5 * LOOK_S:
-            return
-        self._told, self._told_s = told, now
-        self._statuses.publish(self._messages.status(status, sources, self.now_ns()))
+        self._report.status(sources, only_news=only_news)
 
     def _faults(self) -> list[str]:
         return [guard.fault for guard in self._sources.values() if guard.fault]
@@ -289,7 +280,7 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        return self._judge.of(self._session.status(), self._faults(), self._rivals())
+        return self._report.health(self._faults(), self._rivals())
 
 
 _STOP = TrajectoryCommand((), np.empty((0, 0)), np.empty(0))

@@ -12,6 +12,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.storage.robots import load_description, load_robot
 
@@ -88,6 +89,7 @@ SETTINGS = (
         "",
         "Action of the controller that goals of follow_joint_trajectory go to; empty: no action",
     ),
+    STATE_DIR,
     Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
     Setting(
         "thermal_tcp_mm",

@@ -26,6 +26,7 @@ from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.samples import TAUGHT
 from robocal_ros.nodes.deferred_action import DeferredActionServer
 from robocal_ros.nodes.endpoints import EndpointNode
+from robocal_ros.sessions.correction import Course
 
 Array = NDArray[np.float64]
 Result = FollowJointTrajectory.Result
@@ -49,6 +50,7 @@ class _Goal:
     asked_s : since when the controller owes an answer; None when it owes none.
     accepted : the goal at the controller.
     result : what it will answer in the end.
+    course : its corrected trajectory; None without one.
     """
 
     caller: ServerGoalHandle
@@ -56,6 +58,7 @@ class _Goal:
     asked_s: float | None = None
     accepted: ClientGoalHandle | None = None
     result: Future | None = None
+    course: Course | None = None
     cancel: bool = False
     over: bool = False
 
@@ -69,22 +72,21 @@ class TrajectoryProxy:
 
     Parameters
     ----------
-    correct : the corrected trajectory of a taught one; raises `RefusedError`.
+    correct : the corrected trajectory of a taught one, and its course; raises `RefusedError`.
     taught : taught positions and velocities of (names, positions, velocities or None), each (k,).
-    stop : called when the trajectory that was corrected last ends early.
+    stop : called for a goal that is a stop.
     """
 
     def __init__(
         self,
         node: EndpointNode,
         name: str,
-        correct: Callable[[Any], Any],
+        correct: Callable[[Any], tuple[Any, Course | None]],
         taught: Callable[[tuple[str, ...], Array, Array | None], tuple[Array, Array | None]],
         stop: Callable[[], None],
     ) -> None:
         self._node, self._correct, self._taught, self._stop = node, correct, taught, stop
         self._goals: list[_Goal] = []
-        self._last: _Goal | None = None
         self._clients: dict[str, ActionClient] = {}
         self._name = ""  # of the controller's action; empty when closed
         # rclpy remaps the topics and services of an action, but not its name.
@@ -141,6 +143,8 @@ class TrajectoryProxy:
             code = Result.INVALID_JOINTS if about_joints else Result.INVALID_GOAL
             self._fail(goal, str(error), code)
         except Exception as error:
+            if goal.course is not None:  # it never went out
+                goal.course.reject()
             self._node.get_logger().error(traceback.format_exc())
             self._fail(goal, f"a defect of this software, please report it: {error!r}")
 
@@ -159,13 +163,14 @@ class TrajectoryProxy:
                 "killed counts until DDS gives it up"
             )
         else:
-            request.trajectory = self._correct(request.trajectory)
-        goal.asked_s = time.monotonic()
+            request.trajectory, goal.course = self._correct(request.trajectory)
         self._goals.append(goal)
-        self._last = goal
         future = client.send_goal_async(
             request, lambda message: self._feedback(goal, message.feedback), goal.caller.goal_id
         )
+        goal.asked_s = time.monotonic()
+        if goal.course is not None:
+            goal.course.begin(goal.asked_s)
         future.add_done_callback(lambda done: self._answered(goal, done.result()))
 
     def _cancelled(self, caller: ServerGoalHandle) -> CancelResponse:
@@ -187,9 +192,13 @@ class TrajectoryProxy:
     def _answered(self, goal: _Goal, accepted: ClientGoalHandle) -> None:
         goal.asked_s = None
         if not accepted.accepted:
+            if goal.course is not None:
+                goal.course.reject()
             self._fail(goal, f"{self._name} rejected the goal, its log says why")
             return
         goal.accepted = accepted
+        if goal.course is not None:
+            goal.course.accept()
         if goal.cancel or goal.over:
             self._forward_cancel(goal)
         if not goal.over:
@@ -274,8 +283,8 @@ class TrajectoryProxy:
         self._server.end(goal.caller, status, result)
 
     def _stopped(self, goal: _Goal) -> None:
-        if goal is self._last:
-            self._stop()
+        if goal.course is not None:
+            goal.course.end(time.monotonic())
 
 
 def _subtract(desired: Any, actual: Any, error: Any) -> None:

@@ -9,8 +9,10 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from robocal_ros.core.correction_record import CorrectionRecord
 from robocal_ros.core.errors import InputError, StaleError, WrongRobotError
 from robocal_ros.core.proposals import THERMAL, Action, Candidate, Decision, Head, Proposal
+from robocal_ros.storage.correction_records import insert_correction
 from robocal_ros.storage.history_reader import HistoryReader
 from robocal_ros.storage.history_records import (
     insert_decision,
@@ -133,6 +135,11 @@ class CalibrationHistory(HistoryReader):
                     raise InputError(f"calibration {to} is of kind {candidate.kind}, not {kind}")
             target = self._ledger.rollback_target(kind, to)
             return self._decide(Action.ROLLBACK, kind, target, by, reason, wall_ns)
+
+    def note_correction(self, record: CorrectionRecord) -> None:
+        """Add what the robot's commands are corrected with from now on."""
+        with self._changing() as connection:
+            insert_correction(connection, record)
 
     def _decide(
         self, action: Action, kind: str, target: int | None, by: str, reason: str, wall_ns: int

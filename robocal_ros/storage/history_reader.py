@@ -8,8 +8,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from robocal_ros.core.correction_record import CorrectionRecord
 from robocal_ros.core.errors import InputError, WrongRobotError
 from robocal_ros.core.proposals import THERMAL, Candidate, Decision, Entry, Head, State
+from robocal_ros.storage.correction_records import read_corrections
 from robocal_ros.storage.history_file import (
     HistoryFile,
     open_file,
@@ -179,6 +181,11 @@ class HistoryReader:
         """Decisions of every kind after a sequence number, oldest first."""
         with self._reading() as connection:
             return tuple(read_decisions(connection, after_seq))
+
+    def corrections(self, limit: int = 50) -> tuple[CorrectionRecord, ...]:
+        """What the robot's commands were corrected with, newest first."""
+        with self._reading() as connection:
+            return tuple(read_corrections(connection, limit))
 
     def document(self, calibration_id: int) -> dict[str, Any]:
         """JSON document of the identification. Raises `InputError` for an unknown id."""

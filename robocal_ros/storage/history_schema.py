@@ -1,18 +1,21 @@
 """The schema of the history file: ordered scripts, so that any older file can be brought up.
 
-Calibrations, their payloads and the decisions about them are only ever added to; triggers refuse
-changes by any program.
+Calibrations, their payloads, the decisions about them and what commands were corrected with are
+only ever added to; triggers refuse changes by any program.
 """
 
 APPLICATION_ID = 0x52434C48
 """Marks the file as ours ("RCLH"), so that no other program's database is ever migrated."""
 
-_APPEND_ONLY = tuple(
-    f"CREATE TRIGGER {table}_{verb.lower()} BEFORE {verb} ON {table} "
-    f"BEGIN SELECT RAISE(ABORT, '{table} are never changed'); END"
-    for table in ("calibrations", "payloads", "decisions")
-    for verb in ("UPDATE", "DELETE")
-)
+
+def _append_only(*tables: str) -> tuple[str, ...]:
+    return tuple(
+        f"CREATE TRIGGER {table}_{verb.lower()} BEFORE {verb} ON {table} "
+        f"BEGIN SELECT RAISE(ABORT, '{table} are never changed'); END"
+        for table in tables
+        for verb in ("UPDATE", "DELETE")
+    )
+
 
 MIGRATIONS: tuple[tuple[str, ...], ...] = (
     (
@@ -54,7 +57,24 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         # The last line of defence for compare-and-set: no revision can be given twice.
         "CREATE UNIQUE INDEX one_revision ON decisions (kind, head_after) WHERE action <> 'reject'",
         "CREATE UNIQUE INDEX one_decision ON decisions (calibration_id) WHERE action <> 'rollback'",
-        *_APPEND_ONLY,
+        *_append_only("calibrations", "payloads", "decisions"),
+    ),
+    (
+        """CREATE TABLE corrections (
+            seq INTEGER PRIMARY KEY AUTOINCREMENT,
+            wall_ns INTEGER NOT NULL,
+            software TEXT NOT NULL,
+            model_hash TEXT NOT NULL,
+            enabled INTEGER NOT NULL CHECK (enabled IN (0, 1)),
+            shadow INTEGER NOT NULL CHECK (shadow IN (0, 1)),
+            model_revision INTEGER NOT NULL CHECK (model_revision >= 0),
+            tool_revision INTEGER NOT NULL CHECK (tool_revision >= 0),
+            reference TEXT NOT NULL CHECK (reference IN ('nominal', 'calibrated')),
+            reference_source TEXT NOT NULL,
+            reference_name TEXT NOT NULL,
+            reference_hash TEXT NOT NULL,
+            taught_tool TEXT NOT NULL)""",
+        *_append_only("corrections"),
     ),
 )
 """Script ``n`` brings schema version ``n`` to ``n + 1``; shipped ones are never edited."""

@@ -166,7 +166,9 @@ class Graph:
         """Let the graph work for a time, to show that something does not happen."""
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
-            self.executor.spin_once(timeout_sec=left)
+            # The same time-out again and again: with another one rclpy begins anew, with tasks
+            # that wait, and comes to nothing else.
+            self.executor.spin_once(timeout_sec=min(left, 0.05))
 
     def call(self, kind: type, name: str, within_s: float = DEADLINE_S, **fields: Any) -> Any:
         """Call a service, waiting for it to appear, and return its response."""

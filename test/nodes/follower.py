@@ -48,6 +48,7 @@ class Follower(Node):
     goals : as they were received, rejected ones too.
     feedback : what it sent.
     stuck : the robot does not move.
+    rejects : all goals.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -55,7 +56,7 @@ class Follower(Node):
         self.q, self.hold = HOME.copy(), HOME.copy()
         self.goals: list[Any] = []
         self.feedback: list[Any] = []
-        self.stuck = False
+        self.stuck = self.rejects = False
         self.path: Path | None = None
         self._states = self.create_publisher(JointState, "joint_states", 10)
         self._server = ActionServer(
@@ -76,7 +77,7 @@ class Follower(Node):
     def _asked(self, request: Any) -> GoalResponse:
         self.goals.append(request)
         good = request.trajectory.points and set(request.trajectory.joint_names) == set(NAMES)
-        return GoalResponse.ACCEPT if good else GoalResponse.REJECT
+        return GoalResponse.ACCEPT if good and not self.rejects else GoalResponse.REJECT
 
     async def _execute(self, goal: Any) -> Any:
         if self.path is not None:

@@ -13,24 +13,20 @@ from builtin_interfaces.msg import Duration
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTolerance
 from follower import ACTION, HOME, NAMES, Follower
+from joint_correction_live import NODE, NOMINAL, drifted, model_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from robocal_msgs.msg import KinematicModel
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.nodes import conversions, qos, trajectory_proxy
+from robocal_ros.nodes import qos, trajectory_proxy
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
-from robocal_ros.storage.robots import load_robot
 
-NOMINAL = load_robot("kr150_r3100")
-NODE = "/joint_correction_node"
 OWN = f"{NODE}/follow_joint_trajectory"
 Result = FollowJointTrajectory.Result
 MOVED = HOME + np.array([0.2, 0.1, -0.1, 0.2, -0.1, 0.3])
@@ -42,15 +38,6 @@ SETTINGS = {
     "blend_deg_s": 5.0,
     "joint_state_age_s": 5.0,
 }
-
-
-def drifted() -> SerialArm:
-    rng = np.random.default_rng(0)
-    chosen = NOMINAL.parameters
-    size = np.where(chosen.is_length, 1e-4, 5e-5)
-    return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * rng.standard_normal(len(chosen))))
-
-
 ACTUAL = drifted()
 
 
@@ -112,11 +99,7 @@ class Cell:
     def begin(self, settled: bool = True) -> None:
         self.graph.spin_until(self.client.server_is_ready, "the action")
         publisher = self.graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
-        fields = {"serial": "s1", "model_hash": NOMINAL.model_hash, "revision": 1}
-        stamp = Header(frame_id="base")
-        state = KinematicModel.ACCEPTED
-        document = model_document(ACTUAL)
-        publisher.publish(conversions.kinematic_model(document, stamp=stamp, state=state, **fields))
+        publisher.publish(model_message(ACTUAL))
         self.graph.spin_until(lambda: len(self.states) > 5, "joint states")
         if settled:
             self.send(HOME, HOME).ends(GoalStatus.STATUS_SUCCEEDED)
@@ -222,6 +205,38 @@ def test_a_blend_ends_where_its_goal_was_cancelled(cell: Any) -> None:
     whole = np.abs(np.array(cell.robot.goals[-1].trajectory.points[-1].positions) - HOME).max()
     # Both stop within half a second on a busy machine; a blend that went on were 0.8 s away.
     assert np.abs(cell.taught() - HOME).max() < 0.5 / 4.0 * whole
+
+
+def test_a_rejected_goal_leaves_the_blend_of_the_one_that_runs(cell: Any) -> None:
+    cell.begin(settled=False)
+    first = cell.send(HOME, HOME, lasts_s=4.0)
+    cell.graph.spin_until(lambda: np.abs(cell.robot.q - HOME).max() > 1e-5, "the blend")
+    cell.robot.rejects = True
+    cell.send(HOME, HOME, lasts_s=4.0).ends(GoalStatus.STATUS_ABORTED, AT_ONCE_S)
+    cell.graph.spin_for(1.5)
+    assert first.answer is None
+    whole = np.abs(np.array(cell.robot.goals[0].trajectory.points[-1].positions) - HOME).max()
+    assert np.abs(cell.robot.q - HOME).max() > 1.0 / 4.0 * whole  # it went on
+    # Half a second of it for a busy machine; a believed blend that stays were 1.5 s behind.
+    assert np.abs(cell.taught() - HOME).max() < 0.5 / 4.0 * whole
+    first.ends(GoalStatus.STATUS_SUCCEEDED)
+
+
+def test_a_goal_that_ends_stops_no_trajectory_of_the_topic(cell: Any) -> None:
+    cell.begin(settled=False)
+    paths = cell.graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
+    planner = cell.graph.publisher(JointTrajectory, "joint_trajectory")
+    output = cell.node._outputs["joint_trajectory"]
+    cell.graph.spin_until(output.get_subscription_count, "the output")
+    sent = cell.send(HOME, HOME, lasts_s=100.0).moves()
+    planner.publish(goal_of(HOME, HOME, lasts_s=4.0).trajectory)
+    cell.graph.spin_until(lambda: paths, "the trajectory of the topic")
+    sent.handle.cancel_goal_async()
+    sent.ends(GoalStatus.STATUS_CANCELED)
+    whole = np.abs(np.array(paths[-1].points[-1].positions) - HOME).max()
+    before = cell.taught()  # of a robot that stands: what is believed is commanded goes on
+    cell.graph.spin_for(1.5)
+    assert np.abs(cell.taught() - before).max() > 1.0 / 4.0 * whole
 
 
 def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:

@@ -1,10 +1,12 @@
 """Streams of the joint correction: their period, their pauses; models that grow old."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from correction_robot import DT, HOME, RATE, ROUNDING, Robot, drifted, offer, refused
 
-from robocal_ros.sessions.correction import Reason
+from robocal_ros.sessions.correction import JointCommand, Reason
 
 SECOND = 1_000_000_000
 
@@ -103,3 +105,29 @@ def test_without_a_limit_no_model_is_stale() -> None:
     robot.session.offer_model(offer(drifted(), stamp_ns=1))
     robot.session.look(robot.now, 10**18)
     assert not robot.session.status().stale
+
+
+def test_a_driver_whose_clock_is_ahead_starves_no_other() -> None:
+    """A gripper's clock is half a second ahead of the arm's; each is held to its own order."""
+    robot, finger = Robot(), JointCommand(("finger",), np.zeros(1))
+    session, at = robot.session, SECOND
+    for _ in range(20):
+        robot.now, at = robot.now + DT, at + 2_000_000
+        session.reading(replace(finger, stamp_ns=at + SECOND // 2), robot.now)
+        robot.read(HOME, stamp_ns=at)
+    assert session.status().refused == {}
+    refused(Reason.TIME_BACKWARDS, robot.read, HOME, stamp_ns=at - 1)
+    early = replace(finger, stamp_ns=at)
+    refused(Reason.TIME_BACKWARDS, session.reading, early, robot.now)
+
+
+def test_any_number_of_drivers_takes_no_more_room() -> None:
+    robot = Robot()
+    for i in range(5000):
+        robot.now += DT
+        robot.session.reading(
+            JointCommand((f"finger_{i}",), np.zeros(1), stamp_ns=SECOND), robot.now
+        )
+        robot.read(HOME, stamp_ns=SECOND + i)
+    assert len(robot.session._guard._stamps) <= 100
+    refused(Reason.TIME_BACKWARDS, robot.read, HOME, stamp_ns=SECOND)

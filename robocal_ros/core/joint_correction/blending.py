@@ -50,6 +50,11 @@ class Commanded:
             return latest.start
         return latest.end if s >= 1.0 else blend_models(latest.start, latest.end, s)
 
+    def stopped(self, now_s: float) -> "Commanded":
+        """The model of an instant, from then on."""
+        model = self.at(now_s)
+        return Commanded(model, model)
+
     def latest(self, now_s: float) -> "Commanded":
         """What is in the commands at an instant: this, or what was ``before``."""
         if self.before is not None and now_s < self.begin_s:

@@ -25,7 +25,9 @@ Array = NDArray[np.float64]
 
 # The inverse near a singularity is refined until it is exact to this (rad, m), or so often.
 EXACT, ROUNDING = 1e-13, 1e-9
-MOST_REFINEMENTS = 30
+MOST_REFINEMENTS, MOST_NEWTON_STEPS = 30, 12
+DIFFERENCE, LONGEST_STEP = 1e-6, 0.1
+SHORTER = 0.5 ** np.arange(8)
 
 
 @dataclass(frozen=True)
@@ -94,21 +96,28 @@ class StagedCorrection:
         """Taught joints (m, n) of corrected ones: the inverse of `correct`.
 
         Exact where the whole correction is made; near a singularity, or with a free axis, refined
-        until it is, or until it is as near as it gets.
+        until it is, or until it is as near as it gets: always a number, and never further off
+        than twice the bounds of both shifts together.
         """
         answer, best = corrected.copy(), np.full(len(corrected), np.inf)
+        part = np.zeros(len(corrected), dtype=np.bool_)
         rows, aim = np.arange(len(corrected)), corrected
         for _ in range(MOST_REFINEMENTS):
             q = self._exchanged(aim, s[rows])
-            miss = corrected[rows] - self.correct(q, s[rows]).q
+            made = self.correct(q, s[rows])
+            miss = corrected[rows] - made.q
             size = np.max(np.abs(miss), axis=1)
             better = size < best[rows]
             answer[rows[better]], best[rows[better]] = q[better], size[better]
-            # one that no longer gets nearer is at the rounding floor
-            more = (size >= EXACT) & (better | (size >= ROUNDING))
+            if made.tool is not None:
+                part[rows[better]] = made.tool.share[better] < 1.0
+            more = better & (size >= EXACT)  # one that no longer gets nearer needs other steps
             if not np.any(more):
                 break
             aim, rows = aim[more] + miss[more], rows[more]
+        for i in np.flatnonzero((best >= ROUNDING) | part):
+            exact = bool(best[i] < ROUNDING)
+            answer[i] = self._searched(answer[i], corrected[i], s[i : i + 1], exact=exact)
         return answer
 
     def _exchanged(self, q: Array, s: Array) -> Array:
@@ -116,6 +125,61 @@ class StagedCorrection:
         if self._tool is not None:
             q = self._tool.inverse().correct(q, s).q
         return self._arm.inverse().correct(q, s).q
+
+    def _searched(self, near: Array, corrected: Array, s: Array, *, exact: bool) -> Array:
+        """Taught joints (n,) from other starts; ``near`` them, where no other serves.
+
+        A tool's change is made in full or not at all, so that joints for which it would be made
+        in part are taken only when there are no others; ``exact``: ``near`` is at least such.
+        """
+        full = self._in_full(corrected, s)
+        if self._serves(full, corrected, s):
+            return full
+        for start in () if exact else (near, full):
+            found = self._by_newton(start, corrected, s)
+            if self._serves(found, corrected, s):
+                return found
+        return near
+
+    def _serves(self, q: Array, corrected: Array, s: Array) -> bool:
+        made = self.correct(q[None], s)
+        whole = made.tool is None or made.tool.share[0] == 1.0
+        return bool(whole and np.max(np.abs(made.q[0] - corrected)) < ROUNDING)
+
+    def _in_full(self, corrected: Array, s: Array) -> Array:
+        """Taught joints (n,) as if no shift were bounded."""
+        q = corrected[None]
+        for stage in (self._tool, self._arm):
+            if stage is not None:
+                models = stage.models[[2, 3, 0, 1]]
+                q = JointCorrection(models, free_axis=stage.free_axis).correct(q, s).q
+        return np.asarray(q[0])
+
+    def _by_newton(self, q: Array, corrected: Array, s: Array) -> Array:
+        """Taught joints (n,) by Newton's steps from ``q`` (n,), as near as they get.
+
+        The derivative is taken by differences. `correct` turns fast near a singularity.
+        """
+
+        def miss(points: Array) -> Array:
+            return corrected - self.correct(points, np.repeat(s, len(points))).q
+
+        left, nudges = miss(q[None])[0], DIFFERENCE * np.vstack([np.eye(self.n), -np.eye(self.n)])
+        for _ in range(MOST_NEWTON_STEPS):
+            if np.max(np.abs(left)) < EXACT:
+                break
+            there = miss(q + nudges)
+            slopes = (there[self.n :] - there[: self.n]).T / (2.0 * DIFFERENCE)
+            step = np.linalg.lstsq(slopes, left, rcond=None)[0]
+            step *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(step))), EXACT))
+            tries = q + step * SHORTER[:, None]  # the longest of these that comes nearer
+            missed = miss(tries)
+            nearer = np.max(np.abs(missed), axis=1) < np.max(np.abs(left))
+            if not np.any(nearer):
+                break
+            longest = int(np.argmax(nearer))
+            q, left = tries[longest], missed[longest]
+        return q
 
     def rates(
         self,

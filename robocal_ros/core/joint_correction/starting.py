@@ -67,6 +67,7 @@ class Sent:
     begin_s : start on the session's clock.
     times_s : (m,) from the start.
     taught, corrected : (m, k) what came in and what went out.
+    led_from : (k,) where the controller was at ``put_s``, when it was put out, and leads in from.
     before : what was put out before, of the same joints; how the robot may still lag.
     stopped_s : when a stop ended it.
     """
@@ -76,6 +77,8 @@ class Sent:
     times_s: Array
     taught: Array
     corrected: Array
+    led_from: Array | None = None
+    put_s: float = 0.0
     before: "Sent | None" = None
     stopped_s: float = np.inf
 
@@ -106,6 +109,15 @@ class Sent:
         ]
         known = [pair for pair in found if pair is not None]
         return np.stack(known, axis=1) if known else None
+
+    def place(self, now_s: float) -> Array:
+        """Corrected joints (k,) that the controller has come to, on straight ways."""
+        then, there_s = min(now_s, self.stopped_s), self.begin_s + self.times_s[0]
+        if then < there_s and self.led_from is not None:
+            share = (then - self.put_s) / (there_s - self.put_s)
+            return np.asarray(self.led_from + share * (self.corrected[0] - self.led_from))
+        columns, t = self.corrected.T, then - self.begin_s
+        return np.array([np.interp(t, self.times_s, column) for column in columns])
 
     def _at(self, now_s: float) -> Array | None:
         sent = self

@@ -9,12 +9,14 @@ incoming    joints by name, order in time, own output that comes back
 offers      which models are taken over
 tools       which tools are taken over, and when
 starts      where a command may begin
+courses     what becomes of a trajectory that was put out
 proposals   what could be put out, on the way to a model
 corrector   which model corrects at every instant
 """
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
+from robocal_ros.sessions.correction.courses import Course
 from robocal_ros.sessions.correction.incoming import require_finite
 from robocal_ros.sessions.correction.inputs import (
     JointCommand,
@@ -34,6 +36,7 @@ __all__ = [
     "CorrectionConfig",
     "CorrectionSession",
     "CorrectionStatus",
+    "Course",
     "JointCommand",
     "OfferedModel",
     "OfferedTool",

@@ -13,6 +13,7 @@ from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.starting import INSTANTS, RESPONSE_S, Sent
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.sessions.correction.corrector import Corrector
+from robocal_ros.sessions.correction.courses import Courses
 from robocal_ros.sessions.correction.incoming import (
     TARGET,
     TRAJECTORY,
@@ -30,6 +31,9 @@ Index = NDArray[np.int64]
 Command = TypeVar("Command", JointCommand, TrajectoryCommand)
 
 _AT_ONCE = np.zeros(1)
+# A point of a trajectory is corrected and forwarded within this: one that has a time to begin at
+# is entered so much later, and must not have begun to blend by then.
+FORWARDED_S = 1e-4
 
 
 class Commands:
@@ -39,6 +43,7 @@ class Commands:
     ----------
     goal : (n,) taught joints that were commanded last, NaN before the first.
     offset : (n,) what was added to the target corrected last; in shadow mode what would have been.
+    courses : which trajectory was put out last.
     """
 
     def __init__(
@@ -52,6 +57,7 @@ class Commands:
         self._config, self._joints, self._guard = config, joints, guard
         self._corrector, self._starts = corrector, starts
         self._stream = StreamPeriod(config.stream_gap_s)
+        self.courses = Courses(corrector, starts)
         self._out = np.full(joints.count, np.nan)  # of the last target
         self._out_s = -np.inf
         self.goal = np.full(joints.count, np.nan)
@@ -64,13 +70,12 @@ class Commands:
     def stop(self, now_s: float) -> None:
         """What is under way ends, also by a clock that went back."""
         now_s = self._guard.not_before(now_s)
-        self._corrector.stop(now_s)
-        self._starts.stop(now_s)
+        self.courses.stop(now_s)
         self._stream.end()
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream; the blend advances with ``now_s``."""
-        self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s)
+        self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s, command.names)
         self._guard.require_not_own(TARGET, command.names, command.position)
         q, index = self._joints.complete(command.names, command.position[None], now_s)
         speeds = None if command.velocity is None else command.velocity[None]
@@ -85,13 +90,14 @@ class Commands:
         )
         self._stream.note(now_s)
         self.goal = q[0]
-        self._guard.accept_order(TARGET, command.stamp_ns, now_s)
+        self._guard.accept_order(TARGET, command.stamp_ns, now_s, command.names)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
         self._out[:] = np.nan
         self._out[index], self._out_s = out, now_s
         sent = Sent(index, now_s, _AT_ONCE, command.position[None], out[None])
         self._starts.note_sent(sent, now_s)
+        self.courses.current = None
         return corrected
 
     def _correct_target(
@@ -138,7 +144,11 @@ class Commands:
         return command
 
     def trajectory(
-        self, command: TrajectoryCommand, now_s: float, starts_in_s: float
+        self,
+        command: TrajectoryCommand,
+        now_s: float,
+        starts_in_s: float,
+        may_be_rejected: bool = False,
     ) -> TrajectoryCommand:
         """Correct a whole trajectory of at least one point."""
         require_few(len(command))
@@ -153,14 +163,20 @@ class Commands:
         require_finite(command.names, command.acceleration)
         dt_s = np.append(np.inf, np.diff(times))
         motion = self._motion(q, index, dt_s, command.velocity, command.acceleration)
+        places = self._starts.leads_from(self._joints.where(now_s), index, now_s)
+        motion = self._starts.led_in(motion, places, times[0] + starts_in_s, now_s)
+        left = self.courses.left()
         corrected = self._or_as_it_came(
             command, lambda: self._correct_path(command, motion, index, now_s, starts_in_s)
         )
         self._guard.accept_order(TRAJECTORY, 0, now_s)
         out = corrected.position
         self._guard.note_output(TRAJECTORY, command.names, command.position, out)
-        begin = now_s + starts_in_s
-        self._starts.note_sent(Sent(index, begin, times, command.position, out), now_s)
+        begin, led_from = now_s + starts_in_s, places[1, index]
+        sent = Sent(index, begin, times, command.position, out, led_from, now_s)
+        self._starts.note_sent(sent, now_s)
+        at_once = starts_in_s == 0.0
+        self.courses.take(left, at_once=at_once, may_be_rejected=may_be_rejected)
         self._stream.end()
         self._out[:] = np.nan
         self.goal = q[-1]
@@ -180,7 +196,8 @@ class Commands:
         if self._corrector.passing(now_s):
             self._corrector.pass_on(motion, now_s)
             return command
-        done = self._corrector.path(motion, times, now_s, starts_in_s)
+        rests_s = 0.0 if starts_in_s == 0.0 else FORWARDED_S * len(times)
+        done = self._corrector.path(motion, times, now_s, starts_in_s, rests_s)
         return replace(
             command,
             position=done.result.q[:, index],

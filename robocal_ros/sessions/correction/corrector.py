@@ -84,8 +84,7 @@ class Corrector:
 
     def stop(self, now_s: float) -> None:
         """Stay with the model of this instant: the trajectory under way ends."""
-        model = self._commanded.at(now_s)
-        self._commanded = Commanded(model, model)
+        self._commanded = self._commanded.stopped(now_s)
 
     # ---- what is commanded ----------------------------------------------------------------------
 
@@ -101,6 +100,19 @@ class Corrector:
         """What comes next goes on from a model: the robot shows that one."""
         if model is not self._commanded.at(now_s):
             self._commanded = Commanded(model, model)
+
+    @property
+    def under_way(self) -> Commanded:
+        """The model in the commands, as a function of time."""
+        return self._commanded
+
+    def go_back(self, commanded: Commanded) -> None:
+        """What was ``under_way`` once goes on."""
+        self._commanded = commanded
+
+    def begin(self, now_s: float) -> None:
+        """The trajectory that was corrected last begins now."""
+        self._commanded = replace(self._commanded, begin_s=now_s)
 
     def shifted(self, q: Array, model: Array) -> Array:
         """Joints (m, n), corrected with a packed model."""
@@ -144,12 +156,14 @@ class Corrector:
 
         return self._take(motion, step)
 
-    def path(self, motion: Motion, times_s: Array, now_s: float, starts_in_s: float) -> Proposal:
-        """Correct a trajectory, from what is commanded when it begins."""
+    def path(
+        self, motion: Motion, times_s: Array, now_s: float, starts_in_s: float, rests_s: float
+    ) -> Proposal:
+        """Correct a trajectory, from what is commanded when it begins; it blends after a rest."""
 
         def towards(goal: Array) -> Proposal:
             proposal = self._proposer.path(
-                motion, self._commanded, goal, times_s, now_s, starts_in_s
+                motion, self._commanded, goal, times_s, now_s, starts_in_s, rests_s
             )
             self._require(motion, proposal, goal)
             return proposal
@@ -199,7 +213,7 @@ class Corrector:
         limits = self._config.velocity_limits
         if limits is None:
             return
-        before = np.concatenate([motion.before[None], q[:-1]])
+        before = np.concatenate([motion.begin(q[0])[None], q[:-1]])
         mean = (q - before) / motion.dt_s[:, None]
         require_speeds(np.where(np.isfinite(mean), mean, 0.0), limits, self._arm)
         if velocity is not None:

@@ -30,6 +30,7 @@ OF_SHIFT = 0.25
 SHIFTED = 1e-9
 ECHOES = 64  # a loop brings one of so many outputs back
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
+MOST_STAMPS = 64  # of so many drivers, or planners, the order in time is watched
 TRACK_S = 0.01  # between the places that tell how far the robot moved
 
 
@@ -175,7 +176,7 @@ class CorrectionGuard:
 
     def __init__(self) -> None:
         self._clock_s = -np.inf
-        self._stamps: dict[str, int] = {}
+        self._stamps: dict[tuple[str, tuple[str, ...]], int] = {}  # by kind and joints
         self._echoes = {TARGET: Echoes(ECHOES), TRAJECTORY: Echoes(1)}
         self.refused: Counter[Reason] = Counter()
         self.last_refusal = ""
@@ -189,13 +190,18 @@ class CorrectionGuard:
             self.last_refusal = str(error)
             raise
 
-    def require_order(self, kind: str, stamp: int, mark: str, now_s: float) -> None:
-        """Refuse what carries a mark of a correction, or is older than the one before."""
+    def require_order(
+        self, kind: str, stamp: int, mark: str, now_s: float, names: tuple[str, ...] = ()
+    ) -> None:
+        """Refuse what carries a mark of a correction, or is older than the one before.
+
+        That is the one of the same joints: drivers of others have clocks of their own.
+        """
         if mark == CORRECTED or (mark == TAUGHT and kind == READING):
             raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
         if not now_s >= self._clock_s:
             raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {self._clock_s}")
-        last = self._stamps.get(kind, 0)
+        last = self._stamps.get((kind, names), 0)
         reset = last - stamp > CLOCK_RESET_NS
         if stamp and stamp < last and not reset:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
@@ -205,11 +211,16 @@ class CorrectionGuard:
         """The clock's time, or the last one where it went back."""
         return now_s if now_s >= self._clock_s else self._clock_s
 
-    def accept_order(self, kind: str, stamp: int, now_s: float) -> None:
+    def accept_order(
+        self, kind: str, stamp: int, now_s: float, names: tuple[str, ...] = ()
+    ) -> None:
         """Remember the time of what was acted on."""
         self._clock_s = now_s
         if stamp:
-            self._stamps[kind] = stamp
+            self._stamps.pop((kind, names), None)  # so that the oldest is the first to go
+            self._stamps[kind, names] = stamp
+            if len(self._stamps) > MOST_STAMPS:
+                del self._stamps[next(iter(self._stamps))]
 
     def forget_stamps(self) -> None:
         """Start afresh with any source stamp."""

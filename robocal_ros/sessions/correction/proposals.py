@@ -35,8 +35,10 @@ class Motion:
     whole : whether all joints are commanded; the blend waits while they are not: it would move
         joints that are not in the commands, and the next whole command would make up for it in
         one step.
-    before : (n,) what was put out before, NaN where nothing was.
+    before : (n,) what was put out before, or where a trajectory leads in from; NaN where that is
+        not known.
     dt_s : (m,) time from there to each point, from the one before.
+    room : (n,) it may begin as far from ``before``; None: there.
     """
 
     q: Array
@@ -45,6 +47,13 @@ class Motion:
     whole: bool
     before: Array
     dt_s: Array
+    room: Array | None = None
+
+    def begin(self, first: Array) -> Array:
+        """Where it may begin (n,), nearest to its first joints (n,); NaN as in ``before``."""
+        if self.room is None:
+            return self.before
+        return np.clip(first, self.before - self.room, self.before + self.room)
 
 
 @dataclass(frozen=True)
@@ -103,8 +112,12 @@ class Proposer:
         times_s: Array,
         now_s: float,
         starts_in_s: float,
+        rests_s: float,
     ) -> Proposal:
-        """A trajectory, from what is commanded when it begins; the blend runs along its time."""
+        """A trajectory, from what is commanded when it begins; the blend runs along its time.
+
+        It rests for ``rests_s`` from now on.
+        """
         model = commanded.at(now_s + max(0.0, starts_in_s))
         stage, q, waits = self.stage(model, goal), motion.q, ""
         s = np.ones(len(q))
@@ -112,8 +125,8 @@ class Proposer:
             s = np.zeros(len(q))
             waits = "" if motion.whole else PARTIAL
             if motion.whole:
-                s = blend_along(stage, q, times_s, -starts_in_s, self._rates)
-        first = max(0.0, -starts_in_s)
+                s = blend_along(stage, q, times_s, rests_s - starts_in_s, self._rates)
+        first = max(0.0, rests_s - starts_in_s)
         # until then: what is under way; a trajectory that still waits for its start is replaced
         before = replace(commanded.latest(now_s), before=None) if starts_in_s > 0.0 else None
         then = Commanded(

@@ -25,9 +25,9 @@ class Readings:
 
     def take(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
         """Remember readings that are ``age_s`` old, and un-correct them."""
-        self._guard.require_order(READING, state.stamp_ns, state.mark, now_s)
+        self._guard.require_order(READING, state.stamp_ns, state.mark, now_s, state.names)
         index, place = self._joints.read(state, now_s, age_s)
-        self._guard.accept_order(READING, state.stamp_ns, now_s)
+        self._guard.accept_order(READING, state.stamp_ns, now_s, state.names)
         taught, position, velocity = self._un_corrected(state, index, place, now_s)
         self._joints.taught = taught
         return replace(state, position=position, velocity=velocity, mark=TAUGHT)
@@ -35,15 +35,7 @@ class Readings:
     def taught(
         self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float
     ) -> tuple[Array, Array | None]:
-        """Un-correct joints (k,) of the arm as `take` does, and remember nothing.
-
-        Joints that are left out are where they were read last.
-
-        Raises
-        ------
-        RefusedError
-            When a value is not finite, a joint is named twice, or numbers differ.
-        """
+        """Un-correct joints as `take` does, remembering nothing; see `CorrectionSession.taught`."""
         state = JointCommand(names, position, velocity)
         index, place = self._joints.find(state)
         return self._un_corrected(state, index, place, now_s)[1:]

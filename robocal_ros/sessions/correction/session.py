@@ -17,6 +17,7 @@ from robocal_ros.core.joint_correction.refusals import RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.commands import Commands
 from robocal_ros.sessions.correction.corrector import Corrector
+from robocal_ros.sessions.correction.courses import Course
 from robocal_ros.sessions.correction.incoming import CorrectionGuard, JointBook
 from robocal_ros.sessions.correction.inputs import (
     JointCommand,
@@ -133,20 +134,32 @@ class CorrectionSession:
         """
         return self._guard.counted(lambda: self._commands.target(command, now_s))
 
+    @property
+    def course(self) -> Course | None:
+        """The trajectory that was put out last, to tell what becomes of it; None after others."""
+        return self._commands.courses.current
+
     def trajectory(
-        self, command: TrajectoryCommand, now_s: float, starts_in_s: float = 0.0
+        self,
+        command: TrajectoryCommand,
+        now_s: float,
+        starts_in_s: float = 0.0,
+        *,
+        may_be_rejected: bool = False,
     ) -> TrajectoryCommand:
         """Correct a whole trajectory; the blend advances along its time from start.
 
         ``starts_in_s``: when it begins, counted from now (its header's stamp); negative for one
-        that is under way. A trajectory without points is a stop: it passes as it came.
+        that is under way, 0 for one that begins as it is forwarded: see `Course.begin`. With
+        ``may_be_rejected`` the `course` says what became of it. A trajectory without points is a
+        stop: it passes as it came.
         """
         if len(command) == 0:
             self._commands.stop(now_s)
             return command
         return self._guard.counted(
             lambda: self._with_waiting_tool(
-                lambda: self._commands.trajectory(command, now_s, starts_in_s)
+                lambda: self._commands.trajectory(command, now_s, starts_in_s, may_be_rejected)
             )
         )
 

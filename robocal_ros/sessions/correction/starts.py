@@ -1,10 +1,11 @@
 """Where a command may begin: the robot is compared with what was put out last."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction.blending import SPLINE_PEAK
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.starting import (
@@ -17,9 +18,26 @@ from robocal_ros.core.joint_correction.starting import (
 )
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.corrector import Corrector
+from robocal_ros.sessions.correction.proposals import Motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What was put out last; see `Starts`."""
+
+    sent: Sent | None
+    started: bool
+    bare: bool
+
+    def stopped(self, now_s: float) -> "Beginning":
+        """The same, ended at an instant."""
+        sent = self.sent
+        if sent is None or sent.stopped_s <= now_s:
+            return self
+        return replace(self, sent=replace(sent, stopped_s=now_s))
 
 
 class Starts:
@@ -44,8 +62,21 @@ class Starts:
 
     def stop(self, now_s: float) -> None:
         """What was put out last ends."""
-        if self._sent is not None and self._sent.stopped_s > now_s:
-            self._sent = replace(self._sent, stopped_s=now_s)
+        self._sent = self.beginning.stopped(now_s).sent
+
+    @property
+    def beginning(self) -> Beginning:
+        """What was put out last."""
+        return Beginning(self._sent, self.started, self._bare)
+
+    def go_back(self, beginning: Beginning) -> None:
+        """What was put out last was rejected: what was before goes on."""
+        self._sent, self.started, self._bare = beginning.sent, beginning.started, beginning.bare
+
+    def begin(self, now_s: float) -> None:
+        """The trajectory that was put out last begins now."""
+        if self._sent is not None:
+            self._sent = replace(self._sent, begin_s=now_s)
 
     def restart(self) -> None:
         """After a mismatch: the next command may begin where the robot stands."""
@@ -105,11 +136,8 @@ class Starts:
         The correction goes on from the one that the robot shows; where that cannot be told, it
         must be small enough to be made within that time.
         """
-        where.require_known(index)
-        commanded, shows = self._corrector.model(now_s), Follows.UNKNOWN
-        near = self._config.start_near(self._arm)
-        if self._sent is not None:
-            shows = follows(self._sent, where, near, now_s)
+        where.require_fresh(index)
+        commanded, shows = self._corrector.model(now_s), self._shows(where, now_s)
         if shows is Follows.UNKNOWN:
             made = lead_s * self._config.blend_rates(self._arm)[index]
             for model in (commanded, self._corrector.known):
@@ -121,6 +149,36 @@ class Starts:
                     raise self._refuse_start(f"the robot is not where it was sent, and {detail}")
         if shows is Follows.NONE:
             self._corrector.go_on_from(self._corrector.reference, now_s)
+
+    def _shows(self, where: Whereabouts, now_s: float) -> Follows:
+        if self._sent is None:
+            return Follows.UNKNOWN
+        return follows(self._sent, where, self._config.start_near(self._arm), now_s)
+
+    def leads_from(self, where: Whereabouts, index: Index, now_s: float) -> Array:
+        """Where joints ``index`` lead in from (2, n): where the robot is, and its controller.
+
+        These differ while the robot follows what was put out: it lags. NaN where it was not read
+        lately, and for the other joints.
+        """
+        places = np.full((2, self._arm.n), np.nan)
+        places[:, index] = np.where(where.age_s <= where.limit_s, where.measured, np.nan)[index]
+        sent = self._sent
+        if sent is not None and sent.live(now_s) and self._shows(where, now_s) is Follows.COMMANDED:
+            place = np.full(self._arm.n, np.nan)
+            place[sent.index] = sent.place(now_s)
+            places[1] = np.where(np.isfinite(place), place, places[1])
+        return places
+
+    def led_in(self, motion: Motion, places: Array, lead_s: float, now_s: float) -> Motion:
+        """A motion from one of two ``places`` (2, n); its first point lies ``lead_s`` ahead."""
+        if lead_s <= 0.0:
+            return motion
+        if motion.velocity is not None and not self.under_way(now_s):
+            lead_s /= SPLINE_PEAK  # the controller's way from rest is faster than its mean
+        room = 0.5 * np.abs(places[1] - places[0]) + self._config.start_near(self._arm)
+        dt_s = np.append(lead_s, motion.dt_s[1:])
+        return replace(motion, before=places.mean(axis=0), dt_s=dt_s, room=room)
 
     def _refuse_start(self, detail: str) -> RefusedError:
         self.mismatch = f"{detail}; call ~/enable when it may begin there"

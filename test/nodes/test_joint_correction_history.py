@@ -1,0 +1,114 @@
+"""What the joint correction keeps in the robot's history: what it corrected with, since when."""
+
+import contextlib
+import sqlite3
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joint_correction_live import NOMINAL, Line, drifted, model_message, tool_message
+from robocal_msgs.msg import CorrectionStatus
+
+from robocal_ros import __version__
+from robocal_ros.core import frames
+from robocal_ros.core.correction_record import CALIBRATED, CorrectionRecord
+from robocal_ros.core.correction_record import NOMINAL as AS_NOMINAL
+from robocal_ros.nodes import correction_log
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_description, save_robot
+
+
+def kept(graph: Any, serial: str = "s1") -> list[CorrectionRecord]:
+    """All records, oldest first."""
+    with CalibrationHistory.open(serial, state_dir=graph.state) as history:
+        return list(reversed(history.corrections(1000)))
+
+
+def after(graph: Any, count: int) -> list[CorrectionRecord]:
+    graph.spin_until(lambda: len(kept(graph)) >= count, f"{count} records")
+    return kept(graph)
+
+
+def test_each_change_is_kept_with_the_choice_of_the_reference(graph: Any) -> None:
+    began = time.time_ns()
+    line = Line(graph)
+    first = after(graph, 1)[0]
+    assert first == CorrectionRecord(
+        wall_ns=first.wall_ns,
+        software=__version__,
+        model_hash=NOMINAL.model_hash,
+        enabled=False,
+        shadow=False,
+        model_revision=0,
+        tool_revision=0,
+        reference=AS_NOMINAL,
+        reference_source="kr150_r3100",
+        reference_name=NOMINAL.name,
+        reference_hash=NOMINAL.model_hash,
+        taught_tool=(*NOMINAL.T_flange_tool[:3, 3], *frames.quat_xyzw(NOMINAL.T_flange_tool)),
+    )
+    T = NOMINAL.T_flange_tool @ frames.transform(np.eye(3), [2e-3, 0.0, 0.0])
+    line.enable()
+    after(graph, 2)
+    line.take(model_message(drifted(), 3), line.to_model, "kinematic_model")
+    after(graph, 3)
+    line.take(tool_message(T, 5), line.to_tool, "tool_frame")
+    after(graph, 4)
+    line.enable(False)
+    records = after(graph, 5)
+    changes = [(r.enabled, r.model_revision, r.tool_revision) for r in records]
+    assert changes == [(False, 0, 0), (True, 0, 0), (True, 3, 0), (True, 3, 5), (False, 3, 5)]
+    times = [r.wall_ns for r in records]
+    assert began < times[0]
+    assert times == sorted(times)
+    assert times[-1] <= time.time_ns()
+    line.enable(False)  # changes nothing
+    graph.spin_for(2.5 * 0.1)
+    assert len(kept(graph)) == 5
+
+
+def test_a_calibrated_reference_is_kept_and_shown(graph: Any, tmp_path: Path) -> None:
+    cold = tmp_path / "cold.yaml"
+    save_robot(drifted(), cold, load_description("kr150_r3100"))
+    line = Line(graph, reference=str(cold), shadow=True)
+    record = after(graph, 1)[0]
+    assert (record.reference, record.reference_source) == (CALIBRATED, str(cold))
+    assert record.reference_hash != record.model_hash == NOMINAL.model_hash
+    assert record.shadow
+    told = line.told(state=CorrectionStatus.OFF)
+    assert told.reference == f"{cold}: {record.reference_name} {record.reference_hash}"
+
+
+def test_a_history_that_cannot_be_written_holds_nothing_up(graph: Any, monkeypatch: Any) -> None:
+    """Another program holds the file; the commands go on, and the record comes later."""
+    monkeypatch.setattr(correction_log, "RETRY_S", 0.2)
+    with CalibrationHistory.open("s1", state_dir=graph.state) as history:
+        path = history.path
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as holder:
+        holder.execute("BEGIN IMMEDIATE")
+        line = Line(graph)
+        line.target()
+        slowest = 0.0
+        for on in (True, False) * 5:
+            begun = time.monotonic()
+            line.enable(on)
+            line.target()
+            slowest = max(slowest, time.monotonic() - begun)
+        assert slowest < 1.0  # a write gives up after two
+        warning = line.report(b"\x01", "wait to be written into the history")
+        assert "another process holds it" in warning.message
+        holder.execute("ROLLBACK")
+    records = after(graph, 11)
+    assert [r.enabled for r in records] == [False] + [True, False] * 5
+    line.diagnostics.clear()
+    line.report(b"\x00", "")
+
+
+def test_the_end_of_the_node_loses_no_record(graph: Any) -> None:
+    line = Line(graph)
+    line.enable()
+    line.enable(False)
+    line.node.close()
+    graph.executor.remove_node(line.node)
+    assert [r.enabled for r in kept(graph)] == [False, True, False]
