@@ -6,22 +6,24 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.core.estimation import Estimate, solve
+from robocal_ros.core.hand_eye.camera_kernels import whiten
 from robocal_ros.core.hand_eye.camera_model import PairProblem, PairState, linearised
 from robocal_ros.core.hand_eye.camera_noise import (
     Evidence,
+    Found,
     PairNoise,
-    covariances,
+    Parts,
     estimate,
     first_guess,
 )
 from robocal_ros.core.hand_eye.camera_start import robust_start
-from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
+from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
 
 Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
-_SETTLED = 0.02  # of a standard deviation
 _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
 
 
@@ -43,15 +45,18 @@ class GivenNoise:
     camera_scale: float | None = None
 
     def variances(self, own_covariance: bool) -> Array:
-        """(3,) as of `PairNoise`; nan where they are to be estimated."""
+        """(6,) as of `PairNoise`; nan where they are to be estimated."""
         unknown = float("nan")
         robot = unknown if self.robot_m is None else self.robot_m**2
         turn = unknown if self.robot_rad is None else self.robot_rad**2
         if own_covariance:
             scale = unknown if self.camera_scale is None else self.camera_scale**2 - 1.0
-            return np.array([robot, turn, scale])
-        place = unknown if self.camera_m is None else robot + self.camera_m**2
-        return np.array([place, turn, unknown if self.camera_rad is None else self.camera_rad**2])
+            return np.array([robot, turn, 0.0, 0.0, 0.0, scale])
+        place, depth = unknown, unknown
+        if self.camera_m is not None:
+            place, depth = robot + self.camera_m**2, 0.0
+        camera = unknown if self.camera_rad is None else self.camera_rad**2
+        return np.array([place, turn, camera, camera, depth, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,7 @@ class PairFit:
     noise : of both sides, given or estimated.
     expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
     settled : whether noise and placements agree in the end; where the noise is known they do.
+    spread : (12 + s, 12 + s) what the covariance is larger by, because the noise was estimated.
     """
 
     pairs: PosePairs
@@ -70,6 +76,7 @@ class PairFit:
     expected: Array
     estimate: Estimate[PairState]
     settled: bool
+    spread: Array
 
     @property
     def at(self) -> Placement:
@@ -101,9 +108,10 @@ class PairFit:
     @property
     def whole_covariance(self) -> Array:
         """The same with the common errors (12 + s, 12 + s)."""
+        whole = self.estimate.covariance + self.spread
         if self.pairs.time_s is None:
-            return self.estimate.covariance
-        return self.estimate.covariance * correlation(self.estimate.residual[~self.rejected])
+            return whole
+        return whole * correlation(self.estimate.residual[~self.rejected])
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -126,40 +134,73 @@ def fit_pairs(
         As `robocal_ros.core.estimation.solve`.
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
-    free = np.isnan(known)
     sound = robust_start(pairs) if sound is None else sound
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
-    state = PairState(start or sound, np.zeros(count))
-    enough = len(pairs) >= _ENOUGH_TO_DOUBT
-    noise = first_guess(pairs, sound, known)
-    X = sound.X  # not of a start that may be far off: weights follow from it
-    for _ in range(_ROUNDS):
-        V = covariances(pairs, X, noise)
-        scale = 1.0 if pairs.covariance is None else noise.camera_scale
-        problem = PairProblem.of(pairs, V, scale)
-        found = solve(
+    search = _Search(pairs, np.isnan(known), PairState(start or sound, np.zeros(count)))
+    near = PairState(sound, np.zeros(count))  # not a start that may be far off
+    return search.run(near, first_guess(pairs, sound, known))
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Noise and placements in turn, from ``start``; ``free`` (6,) variances are unknown."""
+
+    pairs: PosePairs
+    free: NDArray[np.bool_]
+    start: PairState
+
+    @property
+    def enough(self) -> bool:
+        """Whether the samples can tell outliers and several variances."""
+        return len(self.pairs) >= _ENOUGH_TO_DOUBT
+
+    def run(self, near: PairState, noise: PairNoise) -> PairFit:
+        """The fit, with weights that follow from a placement near the truth and a first noise."""
+        told, state, settled = None, self.start, True
+        parts = Parts.of(self.pairs, near.at.X)
+        if np.any(self.free) and self.enough:
+            told = self.noise(near, parts, self._likely(near, parts, noise), noise)
+        for _ in range(_ROUNDS):
+            noise = noise if told is None else told.noise
+            V, root = parts.covariances(noise)
+            found = self.placed(state, root, noise)
+            state, parts = found.state, Parts.of(self.pairs, found.state.at.X)
+            if told is None:
+                break
+            told = self.noise(state, parts, ~found.rejected, noise)
+            settled = told.settled and told.stayed
+            if settled:
+                break
+        k = len(found.names)
+        spread = np.zeros((k, k)) if told is None else told.spread
+        return PairFit(self.pairs, noise, V, found, settled, spread)
+
+    def placed(self, state: PairState, root: Array, noise: PairNoise) -> Estimate[PairState]:
+        """The most likely placements for one noise."""
+        problem = PairProblem(self.pairs, root, noise.camera_scale)
+        return solve(
             problem,
             state,
             prior_information=problem.prior_information,
-            noise_known=enough or not np.any(free),
-            robust=enough,
+            noise_known=self.enough or not np.any(self.free),
+            robust=self.enough,
         )
-        before, settled, state, X = noise, True, found.state, found.state.at.X
-        if np.any(free) and enough:
-            miss, J = linearised(pairs, state)
-            keep = ~found.rejected
-            used = pairs if np.all(keep) else pairs.take(keep)
-            seen = Evidence.of(used, X, miss[keep], J[keep], state.common)
-            noise, settled = estimate(seen, free, noise)
-        settled = settled and _same(before, noise)
-        if settled:
-            break
-    return PairFit(pairs, noise, V, found, settled)
 
+    def noise(
+        self, state: PairState, parts: Parts, keep: NDArray[np.bool_], noise: PairNoise
+    ) -> Found:
+        """The likeliest noise by some of the samples (m,)."""
+        miss, J = linearised(self.pairs, state)
+        seen = Evidence.of(self.pairs, parts.take(keep), miss[keep], J[keep], state.common)
+        return estimate(seen, self.free, noise)
 
-def _same(before: PairNoise, after: PairNoise) -> bool:
-    old, new = np.sqrt(before.variances), np.sqrt(after.variances)
-    return bool(np.all(np.abs(new - old) <= _SETTLED * np.maximum(old, new)))
+    def _likely(self, state: PairState, parts: Parts, noise: PairNoise) -> NDArray[np.bool_]:
+        """Samples (m,) that a first guess of the noise does not exclude."""
+        miss = differences(predicted(self.pairs, state.at), self.pairs)[:, :, None]
+        whiten(parts.covariances(noise)[1], miss)
+        limit = chi2_quantile(1.0 - FALSE_REJECTION / len(miss), 6)
+        keep = np.einsum("mij,mij->m", miss, miss) < limit
+        return np.asarray(keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep))
 
 
 def correlation(residual: Array) -> float:
