@@ -136,60 +136,49 @@ def whiten(root: Array, rows: Array) -> None:
 
 
 @kernel
-def products(white: Array, size: int, normal: Array) -> None:
-    """Products (size, size) of the first columns of white (m, 6, w), summed over all rows."""
-    normal[:] = 0.0
-    for i in range(white.shape[0]):
-        for a in range(6):
-            W = white[i, a]
-            for p in range(size):
-                factor = W[p]
-                for q in range(p, size):
-                    normal[p, q] += factor * W[q]
-    for p in range(size):
-        for q in range(p):
-            normal[p, q] = normal[q, p]
-
-
-@kernel
 def tell(
-    white: Array, owner: Index, step: Array, slope: Array, bend: Array, pull: Array, taken: Array
-) -> None:
-    """What whitened rows [J, miss, columns] (m, 6, k + 1 + c) tell of the variances (n,).
+    explained: Array, left: Array, white: Array, owner: Index,
+    slope: Array, bend: Array, pull: Array,
+) -> None:  # fmt: skip
+    """What whitened columns (m, 6, c) of variances (n,), zero before, tell of them.
 
-    With e = miss + J step and P_l = the columns of variance l times their transpose, summed:
-    ``slope`` (n,) tr(P_l) - e^T P_l e; ``bend`` (n, n) e^T P_l P_m e; ``pull`` (n, k) J^T P_l e;
-    ``taken`` (n, k, k) J^T P_l J, its upper half.
+    With U = ``explained`` (m, 6, k), orthonormal over all rows, e = ``left`` (m, 6) and P_l = the
+    columns of variance l times their transpose: ``slope`` (n,) tr((I - U U^T) P_l) - e^T P_l e,
+    ``bend`` (n, n) e^T P_l P_m e, ``pull`` (n, k) U^T P_l e.
     """
-    k, n = step.shape[0], slope.shape[0]
-    e, h, s = np.empty(6), np.empty(k), np.empty((n, 6))
-    for i in range(white.shape[0]):
-        W = white[i]
+    k, n = explained.shape[2], slope.shape[0]
+    S, s = np.empty((6, 6)), np.empty((n, 6))
+    for i in range(explained.shape[0]):
+        U, e, B = explained[i], left[i], white[i]
         for a in range(6):
-            e[a] = W[a, k]
-            for j in range(k):
-                e[a] += W[a, j] * step[j]
+            for b in range(a + 1):
+                entry = e[a] * e[b]
+                for j in range(k):
+                    entry += U[a, j] * U[b, j]
+                S[a, b] = -2.0 * entry  # of what is symmetrical half the entries, doubled
+            S[a, a] = 1.0 + 0.5 * S[a, a]
         s[:] = 0.0
         for c in range(owner.shape[0]):
             one = owner[c]
-            along, length = 0.0, 0.0
-            h[:] = 0.0
+            along = 0.0
             for a in range(6):
-                b = W[a, k + 1 + c]
-                if b != 0.0:
-                    along += b * e[a]
-                    length += b * b
-                    for j in range(k):
-                        h[j] += b * W[a, j]
-            slope[one] += length - along * along
+                value = B[a, c]
+                if value != 0.0:
+                    along += value * e[a]
+                    entry = 0.0
+                    for b in range(a + 1):
+                        entry += S[a, b] * B[b, c]
+                    slope[one] += value * entry
             for a in range(6):
-                s[one, a] += along * W[a, k + 1 + c]
-            for p in range(k):
-                factor = h[p]
-                pull[one, p] += along * factor
-                for q in range(p, k):
-                    taken[one, p, q] += factor * h[q]
+                s[one, a] += along * B[a, c]
         for p in range(n):
-            for q in range(n):
-                for a in range(6):
-                    bend[p, q] += s[p, a] * s[q, a]
+            for a in range(6):
+                value = s[p, a]
+                if value != 0.0:
+                    for j in range(k):
+                        pull[p, j] += value * U[a, j]
+                    for q in range(p + 1):
+                        bend[p, q] += value * s[q, a]
+    for p in range(n):
+        for q in range(p):
+            bend[q, p] = bend[p, q]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.camera_kernels import factorise, products, tell, whiten
+from robocal_ros.core.hand_eye.camera_kernels import factorise, tell, whiten
 from robocal_ros.core.hand_eye.pose_pairs import (
     Placement,
     PosePairs,
@@ -251,26 +251,23 @@ def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed | None:
     parts, k, n = seen.parts, seen.rows.shape[2] - 1, len(theta)
     V, root = np.empty_like(parts.rest), np.zeros_like(parts.rest)
     cost = factorise(parts.columns, parts.owner, theta, parts.rest, V, root)
-    white = np.concatenate([seen.rows, parts.columns], axis=2)
+    white, columns = seen.rows.copy(), parts.columns.copy()
     whiten(root, white)
-    normal = np.empty((k + 1, k + 1))
-    products(white, k + 1, normal)
+    whiten(root, columns)
+    rows = white.reshape(-1, k + 1)
+    normal = rows.T @ rows
     unit = 1.0 / np.sqrt(np.maximum(np.diag(normal)[:k], np.finfo(float).tiny))
-    scaled = normal[:k, :k] * np.outer(unit, unit)
     try:
-        half = np.linalg.inv(np.linalg.cholesky(scaled)) * unit  # half^T half = M
+        half = np.linalg.inv(np.linalg.cholesky(normal[:k, :k] * np.outer(unit, unit))) * unit
     except np.linalg.LinAlgError:
         return None
-    step = -half.T @ (half @ normal[:k, k])
-    slope, bend = np.zeros(n), np.zeros((n, n))
-    pull, taken = np.zeros((n, k)), np.zeros((n, k, k))
-    tell(white, parts.owner, step, slope, bend, pull, taken)
-    M = half.T @ half
-    doubled = 2.0 * M - np.diag(np.diag(M))  # of `taken` only the upper half is filled
-    slope -= np.einsum("npq,pq->n", taken, doubled)
-    pull = pull @ half.T
+    told = half @ normal[:k, k]
+    cost += float(normal[k, k] - told @ told) - 2.0 * float(np.sum(np.log(np.diag(half))))
+    left = (rows @ np.append(-half.T @ told, 1.0)).reshape(-1, 6)
+    explained = (rows[:, :k] @ half.T).reshape(-1, 6, k)
+    slope, bend, pull = np.zeros(n), np.zeros((n, n)), np.zeros((n, k))
+    tell(explained, left, columns, parts.owner, slope, bend, pull)
     bend -= pull @ pull.T
-    cost += float(normal[k, k] + normal[:k, k] @ step) - 2.0 * float(np.sum(np.log(np.diag(half))))
     some = theta[chosen]
     steep = some * slope[chosen]
     bent = np.outer(some, some) * bend[np.ix_(chosen, chosen)]
