@@ -14,6 +14,7 @@ Index = NDArray[np.int64]
 
 _STRAIGHT = 1e-12  # sine of an angle that is its sine to the last digit
 _SMALL = 1e-4  # angle below which a series is exact
+_TOLD = 1e-14  # part of what an unknown would tell alone, below which it tells nothing
 
 
 @kernel
@@ -33,6 +34,32 @@ def predict(carrier: Array, X: Array, Z: Array, T: Array) -> None:
             T[i, r, 3] = R[0, r] * p[0] + R[1, r] * p[1] + R[2, r] * p[2]
             T[i, 3, r] = 0.0
         T[i, 3, 3] = 1.0
+
+
+@kernel
+def advance(T: Array, step: Array, out: Array) -> None:
+    """T after an increment (v, w) (6,), m and rad, along its own axes."""
+    x, y, z = step[3], step[4], step[5]
+    square = x * x + y * y + z * z
+    angle = np.sqrt(square)
+    first, second = 1.0 - square / 6.0, 0.5 - square / 24.0
+    if angle > _SMALL:
+        first, second = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    E = np.empty((3, 4))
+    w = step[3:]
+    for r in range(3):
+        for c in range(3):
+            E[r, c] = second * w[r] * w[c]
+        E[r, r] += 1.0 - second * square
+        E[r, 3] = step[r]
+    E[0, 1], E[1, 0] = E[0, 1] - first * z, E[1, 0] + first * z
+    E[0, 2], E[2, 0] = E[0, 2] + first * y, E[2, 0] - first * y
+    E[1, 2], E[2, 1] = E[1, 2] - first * x, E[2, 1] + first * x
+    for r in range(3):
+        for c in range(4):
+            out[r, c] = T[r, 0] * E[0, c] + T[r, 1] * E[1, c] + T[r, 2] * E[2, c]
+        out[r, 3] += T[r, 3]
+    out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
 @kernel
@@ -105,13 +132,19 @@ def factorise(
     """
     total = 0.0
     for i in range(columns.shape[0]):
-        B, L = columns[i], root[i]
+        B, L, S = columns[i], root[i], V[i]
+        S[:] = rest[i]
+        for c in range(owner.shape[0]):
+            variance = variances[owner[c]]
+            for a in range(6):
+                value = variance * B[a, c]
+                if value != 0.0:
+                    for b in range(a + 1):
+                        S[a, b] += value * B[b, c]
         for a in range(6):
             for b in range(a + 1):
-                entry = rest[i, a, b]
-                for c in range(owner.shape[0]):
-                    entry += variances[owner[c]] * B[a, c] * B[b, c]
-                V[i, a, b] = V[i, b, a] = entry
+                entry = S[a, b]
+                S[b, a] = entry
                 for c in range(b):
                     entry -= L[a, c] * L[b, c]
                 L[a, b] = np.sqrt(entry) if a == b else entry / L[b, b]
@@ -136,49 +169,101 @@ def whiten(root: Array, rows: Array) -> None:
 
 
 @kernel
-def tell(
-    explained: Array, left: Array, white: Array, owner: Index,
-    slope: Array, bend: Array, pull: Array,
-) -> None:  # fmt: skip
-    """What whitened columns (m, 6, c) of variances (n,), zero before, tell of them.
+def _without(N: Array, apart: Array) -> float:
+    """From products N (k + 1, k + 1) of whitened rows [J, miss], which are lost.
 
-    With U = ``explained`` (m, 6, k), orthonormal over all rows, e = ``left`` (m, 6) and P_l = the
-    columns of variance l times their transpose: ``slope`` (n,) tr((I - U U^T) P_l) - e^T P_l e,
-    ``bend`` (n, n) e^T P_l P_m e, ``pull`` (n, k) U^T P_l e.
+    ``apart`` (k + 1, k + 1): [J, miss] apart = [U, e] with orthonormal U and what J leaves of the
+    miss. Returns -2 log likelihood but for the noise's part: e^T e, and the determinant of J^T J;
+    infinite where J tells less than k unknowns.
     """
-    k, n = explained.shape[2], slope.shape[0]
-    S, s = np.empty((6, 6)), np.empty((n, 6))
-    for i in range(explained.shape[0]):
-        U, e, B = explained[i], left[i], white[i]
+    k = N.shape[0] - 1
+    determinant = 0.0
+    for p in range(k + 1):
+        least = _TOLD * N[p, p] if p < k else 0.0
+        for r in range(p):  # the rows above hold the root already
+            for q in range(p, k + 1):
+                N[p, q] -= N[r, p] * N[r, q]
+        if p == k:
+            break
+        if not N[p, p] > least:
+            return np.inf
+        factor = np.sqrt(N[p, p])
+        for q in range(p, k + 1):
+            N[p, q] /= factor
+        determinant += 2.0 * np.log(factor)
+    left, N[k, k] = N[k, k], 1.0
+    apart[:] = 0.0
+    for p in range(k + 1):
+        apart[p, p] = 1.0 / N[p, p]
+        for r in range(p):
+            entry = 0.0
+            for q in range(r, p):
+                entry += apart[r, q] * N[q, p]
+            apart[r, p] = -entry / N[p, p]
+    return determinant + left
+
+
+@kernel
+def _tell(U: Array, B: Array, owner: Index, slope: Array, bend: Array, pull: Array) -> None:
+    """Add what one sample's whitened columns B (6, c) tell, see `weigh`; U (6, k + 1) with e."""
+    k, n = U.shape[1] - 1, slope.shape[0]
+    s, h = np.zeros((n, 6)), np.empty(k + 1)
+    for c in range(owner.shape[0]):
+        one = owner[c]
+        h[:] = 0.0
+        length = 0.0
         for a in range(6):
-            for b in range(a + 1):
-                entry = e[a] * e[b]
-                for j in range(k):
-                    entry += U[a, j] * U[b, j]
-                S[a, b] = -2.0 * entry  # of what is symmetrical half the entries, doubled
-            S[a, a] = 1.0 + 0.5 * S[a, a]
-        s[:] = 0.0
-        for c in range(owner.shape[0]):
-            one = owner[c]
-            along = 0.0
-            for a in range(6):
-                value = B[a, c]
-                if value != 0.0:
-                    along += value * e[a]
-                    entry = 0.0
-                    for b in range(a + 1):
-                        entry += S[a, b] * B[b, c]
-                    slope[one] += value * entry
-            for a in range(6):
-                s[one, a] += along * B[a, c]
-        for p in range(n):
-            for a in range(6):
-                value = s[p, a]
-                if value != 0.0:
-                    for j in range(k):
-                        pull[p, j] += value * U[a, j]
-                    for q in range(p + 1):
-                        bend[p, q] += value * s[q, a]
+            value = B[a, c]
+            if value != 0.0:
+                length += value * value
+                for j in range(k + 1):
+                    h[j] += value * U[a, j]
+        along = h[k]
+        for j in range(k + 1):
+            length -= h[j] * h[j]
+            pull[one, j] += along * h[j]
+        slope[one] += length
+        for a in range(6):
+            s[one, a] += along * B[a, c]
     for p in range(n):
-        for q in range(p):
+        for q in range(p + 1):
+            for a in range(6):
+                bend[p, q] += s[p, a] * s[q, a]
+
+
+@kernel
+def weigh(
+    rows: Array, columns: Array, owner: Index, rest: Array, variances: Array,
+    slope: Array, bend: Array, drift: Array,
+) -> float:  # fmt: skip
+    """-2 log restricted likelihood of variances (n,), and its derivatives.
+
+    ``rows`` (m, 6, k + 1): Jacobian and differences; ``columns``, ``owner``, ``rest``: see
+    `factorise`. With P the covariance's inverse that the unknowns leave, and P_l the derivative of
+    the covariance by variance l: ``slope`` (n,) tr(P P_l) - r^T P P_l P r, ``bend`` (n, n)
+    r^T P P_l P P_m P r, ``drift`` (n, k) derivatives of the best unknowns; zero before. Infinite,
+    and nothing told, where the rows do not determine the unknowns.
+    """
+    m, k, n = rows.shape[0], rows.shape[2] - 1, slope.shape[0]
+    V, root = np.empty((m, 6, 6)), np.zeros((m, 6, 6))
+    cost = factorise(columns, owner, variances, rest, V, root)
+    white, B = rows.copy(), columns.copy()
+    whiten(root, white)
+    whiten(root, B)
+    flat = white.reshape(6 * m, k + 1)
+    apart, pull = np.empty((k + 1, k + 1)), np.zeros((n, k + 1))
+    cost += _without(flat.T @ flat, apart)
+    if cost == np.inf:
+        return cost
+    U = (flat @ apart).reshape(m, 6, k + 1)
+    for i in range(m):
+        _tell(U[i], B[i], owner, slope, bend, pull)
+    for p in range(n):
+        for q in range(p + 1):
+            for j in range(k):
+                bend[p, q] -= pull[p, j] * pull[q, j]
             bend[q, p] = bend[p, q]
+        for j in range(k):
+            for q in range(j, k):
+                drift[p, j] -= apart[j, q] * pull[p, q]
+    return cost

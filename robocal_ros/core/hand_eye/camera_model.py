@@ -6,9 +6,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.hand_eye.camera_kernels import differentiate, whiten
-from robocal_ros.core.hand_eye.increments import moved
-from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
+from robocal_ros.core.hand_eye.camera_kernels import advance, differentiate, whiten
+from robocal_ros.core.hand_eye.pose_pairs import (
+    Placement,
+    PosePairs,
+    differences,
+    plain,
+    predicted,
+)
 
 Array = NDArray[np.float64]
 
@@ -73,8 +78,10 @@ class PairProblem:
 
     def retract(self, state: PairState, step: Array) -> PairState:
         """The state after a step (12 + s,)."""
-        at = Placement(moved(state.at.X, step[:6]), moved(state.at.Z, step[6:12]))
-        return PairState(at, state.common + step[12:])
+        X, Z = np.empty((4, 4)), np.empty((4, 4))
+        advance(plain(state.at.X), step[:6], X)
+        advance(plain(state.at.Z), step[6:12], Z)
+        return PairState(Placement(X, Z), state.common + step[12:])
 
     def deviation(self, state: PairState) -> Array:
         """Of the common errors from their mean, zero."""

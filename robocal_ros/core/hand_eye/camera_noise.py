@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.camera_kernels import factorise, tell, whiten
+from robocal_ros.core.hand_eye.camera_kernels import factorise, weigh
 from robocal_ros.core.hand_eye.pose_pairs import (
     Placement,
     PosePairs,
@@ -32,7 +32,7 @@ _GENEROUS = 2.0
 _MOST_STEPS, _LONGEST = 50, 2.0
 _PRIOR = 1.0  # slope of the prior's logarithm, doubled: a variance's density goes as its root
 _DAMPING, _LESS, _MORE = 1.0, 0.1, 4.0
-_FLAT = 1e-3  # squared step in standard deviations of the noise
+_CLOSE = 0.1  # squared step in standard deviations of the noise; the next is its square
 _NEAR = 1e-2  # the same where weights are as good as final
 
 
@@ -196,30 +196,26 @@ def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> Found
     chosen = np.flatnonzero(free)
     theta = noise.variances
     here = _weigh(seen, theta, chosen)
-    damping, stayed = 0.0, False
-    for turn in range(_MOST_STEPS):
-        if here is None:
-            break
+    damping = 0.0
+    for turn in range(_MOST_STEPS if here.cost < np.inf else 0):
         step, size = here.step(damping)
-        stayed = stayed or (turn == 0 and size < _NEAR)
-        if size < _FLAT:
-            return Found(noise_of(theta), True, stayed, here.spread())
         trial = theta.copy()
         trial[chosen] *= np.exp(step)
+        if size < _CLOSE:  # where one more step is exact enough
+            return Found(noise_of(trial), True, turn == 0 and size < _NEAR, here.spread())
         there = _weigh(seen, trial, chosen)
-        if there is not None and there.cost <= here.cost:
+        if there.cost <= here.cost:
             theta, here, damping = trial, there, _LESS * damping
         else:
             damping = max(_MORE * damping, _DAMPING)
-    k = seen.rows.shape[2] - 1
-    return Found(noise_of(theta), False, False, np.zeros((k, k)) if here is None else here.spread())
+    return Found(noise_of(theta), False, False, here.spread())
 
 
 @dataclass(frozen=True, eq=False)
 class _Weighed:
     """The posterior of the noise at one point, in the logarithms of n variances.
 
-    ``cost``: -2 log density; ``slope`` (n,), ``bend`` (n, n): its derivatives; ``drift`` (n, k): by
+    ``cost``: -2 log density, infinite where the samples do not determine the unknowns; ``slope`` (n,), ``bend`` (n, n): its derivatives; ``drift`` (n, k): by
     how much the best unknowns go along.
     """
 
@@ -246,37 +242,21 @@ class _Weighed:
         return np.asarray(4.0 * self.drift.T @ np.linalg.solve(self.bend, self.drift))
 
 
-def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed | None:
-    """None where the samples do not tell the unknowns."""
+def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed:
+    """At variances (6,) of which some are ``chosen``."""
     parts, k, n = seen.parts, seen.rows.shape[2] - 1, len(theta)
-    V, root = np.empty_like(parts.rest), np.zeros_like(parts.rest)
-    cost = factorise(parts.columns, parts.owner, theta, parts.rest, V, root)
-    white, columns = seen.rows.copy(), parts.columns.copy()
-    whiten(root, white)
-    whiten(root, columns)
-    rows = white.reshape(-1, k + 1)
-    normal = rows.T @ rows
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(normal)[:k], np.finfo(float).tiny))
-    try:
-        half = np.linalg.inv(np.linalg.cholesky(normal[:k, :k] * np.outer(unit, unit))) * unit
-    except np.linalg.LinAlgError:
-        return None
-    told = half @ normal[:k, k]
-    cost += float(normal[k, k] - told @ told) - 2.0 * float(np.sum(np.log(np.diag(half))))
-    left = (rows @ np.append(-half.T @ told, 1.0)).reshape(-1, 6)
-    explained = (rows[:, :k] @ half.T).reshape(-1, 6, k)
-    slope, bend, pull = np.zeros(n), np.zeros((n, n)), np.zeros((n, k))
-    tell(explained, left, columns, parts.owner, slope, bend, pull)
-    bend -= pull @ pull.T
+    slope, bend, drift = np.zeros(n), np.zeros((n, n)), np.zeros((n, k))
+    cost = weigh(
+        seen.rows, parts.columns, parts.owner, parts.rest, theta, slope, bend, drift
+    )
     some = theta[chosen]
-    steep = some * slope[chosen]
     bent = np.outer(some, some) * bend[np.ix_(chosen, chosen)]
-    bent[np.diag_indices_from(bent)] += _PRIOR  # at the top, where ``steep`` is as large
+    bent[np.diag_indices_from(bent)] += _PRIOR  # at the top, where the likelihood rises as steeply
     return _Weighed(
         cost - _PRIOR * float(np.sum(np.log(some))),
-        steep - _PRIOR,
+        some * slope[chosen] - _PRIOR,
         bent,
-        -some[:, None] * (pull[chosen] @ half),
+        some[:, None] * drift[chosen],
     )
 
 

@@ -69,7 +69,7 @@ class PosePairs:
     @cached_property
     def for_kernels(self) -> tuple[Array, Array]:
         """``T_boardside_cameraside`` and ``T_camera_board``, as kernels take them."""
-        return _plain(self.T_boardside_cameraside), _plain(self.T_camera_board)
+        return plain(self.T_boardside_cameraside), plain(self.T_camera_board)
 
     @property
     def distance_m(self) -> float:
@@ -104,7 +104,7 @@ def predicted(pairs: PosePairs, at: Placement) -> Array:
     """T_camera_board (m, 4, 4) as the robot's poses have it."""
     carrier, _ = pairs.for_kernels
     T = np.empty_like(carrier)
-    predict(carrier, _plain(at.X), _plain(at.Z), T)
+    predict(carrier, plain(at.X), plain(at.Z), T)
     return T
 
 
@@ -112,13 +112,13 @@ def differences(predicted_T: Array, pairs: PosePairs) -> Array:
     """Difference (m, 6) of predicted from seen board poses: position and turn, camera axes."""
     _, seen = pairs.for_kernels
     miss = np.empty((len(seen), 6))
-    if compare(_plain(predicted_T), seen, miss) < _NEARLY_BACK:
+    if compare(plain(predicted_T), seen, miss) < _NEARLY_BACK:
         turn = predicted_T[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2)
         miss[:, 3:] = frames.log_rotation(turn)
     return miss
 
 
-def _plain(values: Array) -> Array:
+def plain(values: Array) -> Array:
     """As kernels take it: in one piece, and not read-only, which would be another type to them."""
     return np.require(values, np.float64, ("C", "W"))
 
