@@ -19,7 +19,7 @@ from robocal_ros.core.hand_eye.camera_noise import (
     first_guess,
 )
 from robocal_ros.core.hand_eye.camera_start import robust_start
-from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
+from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
 
 Array = NDArray[np.float64]
 
@@ -137,49 +137,58 @@ def fit_pairs(
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
     sound = robust_start(pairs) if sound is None else sound
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
-    search = _Search(pairs, np.isnan(known), PairState(start or sound, np.zeros(count)))
-    near = PairState(sound, np.zeros(count))  # not a start that may be far off
-    return search.run(near, first_guess(pairs, sound, known))
+    search = _Search(pairs, np.isnan(known))
+    near = PairState(sound, np.zeros(count))
+    far = None if start is None else PairState(start, np.zeros(count))
+    return search.run(near, far, first_guess(pairs, sound, known))
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Noise and placements in turn, from ``start``; ``free`` (6,) variances are unknown."""
+    """Noise and placements in turn; ``free`` (6,) variances are unknown."""
 
     pairs: PosePairs
     free: NDArray[np.bool_]
-    start: PairState
 
     @property
     def enough(self) -> bool:
         """Whether the samples can tell outliers and several variances."""
         return len(self.pairs) >= _ENOUGH_TO_DOUBT
 
-    def run(self, near: PairState, noise: PairNoise) -> PairFit:
-        """The fit, with weights that follow from a placement near the truth and a first noise."""
-        told, state, settled = None, self.start, True
+    def run(self, near: PairState, far: PairState | None, noise: PairNoise) -> PairFit:
+        """The fit, from a state near the truth and a first noise; placements from ``far``."""
+        told, settled = None, True
         parts = Parts.of(self.pairs, near.at.X)
         if np.any(self.free) and self.enough:
-            keep = self._likely(near, parts, noise)
-            if np.sum(keep) > _MANY:
-                noise = self.noise(near, parts, _thinned(keep), noise).noise
-            told = self.noise(near, parts, keep, noise)
+            told = self._first_noise(near, parts, noise)
+            noise, near = told.noise, near.after(told.best)
+        state = near if far is None else far
         for _ in range(_ROUNDS):
-            noise = noise if told is None else told.noise
             V, root = parts.covariances(noise)
-            found = self.placed(state, root, noise)
-            state, parts = found.state, Parts.of(self.pairs, found.state.at.X)
+            found = self._placed(state, root, noise)
             if told is None:
                 break
-            told = self.noise(state, parts, ~found.rejected, noise)
+            state, parts = found.state, Parts.of(self.pairs, found.state.at.X)
+            seen = Evidence.of(self.pairs, parts, state).take(~found.rejected)
+            told = estimate(seen.with_common(self.pairs.shared, state.common), self.free, noise)
             settled = told.settled and told.stayed
             if settled:
                 break
+            noise = told.noise
         k = len(found.names)
         spread = np.zeros((k, k)) if told is None else told.spread
         return PairFit(self.pairs, noise, V, found, settled, spread)
 
-    def placed(self, state: PairState, root: Array, noise: PairNoise) -> Estimate[PairState]:
+    def _first_noise(self, near: PairState, parts: Parts, guess: PairNoise) -> Found:
+        """The likeliest noise by the samples that a guess does not exclude, first by some."""
+        seen, shared = Evidence.of(self.pairs, parts, near), self.pairs.shared
+        keep = _likely(seen, parts.covariances(guess)[1])
+        if np.sum(keep) > _MANY:
+            few = seen.take(_thinned(keep)).with_common(shared, near.common)
+            guess = estimate(few, self.free, guess).noise
+        return estimate(seen.take(keep).with_common(shared, near.common), self.free, guess)
+
+    def _placed(self, state: PairState, root: Array, noise: PairNoise) -> Estimate[PairState]:
         """The most likely placements for one noise."""
         problem = PairProblem(self.pairs, root, noise.camera_scale)
         return solve(
@@ -190,21 +199,14 @@ class _Search:
             robust=self.enough,
         )
 
-    def noise(
-        self, state: PairState, parts: Parts, keep: NDArray[np.bool_], noise: PairNoise
-    ) -> Found:
-        """The likeliest noise by some of the samples (m,)."""
-        miss, J = linearised(self.pairs, state)
-        seen = Evidence.of(self.pairs, parts.take(keep), miss[keep], J[keep], state.common)
-        return estimate(seen, self.free, noise)
 
-    def _likely(self, state: PairState, parts: Parts, noise: PairNoise) -> NDArray[np.bool_]:
-        """Samples (m,) that a first guess of the noise does not exclude."""
-        miss = differences(predicted(self.pairs, state.at), self.pairs)[:, :, None]
-        whiten(parts.covariances(noise)[1], miss)
-        limit = chi2_quantile(1.0 - FALSE_REJECTION / len(miss), 6)
-        keep = np.einsum("mij,mij->m", miss, miss) < limit
-        return np.asarray(keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep))
+def _likely(seen: Evidence, root: Array) -> NDArray[np.bool_]:
+    """Samples (m,) that their covariances, given by the lower roots (m, 6, 6), do not exclude."""
+    miss = seen.rows[:, :, -1:].copy()
+    whiten(root, miss)
+    limit = chi2_quantile(1.0 - FALSE_REJECTION / len(miss), 6)
+    keep = np.einsum("mij,mij->m", miss, miss) < limit
+    return np.asarray(keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep))
 
 
 def _thinned(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -234,15 +234,15 @@ def _tell(U: Array, B: Array, owner: Index, slope: Array, bend: Array, pull: Arr
 @kernel
 def weigh(
     rows: Array, columns: Array, owner: Index, rest: Array, variances: Array,
-    slope: Array, bend: Array, drift: Array,
+    step: Array, slope: Array, bend: Array, drift: Array,
 ) -> float:  # fmt: skip
     """-2 log restricted likelihood of variances (n,), and its derivatives.
 
     ``rows`` (m, 6, k + 1): Jacobian and differences; ``columns``, ``owner``, ``rest``: see
     `factorise`. With P the covariance's inverse that the unknowns leave, and P_l the derivative of
     the covariance by variance l: ``slope`` (n,) tr(P P_l) - r^T P P_l P r, ``bend`` (n, n)
-    r^T P P_l P P_m P r, ``drift`` (n, k) derivatives of the best unknowns; zero before. Infinite,
-    and nothing told, where the rows do not determine the unknowns.
+    r^T P P_l P P_m P r, ``step`` (k,) to the best unknowns, ``drift`` (n, k) its derivatives; zero
+    before. Infinite, and nothing told, where the rows do not determine the unknowns.
     """
     m, k, n = rows.shape[0], rows.shape[2] - 1, slope.shape[0]
     V, root = np.empty((m, 6, 6)), np.zeros((m, 6, 6))
@@ -255,6 +255,7 @@ def weigh(
     cost += _without(flat.T @ flat, apart)
     if cost == np.inf:
         return cost
+    step[:] = apart[:k, k]
     U = (flat @ apart).reshape(m, 6, k + 1)
     for i in range(m):
         _tell(U[i], B[i], owner, slope, bend, pull)

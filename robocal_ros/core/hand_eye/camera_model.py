@@ -33,6 +33,13 @@ class PairState:
     at: Placement
     common: Array
 
+    def after(self, step: Array) -> "PairState":
+        """The state after increments (12 + s,), as of `linearised`."""
+        X, Z = np.empty((4, 4)), np.empty((4, 4))
+        advance(plain(self.at.X), step[:6], X)
+        advance(plain(self.at.Z), step[6:12], Z)
+        return PairState(Placement(X, Z), self.common + step[12:])
+
 
 def linearised(pairs: PosePairs, state: PairState) -> tuple[Array, Array]:
     """Differences (m, 6), camera axes, m and rad, and their Jacobian (m, 6, 12 + s).
@@ -78,10 +85,7 @@ class PairProblem:
 
     def retract(self, state: PairState, step: Array) -> PairState:
         """The state after a step (12 + s,)."""
-        X, Z = np.empty((4, 4)), np.empty((4, 4))
-        advance(plain(state.at.X), step[:6], X)
-        advance(plain(state.at.Z), step[6:12], Z)
-        return PairState(Placement(X, Z), state.common + step[12:])
+        return state.after(step)
 
     def deviation(self, state: PairState) -> Array:
         """Of the common errors from their mean, zero."""

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.camera_kernels import factorise, weigh
+from robocal_ros.core.hand_eye.camera_model import PairState, linearised
 from robocal_ros.core.hand_eye.pose_pairs import (
     Placement,
     PosePairs,
+    Shared,
     differences,
     levers,
     predicted,
@@ -145,27 +147,34 @@ class Evidence:
     parts: Parts
 
     @classmethod
-    def of(
-        cls, pairs: PosePairs, parts: Parts, miss: Array, jacobian: Array, common: Array
-    ) -> "Evidence":
-        """Of pairs at a solution; ``common`` (s,) errors are evidence of the camera's too."""
-        own = cls(np.concatenate([jacobian, miss[:, :, None]], axis=2), parts)
-        if pairs.shared is None:
-            return own
-        # Their deviations from zero, made independent, in rows of six as all others; rows that
-        # are left over hold nothing.
-        s, k = len(common), jacobian.shape[2]
+    def of(cls, pairs: PosePairs, parts: Parts, state: PairState) -> "Evidence":
+        """Of pairs at a state near the best, for parts of the same place."""
+        miss, jacobian = linearised(pairs, state)
+        return cls(np.concatenate([jacobian, miss[:, :, None]], axis=2), parts)
+
+    def take(self, keep: NDArray[np.bool_]) -> "Evidence":
+        """That of some samples (m,)."""
+        return self if np.all(keep) else Evidence(self.rows[keep], self.parts.take(keep))
+
+    def with_common(self, shared: Shared | None, common: Array) -> "Evidence":
+        """And of ``common`` (s,) errors, whose size tells that of the camera's too.
+
+        Their deviations from zero, made independent, in rows of six as all others; rows that are
+        left over hold nothing.
+        """
+        if shared is None:
+            return self
+        s, width, parts = len(common), self.rows.shape[2], self.parts
         more = -(-s // 6)
-        root = np.linalg.inv(np.linalg.cholesky(pairs.shared.covariance))
-        rows = np.zeros((6 * more, k + 1))
-        rows[:s, k - s : k], rows[:s, k] = root, root @ common
+        root = np.linalg.inv(np.linalg.cholesky(shared.covariance))
+        rows = np.zeros((6 * more, width))
+        rows[:s, width - 1 - s : width - 1], rows[:s, width - 1] = root, root @ common
         columns = np.zeros((6 * more, len(parts.owner)))
-        index = np.arange(s)
         excess = np.flatnonzero(parts.owner == EXCESS)
         if len(excess):
-            columns[index, excess[index % 6]] = 1.0
-        return cls(
-            np.concatenate([own.rows, rows.reshape(more, 6, k + 1)]),
+            columns[np.arange(s), excess[np.arange(s) % 6]] = 1.0
+        return Evidence(
+            np.concatenate([self.rows, rows.reshape(more, 6, width)]),
             Parts(
                 np.concatenate([parts.columns, columns.reshape(more, 6, -1)]),
                 parts.owner,
@@ -183,12 +192,14 @@ class Found:
     settled : whether the likelihood's top was reached.
     stayed : whether the noise that the search began with was as good as at the top.
     spread : (k, k) what the unknowns' covariance is larger by than for noise that is known.
+    best : (k,) step of the unknowns to where they are likeliest.
     """
 
     noise: PairNoise
     settled: bool
     stayed: bool
     spread: Array
+    best: Array
 
 
 def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> Found:
@@ -202,13 +213,14 @@ def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> Found
         trial = theta.copy()
         trial[chosen] *= np.exp(step)
         if size < _CLOSE:  # where one more step is exact enough
-            return Found(noise_of(trial), True, turn == 0 and size < _NEAR, here.spread())
+            stayed = turn == 0 and size < _NEAR
+            return Found(noise_of(trial), True, stayed, here.spread(), here.best)
         there = _weigh(seen, trial, chosen)
         if there.cost <= here.cost:
             theta, here, damping = trial, there, _LESS * damping
         else:
             damping = max(_MORE * damping, _DAMPING)
-    return Found(noise_of(theta), False, False, here.spread())
+    return Found(noise_of(theta), False, False, here.spread(), here.best)
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,13 +228,14 @@ class _Weighed:
     """The posterior of the noise at one point, in the logarithms of n variances.
 
     ``cost``: -2 log density, infinite where the samples do not determine the unknowns; ``slope`` (n,), ``bend`` (n, n): its derivatives; ``drift`` (n, k): by
-    how much the best unknowns go along.
+    how much the best unknowns go along; ``best`` (k,): the step to them.
     """
 
     cost: float
     slope: Array
     bend: Array
     drift: Array
+    best: Array
 
     def step(self, damping: float) -> tuple[Array, float]:
         """Towards the top (n,), and its squared length in standard deviations."""
@@ -245,9 +258,9 @@ class _Weighed:
 def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed:
     """At variances (6,) of which some are ``chosen``."""
     parts, k, n = seen.parts, seen.rows.shape[2] - 1, len(theta)
-    slope, bend, drift = np.zeros(n), np.zeros((n, n)), np.zeros((n, k))
+    step, slope, bend, drift = np.zeros(k), np.zeros(n), np.zeros((n, n)), np.zeros((n, k))
     cost = weigh(
-        seen.rows, parts.columns, parts.owner, parts.rest, theta, slope, bend, drift
+        seen.rows, parts.columns, parts.owner, parts.rest, theta, step, slope, bend, drift
     )
     some = theta[chosen]
     bent = np.outer(some, some) * bend[np.ix_(chosen, chosen)]
@@ -257,6 +270,7 @@ def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed:
         some * slope[chosen] - _PRIOR,
         bent,
         some[:, None] * drift[chosen],
+        step,
     )
 
 
