@@ -24,6 +24,7 @@ from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
 Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
+_GENEROUS = 2.0  # what is excluded by too small a noise makes it smaller still
 _MANY = 40  # samples: so many bring the noise near to what all tell, in less time
 _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
 
@@ -137,30 +138,36 @@ def fit_pairs(
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
     sound = robust_start(pairs) if sound is None else sound
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
-    search = _Search(pairs, np.isnan(known))
     near = PairState(sound, np.zeros(count))
     far = None if start is None else PairState(start, np.zeros(count))
-    return search.run(near, far, first_guess(pairs, sound, known))
+    return _Search(pairs, known).run(near, far)
 
 
 @dataclass(frozen=True, eq=False)
 class _Search:
-    """Noise and placements in turn; ``free`` (6,) variances are unknown."""
+    """Noise and placements in turn; ``known`` (6,) variances are nan where they are unknown."""
 
     pairs: PosePairs
-    free: NDArray[np.bool_]
+    known: Array
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """(6,) variances to be estimated."""
+        return np.isnan(self.known)
 
     @property
     def enough(self) -> bool:
         """Whether the samples can tell outliers and several variances."""
         return len(self.pairs) >= _ENOUGH_TO_DOUBT
 
-    def run(self, near: PairState, far: PairState | None, noise: PairNoise) -> PairFit:
-        """The fit, from a state near the truth and a first noise; placements from ``far``."""
+    def run(self, near: PairState, far: PairState | None) -> PairFit:
+        """The fit, from a state near the truth; placements from ``far`` where it is given."""
         told, settled = None, True
         parts = Parts.of(self.pairs, near.at.X)
+        seen = Evidence.of(self.pairs, parts, near)
+        noise = first_guess(seen.rows[:, :, -1], self.known)
         if np.any(self.free) and self.enough:
-            told = self._first_noise(near, parts, noise)
+            told = self._first_noise(seen, near, noise)
             noise, near = told.noise, near.after(told.best)
         state = near if far is None else far
         for _ in range(_ROUNDS):
@@ -168,7 +175,7 @@ class _Search:
             found = self._placed(state, root, noise)
             if told is None:
                 break
-            state, parts = found.state, Parts.of(self.pairs, found.state.at.X)
+            state, parts = found.state, parts.moved(self.pairs, found.state.at.X)
             seen = Evidence.of(self.pairs, parts, state).take(~found.rejected)
             told = estimate(seen.with_common(self.pairs.shared, state.common), self.free, noise)
             settled = told.settled and told.stayed
@@ -179,10 +186,10 @@ class _Search:
         spread = np.zeros((k, k)) if told is None else told.spread
         return PairFit(self.pairs, noise, V, found, settled, spread)
 
-    def _first_noise(self, near: PairState, parts: Parts, guess: PairNoise) -> Found:
+    def _first_noise(self, seen: Evidence, near: PairState, guess: PairNoise) -> Found:
         """The likeliest noise by the samples that a guess does not exclude, first by some."""
-        seen, shared = Evidence.of(self.pairs, parts, near), self.pairs.shared
-        keep = _likely(seen, parts.covariances(guess)[1])
+        shared = self.pairs.shared
+        keep = _likely(seen, guess)
         if np.sum(keep) > _MANY:
             few = seen.take(_thinned(keep)).with_common(shared, near.common)
             guess = estimate(few, self.free, guess).noise
@@ -200,11 +207,11 @@ class _Search:
         )
 
 
-def _likely(seen: Evidence, root: Array) -> NDArray[np.bool_]:
-    """Samples (m,) that their covariances, given by the lower roots (m, 6, 6), do not exclude."""
+def _likely(seen: Evidence, guess: PairNoise) -> NDArray[np.bool_]:
+    """Samples (m,) that a guess of the noise does not exclude."""
     miss = seen.rows[:, :, -1:].copy()
-    whiten(root, miss)
-    limit = chi2_quantile(1.0 - FALSE_REJECTION / len(miss), 6)
+    whiten(seen.parts.covariances(guess)[1], miss)
+    limit = _GENEROUS**2 * chi2_quantile(1.0 - FALSE_REJECTION / len(miss), 6)
     keep = np.einsum("mij,mij->m", miss, miss) < limit
     return np.asarray(keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep))
 

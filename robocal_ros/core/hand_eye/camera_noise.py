@@ -16,12 +16,9 @@ from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.camera_kernels import factorise, weigh
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised
 from robocal_ros.core.hand_eye.pose_pairs import (
-    Placement,
     PosePairs,
     Shared,
-    differences,
     levers,
-    predicted,
 )
 
 Array = NDArray[np.float64]
@@ -30,7 +27,6 @@ Index = NDArray[np.int64]
 SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data solvable
 POSITION, TURN, TILT, ROLL, DEPTH, EXCESS = range(6)
 _NORMAL_MEDIAN = 1.538  # median length of three unit normals
-_GENEROUS = 2.0
 _MOST_STEPS, _LONGEST = 50, 2.0
 _PRIOR = 1.0  # slope of the prior's logarithm, doubled: a variance's density goes as its root
 _DAMPING, _LESS, _MORE = 1.0, 0.1, 4.0
@@ -112,6 +108,12 @@ class Parts:
         owner += [TILT, TILT, ROLL, DEPTH]
         return cls(columns, np.array(owner), np.tile(least, (m, 1, 1)))
 
+    def moved(self, pairs: PosePairs, X: Array) -> "Parts":
+        """With the levers of another placement."""
+        columns = self.columns.copy()
+        columns[:, :3, 3:6] = -frames.skew(levers(pairs, X))
+        return Parts(columns, self.owner, self.rest)
+
     def covariances(self, noise: PairNoise) -> tuple[Array, Array]:
         """Covariance (m, 6, 6) of the differences of each sample, and its lower root."""
         V, root = np.empty_like(self.rest), np.zeros_like(self.rest)
@@ -123,20 +125,19 @@ class Parts:
         return self if np.all(keep) else Parts(self.columns[keep], self.owner, self.rest[keep])
 
 
-def first_guess(pairs: PosePairs, at: Placement, known: Array) -> PairNoise:
-    """Unknown variances, nan in ``known`` (6,), from the median of the differences at a start.
+def first_guess(miss: Array, known: Array) -> PairNoise:
+    """Unknown variances, nan in ``known`` (6,), from the median of the differences (m, 6).
 
-    On the large side: what is rejected by too small a noise makes it smaller still.
+    On the large side, as if each were all of the noise.
     """
-    if not np.any(np.isnan(known)):
+    unknown = np.isnan(known)
+    if not np.any(unknown):
         return noise_of(known)
-    miss = differences(predicted(pairs, at), pairs)
     place, turn = (
-        max(float(np.median(np.linalg.norm(part, axis=1))) * _GENEROUS / _NORMAL_MEDIAN, SMALLEST_M)
+        max(float(np.median(np.linalg.norm(part, axis=1))) / _NORMAL_MEDIAN, SMALLEST_M)
         for part in (miss[:, :3], miss[:, 3:])
     )
-    guess = np.square([place, turn, turn, turn, place, _GENEROUS])
-    return noise_of(np.where(np.isnan(known), guess, known))
+    return noise_of(np.where(unknown, np.square([place, turn, turn, turn, place, 1.0]), known))
 
 
 @dataclass(frozen=True, eq=False)
