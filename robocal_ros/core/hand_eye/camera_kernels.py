@@ -226,9 +226,11 @@ def _tell(U: Array, B: Array, owner: Index, slope: Array, bend: Array, pull: Arr
         for a in range(6):
             s[one, a] += along * B[a, c]
     for p in range(n):
-        for q in range(p + 1):
-            for a in range(6):
-                bend[p, q] += s[p, a] * s[q, a]
+        for a in range(6):
+            value = s[p, a]
+            if value != 0.0:
+                for q in range(p + 1):
+                    bend[p, q] += value * s[q, a]
 
 
 @kernel

@@ -30,7 +30,7 @@ _NORMAL_MEDIAN = 1.538  # median length of three unit normals
 _MOST_STEPS, _LONGEST = 50, 2.0
 _PRIOR = 1.0  # slope of the prior's logarithm, doubled: a variance's density goes as its root
 _DAMPING, _LESS, _MORE = 1.0, 0.1, 4.0
-_CLOSE = 0.1  # squared step in standard deviations of the noise; the next is its square
+_CLOSE = 0.3  # squared step in standard deviations of the noise; the next is its square
 _NEAR = 1e-2  # the same where weights are as good as final
 
 
