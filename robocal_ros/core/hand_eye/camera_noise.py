@@ -30,8 +30,8 @@ _NORMAL_MEDIAN = 1.538  # median length of three unit normals
 _MOST_STEPS, _LONGEST = 50, 2.0
 _PRIOR = 1.0  # slope of the prior's logarithm, doubled: a variance's density goes as its root
 _DAMPING, _LESS, _MORE = 1.0, 0.1, 4.0
-_CLOSE = 0.3  # squared step in standard deviations of the noise; the next is its square
-_NEAR = 1e-2  # the same where weights are as good as final
+_NEAR = 1e-2  # squared step in standard deviations of the noise: weights are as good as final
+_CLOSE = 0.3  # the same, from where the next may be as near
 
 
 @dataclass(frozen=True)
@@ -208,14 +208,15 @@ def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> Found
     chosen = np.flatnonzero(free)
     theta = noise.variances
     here = _weigh(seen, theta, chosen)
-    damping = 0.0
+    damping, last = 0.0, np.inf
     for turn in range(_MOST_STEPS if here.cost < np.inf else 0):
         step, size = here.step(damping)
         trial = theta.copy()
         trial[chosen] *= np.exp(step)
-        if size < _CLOSE:  # where one more step is exact enough
-            stayed = turn == 0 and size < _NEAR
-            return Found(noise_of(trial), True, stayed, here.spread(), here.best)
+        soon = turn > 0 and size < _CLOSE and size * size / last < _NEAR  # the next, as it shrinks
+        if size < _NEAR or soon:
+            return Found(noise_of(trial), True, turn == 0, here.spread(), here.best)
+        last = size
         there = _weigh(seen, trial, chosen)
         if there.cost <= here.cost:
             theta, here, damping = trial, there, _LESS * damping
