@@ -24,6 +24,7 @@ from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
 Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
+_SAME = 1e-3  # m, and rad: levers change by parts in a thousand
 _GENEROUS = 2.0  # what is excluded by too small a noise makes it smaller still
 _MANY = 40  # samples: so many bring the noise near to what all tell, in less time
 _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
@@ -162,23 +163,27 @@ class _Search:
 
     def run(self, near: PairState, far: PairState | None) -> PairFit:
         """The fit, from a state near the truth; placements from ``far`` where it is given."""
-        told, settled = None, True
+        told, keep = None, np.ones(len(self.pairs), dtype=np.bool_)
         parts = Parts.of(self.pairs, near.at.X)
         seen = Evidence.of(self.pairs, parts, near)
         noise = first_guess(seen.rows[:, :, -1], self.known)
-        if np.any(self.free) and self.enough:
-            told = self._first_noise(seen, near, noise)
-            noise, near = told.noise, near.after(told.best)
         state = near if far is None else far
+        if np.any(self.free) and self.enough:
+            keep = _likely(seen, noise)
+            told = self._first_noise(seen, near, keep, noise)
+            noise = told.noise
+            state = near.after(told.best) if far is None else far
         for _ in range(_ROUNDS):
             V, root = parts.covariances(noise)
             found = self._placed(state, root, noise)
-            if told is None:
+            used, state = ~found.rejected, found.state
+            settled = told is None or told.settled
+            if told is None or (np.array_equal(used, keep) and _together(near.at, state.at)):
                 break
-            state, parts = found.state, parts.moved(self.pairs, found.state.at.X)
-            seen = Evidence.of(self.pairs, parts, state).take(~found.rejected)
+            parts, near, keep = parts.moved(self.pairs, state.at.X), state, used
+            seen = Evidence.of(self.pairs, parts, state).take(used)
             told = estimate(seen.with_common(self.pairs.shared, state.common), self.free, noise)
-            settled = told.settled and told.stayed
+            settled = told.stayed
             if settled:
                 break
             noise = told.noise
@@ -186,10 +191,11 @@ class _Search:
         spread = np.zeros((k, k)) if told is None else told.spread
         return PairFit(self.pairs, noise, V, found, settled, spread)
 
-    def _first_noise(self, seen: Evidence, near: PairState, guess: PairNoise) -> Found:
-        """The likeliest noise by the samples that a guess does not exclude, first by some."""
+    def _first_noise(
+        self, seen: Evidence, near: PairState, keep: NDArray[np.bool_], guess: PairNoise
+    ) -> Found:
+        """The likeliest noise by samples to keep (m,), first by some of them."""
         shared = self.pairs.shared
-        keep = _likely(seen, guess)
         if np.sum(keep) > _MANY:
             few = seen.take(_thinned(keep)).with_common(shared, near.common)
             guess = estimate(few, self.free, guess).noise
@@ -205,6 +211,12 @@ class _Search:
             noise_known=self.enough or not np.any(self.free),
             robust=self.enough,
         )
+
+
+def _together(a: Placement, b: Placement) -> bool:
+    """Whether weights that follow from one placement do for the other."""
+    away = max(float(np.abs(a.X - b.X).max()), float(np.abs(a.Z - b.Z).max()))
+    return away < _SAME
 
 
 def _likely(seen: Evidence, guess: PairNoise) -> NDArray[np.bool_]:

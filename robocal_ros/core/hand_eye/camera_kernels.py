@@ -200,7 +200,7 @@ def _without(N: Array, apart: Array) -> float:
             for q in range(r, p):
                 entry += apart[r, q] * N[q, p]
             apart[r, p] = -entry / N[p, p]
-    return determinant + left
+    return float(determinant + left)
 
 
 @kernel

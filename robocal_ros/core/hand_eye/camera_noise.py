@@ -229,8 +229,9 @@ def estimate(seen: Evidence, free: NDArray[np.bool_], noise: PairNoise) -> Found
 class _Weighed:
     """The posterior of the noise at one point, in the logarithms of n variances.
 
-    ``cost``: -2 log density, infinite where the samples do not determine the unknowns; ``slope`` (n,), ``bend`` (n, n): its derivatives; ``drift`` (n, k): by
-    how much the best unknowns go along; ``best`` (k,): the step to them.
+    ``cost``: -2 log density, infinite where the samples do not determine the unknowns; ``slope``
+    (n,), ``bend`` (n, n): its derivatives; ``drift`` (n, k): by how much the best unknowns go
+    along; ``best`` (k,): the step to them.
     """
 
     cost: float
@@ -246,7 +247,7 @@ class _Weighed:
         if damping:
             damped = np.linalg.solve(self.bend + damping * np.eye(len(full)), self.slope)
         shorter = min(1.0, _LONGEST / max(float(np.max(np.abs(damped))), _LONGEST))
-        return -shorter * damped, float(self.slope @ full)
+        return np.asarray(-shorter * damped), float(self.slope @ full)
 
     def spread(self) -> Array:
         """Twice the covariance (k, k) that the unknowns have by the noise's own.
@@ -261,9 +262,8 @@ def _weigh(seen: Evidence, theta: Array, chosen: Index) -> _Weighed:
     """At variances (6,) of which some are ``chosen``."""
     parts, k, n = seen.parts, seen.rows.shape[2] - 1, len(theta)
     step, slope, bend, drift = np.zeros(k), np.zeros(n), np.zeros((n, n)), np.zeros((n, k))
-    cost = weigh(
-        seen.rows, parts.columns, parts.owner, parts.rest, theta, step, slope, bend, drift
-    )
+    split = (parts.columns, parts.owner, parts.rest)
+    cost = weigh(seen.rows, *split, theta, step, slope, bend, drift)
     some = theta[chosen]
     bent = np.outer(some, some) * bend[np.ix_(chosen, chosen)]
     bent[np.diag_indices_from(bent)] += _PRIOR  # at the top, where the likelihood rises as steeply
