@@ -268,5 +268,5 @@ def weigh(
             bend[q, p] = bend[p, q]
         for j in range(k):
             for q in range(j, k):
-                drift[p, j] -= apart[j, q] * pull[p, q]
+                drift[p, j] += apart[j, q] * pull[p, q]
     return cost
