@@ -200,13 +200,13 @@ def speed_table() -> Table:
         "hand_eye_camera_speed",
         f"Time to solve {MANY} samples",
         ("solver", "ms", "times ours", "goal"),
-        "Processor's own time, median of nine, taken in turn. Ours: start, noise, robust maximum likelihood, covariance. "
-        "Goal: 20 times faster than cv2.calibrateHandEye, whichever of its methods, by default: "
-        "with all noise estimated.",
+        "Processor's own time, median of nine, taken in turn. Ours: start, noise, robust maximum "
+        "likelihood, covariance. Goal: 20 times faster than cv2.calibrateHandEye, whichever of "
+        "its methods, by default: with all noise estimated.",
     )
     pairs = measured(BoardCell(noise=NOISE), MANY, np.random.default_rng(33))
     solvers: dict[str, Callable[[], object]] = {
-        "ours, all noise estimated": lambda: fit_pairs(replace(pairs, covariance=None)),
+        "ours, all noise estimated": partial(fit_pairs, replace(pairs, covariance=None)),
         "ours, covariance told, its scale and the robot's noise estimated": partial(
             fit_pairs, pairs
         ),

@@ -6,9 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.descent import FALSE_REJECTION, chi2_quantile
 from robocal_ros.core.estimation import Estimate, solve
-from robocal_ros.core.hand_eye.camera_kernels import whiten
 from robocal_ros.core.hand_eye.camera_model import PairProblem, PairState, linearised
 from robocal_ros.core.hand_eye.camera_noise import (
     Evidence,
@@ -25,7 +23,6 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
 _SAME = 1e-3  # m, and rad: levers change by parts in a thousand
-_GENEROUS = 2.0  # what is excluded by too small a noise makes it smaller still
 _MANY = 40  # samples: so many bring the noise near to what all tell, in less time
 _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
 
@@ -163,13 +160,13 @@ class _Search:
 
     def run(self, near: PairState, far: PairState | None) -> PairFit:
         """The fit, from a state near the truth; placements from ``far`` where it is given."""
-        told, keep = None, np.ones(len(self.pairs), dtype=np.bool_)
+        told = None
         parts = Parts.of(self.pairs, near.at.X)
         seen = Evidence.of(self.pairs, parts, near)
-        noise = first_guess(seen.rows[:, :, -1], self.known)
+        noise, keep = first_guess(seen.rows[:, :, -1], self.known)
         state = near if far is None else far
         if np.any(self.free) and self.enough:
-            keep = _likely(seen, noise)
+            keep = keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep)
             told = self._first_noise(seen, near, keep, noise)
             noise = told.noise
             state = near.after(told.best) if far is None else far
@@ -217,15 +214,6 @@ def _together(a: Placement, b: Placement) -> bool:
     """Whether weights that follow from one placement do for the other."""
     away = max(float(np.abs(a.X - b.X).max()), float(np.abs(a.Z - b.Z).max()))
     return away < _SAME
-
-
-def _likely(seen: Evidence, guess: PairNoise) -> NDArray[np.bool_]:
-    """Samples (m,) that a guess of the noise does not exclude."""
-    miss = seen.rows[:, :, -1:].copy()
-    whiten(seen.parts.covariances(guess)[1], miss)
-    limit = _GENEROUS**2 * chi2_quantile(1.0 - FALSE_REJECTION / len(miss), 6)
-    keep = np.einsum("mij,mij->m", miss, miss) < limit
-    return np.asarray(keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep))
 
 
 def _thinned(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -27,6 +27,7 @@ Index = NDArray[np.int64]
 SMALLEST_M, SMALLEST_RAD = 1e-7, 1e-7  # beyond any robot; keeps noise-free data solvable
 POSITION, TURN, TILT, ROLL, DEPTH, EXCESS = range(6)
 _NORMAL_MEDIAN = 1.538  # median length of three unit normals
+_STRAY = 6.0  # medians from which a sample may lead the noise astray
 _MOST_STEPS, _LONGEST = 50, 2.0
 _PRIOR = 1.0  # slope of the prior's logarithm, doubled: a variance's density goes as its root
 _DAMPING, _LESS, _MORE = 1.0, 0.1, 4.0
@@ -125,19 +126,17 @@ class Parts:
         return self if np.all(keep) else Parts(self.columns[keep], self.owner, self.rest[keep])
 
 
-def first_guess(miss: Array, known: Array) -> PairNoise:
-    """Unknown variances, nan in ``known`` (6,), from the median of the differences (m, 6).
+def first_guess(miss: Array, known: Array) -> tuple[PairNoise, NDArray[np.bool_]]:
+    """Noise whose unknown variances, nan in ``known`` (6,), come from differences (m, 6).
 
-    On the large side, as if each were all of the noise.
+    From their medians, as if each were all of the noise; and samples (m,) that are not far beyond.
     """
-    unknown = np.isnan(known)
-    if not np.any(unknown):
-        return noise_of(known)
-    place, turn = (
-        max(float(np.median(np.linalg.norm(part, axis=1))) / _NORMAL_MEDIAN, SMALLEST_M)
-        for part in (miss[:, :3], miss[:, 3:])
-    )
-    return noise_of(np.where(unknown, np.square([place, turn, turn, turn, place, 1.0]), known))
+    sizes = np.sqrt(np.einsum("mij,mij->mi", *2 * (miss.reshape(-1, 2, 3),)))
+    typical = np.maximum(np.median(sizes, axis=0), SMALLEST_M)
+    keep = np.all(sizes <= _STRAY * typical, axis=1)
+    place, turn = typical / _NORMAL_MEDIAN
+    guess = np.square([place, turn, turn, turn, place, 1.0])
+    return noise_of(np.where(np.isnan(known), guess, known)), np.asarray(keep)
 
 
 @dataclass(frozen=True, eq=False)
