@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
 _SAME = 1e-3  # m, and rad: levers change by parts in a thousand
-_MANY = 40  # samples: so many bring the noise near to what all tell, in less time
+_MANY = 30  # samples: so many bring the noise near to what all tell, in less time
 _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
 
 
@@ -217,7 +217,7 @@ def _together(a: Placement, b: Placement) -> bool:
 
 
 def _thinned(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """About 40 of many samples, spread evenly."""
+    """About 30 of many samples, spread evenly."""
     rows = np.flatnonzero(keep)
     few = np.zeros_like(keep)
     few[rows[np.linspace(0, len(rows) - 1, _MANY).astype(int)]] = True
