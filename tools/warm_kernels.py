@@ -5,7 +5,9 @@ Numba keeps the machine code beside the source, so that no node pays for it at i
 
 import numpy as np
 
-from robocal_ros.core import serialized_path
+from robocal_ros.core import frames, serialized_path
+from robocal_ros.core.hand_eye.camera_fit import fit_pairs
+from robocal_ros.core.hand_eye.pose_pairs import PosePairs
 from robocal_ros.core.identification import identify
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.core.kinematics import SerialArm
@@ -52,6 +54,7 @@ def main() -> None:
     position = T[:, :3, 3] + 0.1 * T[:, :3, 2] + noise
     data = Measurements(q=q, position=position, target=("tool",) * POSES, sample=names)
     identify(arm, data).cell.residual(data)
+    fit_pairs(PosePairs(T, frames.invert(T), names))
     load_kernels(arm)
     serialized_path.load_kernels()
 

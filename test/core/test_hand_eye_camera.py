@@ -31,7 +31,9 @@ from robocal_ros.core.hand_eye.camera_closed_forms import (
     closed_form_of_all,
 )
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
+from robocal_ros.core.hand_eye.camera_kernels import weigh
 from robocal_ros.core.hand_eye.camera_model import PairState, linearised
+from robocal_ros.core.hand_eye.camera_noise import Evidence, PairNoise, Parts, estimate
 from robocal_ros.core.hand_eye.camera_quality import left_out, unsettled
 from robocal_ros.core.hand_eye.camera_start import robust_start
 from robocal_ros.core.hand_eye.increments import moved
@@ -168,9 +170,85 @@ def test_unknown_noise_of_both_sides_is_found() -> None:
     _, pairs = measured(400, 5, noise=truth)
     noise = fit_pairs(pairs).noise
     # 1200 degrees of freedom each: 2 % of a sigma, more where components compete
-    assert np.sqrt(noise.variances[0]) == pytest.approx(5e-4, rel=0.12)
+    assert noise.position_m == pytest.approx(5e-4, rel=0.12)
     assert noise.turn_rad == pytest.approx(8e-4, rel=0.12)
-    assert noise.camera == pytest.approx(1.2e-3, rel=0.12)
+    assert noise.tilt_rad == pytest.approx(1.2e-3, rel=0.12)
+    assert noise.roll_rad == pytest.approx(1.2e-3, rel=0.2)
+    # there is none: what four sigmas of a variance from 400 numbers leave
+    assert noise.depth_m < 5e-4 * (16.0 * 2.0 / 400) ** 0.25
+
+
+def test_a_camera_that_sees_less_along_its_axis_is_found_out() -> None:
+    truth = BoardNoise(2e-4, 1e-3, (1e-4, 1e-4, 10e-4), (2e-3, 2e-3, 6e-4))
+    _, pairs = measured(400, 6, "to-hand", truth)
+    noise = fit_pairs(pairs).noise
+    # 400 degrees of freedom along the axis: 4 % of a sigma, more where components compete
+    assert noise.position_m == pytest.approx(np.hypot(2e-4, 1e-4), rel=0.25)
+    assert noise.turn_rad == pytest.approx(1e-3, rel=0.12)
+    assert noise.tilt_rad == pytest.approx(2e-3, rel=0.12)
+    assert noise.roll_rad == pytest.approx(6e-4, rel=0.4)  # beside the robot's 1e-3
+    assert noise.depth_m == pytest.approx(np.sqrt(10e-4**2 - 1e-4**2), rel=0.16)
+
+
+ANY_AXIS = BoardNoise(2e-4, 3e-4, (2e-4, 2e-4, 2e-4), (6e-4, 6e-4, 6e-4))
+
+
+@pytest.mark.parametrize("noise", [BoardNoise(), ANY_AXIS], ids=["along the axis", "any axis"])
+@pytest.mark.parametrize("mount", MOUNTS)
+def test_noise_that_is_estimated_costs_little(mount: str, noise: BoardNoise) -> None:
+    """Five variances from 108 numbers take 2.3 % of the error; a tenth of it is chance here."""
+    runs, count, chi_square = 120, 20, 0.0
+    given = GivenNoise(noise.robot_m, noise.robot_rad, camera_scale=1.0)
+    square = np.zeros((2, 2))
+    for seed in range(runs):
+        cell, pairs = measured(count, 9000 + seed, mount, noise)
+        told = replace(pairs, covariance=np.tile(noise.board_covariance, (count, 1, 1)))
+        for row, fit in enumerate((fit_pairs(pairs), fit_pairs(told, given))):
+            e = error(fit.at.X, cell.camera)
+            square[row] += e[:3] @ e[:3], e[3:] @ e[3:]
+            if row == 0:
+                chi_square += float(e @ np.linalg.solve(fit.covariance[:6, :6], e))
+    assert np.all(np.sqrt(square[0] / square[1]) < 1.0 + 2.0 * 2.5 / 108)
+    assert sound(chi_square, 6 * runs)
+
+
+@pytest.mark.parametrize("covariance", [True, False])
+def test_slopes_of_the_noise_are_those_of_its_likelihood(covariance: bool) -> None:
+    _, pairs = measured(9, 25)
+    pairs = replace(pairs, shared=Shared(np.full((9, 6, 1), 1e-3), np.eye(1)))
+    if not covariance:
+        pairs = replace(pairs, covariance=None)
+    state = PairState(robust_start(pairs), np.array([0.3]))
+    parts = Parts.of(pairs, state.at.X)
+    seen = Evidence.of(pairs, parts, state).with_common(pairs.shared, state.common)
+
+    def weighed(theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        step, slope, drift = np.zeros(13), np.zeros(6), np.zeros((6, 13))
+        kept = (seen.parts.columns, seen.parts.owner, seen.parts.rest)
+        cost = weigh(seen.rows, *kept, theta, step, slope, np.zeros((6, 6)), drift)
+        return cost, step, slope, drift
+
+    theta = np.array([4e-8, 9e-8, 1e-6, 4e-8, 1e-7, 0.7])
+    _, _, slope, drift = weighed(theta)
+    for one in np.unique(seen.parts.owner):
+        away = np.zeros(6)
+        away[one] = 1e-4 * theta[one]
+        more, less = weighed(theta + away), weighed(theta - away)
+        near = (more[0] - less[0]) / (2.0 * away[one])
+        assert slope[one] == pytest.approx(near, rel=1e-5, abs=1e-6 / theta[one])
+        moved_by = (more[1] - less[1]) / (2.0 * away[one])
+        assert drift[one] == pytest.approx(moved_by, rel=1e-4, abs=1e-6 * np.abs(moved_by).max())
+
+
+def test_noise_that_too_little_tells_is_not_settled() -> None:
+    _, pairs = measured(8, 26)
+    pairs = replace(pairs, T_base_flange=np.repeat(pairs.T_base_flange[:1], 8, axis=0))
+    state = PairState(Placement(np.eye(4), np.eye(4)), np.zeros(0))
+    seen = Evidence.of(pairs, Parts.of(pairs, np.eye(4)), state)
+    start = PairNoise(1e-3, 1e-3, excess=1.0)
+    found = estimate(seen, np.array([True, True, False, False, False, True]), start)
+    assert not found.settled
+    assert found.noise == start
 
 
 def test_a_camera_that_is_worse_than_it_says_is_found_out() -> None:

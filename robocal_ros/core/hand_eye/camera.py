@@ -186,7 +186,9 @@ def _noise_document(fit: PairFit, known: GivenNoise) -> Document:
         "noise": {
             "position_mm": noise.position_m * 1e3,
             "robot_turn_deg": float(np.degrees(noise.turn_rad)),
-            "camera_turn_deg": None if own else float(np.degrees(noise.camera)),
+            "camera_tilt_deg": None if own else float(np.degrees(noise.tilt_rad)),
+            "camera_roll_deg": None if own else float(np.degrees(noise.roll_rad)),
+            "camera_depth_mm": None if own else noise.depth_m * 1e3,
             "camera_scale": noise.camera_scale if own else None,
             "estimated": bool(np.any(np.isnan(known.variances(own)))),
         }

@@ -10,8 +10,9 @@ from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.hand_eye.camera_model import PairProblem, PairState, linearised
 from robocal_ros.core.hand_eye.camera_noise import (
     Evidence,
+    Found,
     PairNoise,
-    covariances,
+    Parts,
     estimate,
     first_guess,
 )
@@ -21,7 +22,8 @@ from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
 Array = NDArray[np.float64]
 
 _ROUNDS = 8  # of weights and noise in turn
-_SETTLED = 0.02  # of a standard deviation
+_SAME = 1e-3  # m, and rad: levers change by parts in a thousand
+_MANY = 30  # samples: so many bring the noise near to what all tell, in less time
 _ENOUGH_TO_DOUBT = 6  # samples: fewer tell neither outliers nor several variances
 
 
@@ -43,15 +45,18 @@ class GivenNoise:
     camera_scale: float | None = None
 
     def variances(self, own_covariance: bool) -> Array:
-        """(3,) as of `PairNoise`; nan where they are to be estimated."""
+        """(6,) as of `PairNoise`; nan where they are to be estimated."""
         unknown = float("nan")
         robot = unknown if self.robot_m is None else self.robot_m**2
         turn = unknown if self.robot_rad is None else self.robot_rad**2
         if own_covariance:
             scale = unknown if self.camera_scale is None else self.camera_scale**2 - 1.0
-            return np.array([robot, turn, scale])
-        place = unknown if self.camera_m is None else robot + self.camera_m**2
-        return np.array([place, turn, unknown if self.camera_rad is None else self.camera_rad**2])
+            return np.array([robot, turn, 0.0, 0.0, 0.0, scale])
+        place, depth = unknown, unknown
+        if self.camera_m is not None:
+            place, depth = robot + self.camera_m**2, 0.0
+        camera = unknown if self.camera_rad is None else self.camera_rad**2
+        return np.array([place, turn, camera, camera, depth, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,7 @@ class PairFit:
     noise : of both sides, given or estimated.
     expected : (m, 6, 6) covariance of the samples' differences by the noise alone.
     settled : whether noise and placements agree in the end; where the noise is known they do.
+    spread : (12 + s, 12 + s) what the covariance is larger by, because the noise was estimated.
     """
 
     pairs: PosePairs
@@ -70,6 +76,7 @@ class PairFit:
     expected: Array
     estimate: Estimate[PairState]
     settled: bool
+    spread: Array
 
     @property
     def at(self) -> Placement:
@@ -101,9 +108,10 @@ class PairFit:
     @property
     def whole_covariance(self) -> Array:
         """The same with the common errors (12 + s, 12 + s)."""
+        whole = self.estimate.covariance + self.spread
         if self.pairs.time_s is None:
-            return self.estimate.covariance
-        return self.estimate.covariance * correlation(self.estimate.residual[~self.rejected])
+            return whole
+        return whole * correlation(self.estimate.residual[~self.rejected])
 
     @property
     def rejected(self) -> NDArray[np.bool_]:
@@ -126,40 +134,94 @@ def fit_pairs(
         As `robocal_ros.core.estimation.solve`.
     """
     known = (given or GivenNoise()).variances(pairs.covariance is not None)
-    free = np.isnan(known)
     sound = robust_start(pairs) if sound is None else sound
     count = 0 if pairs.shared is None else len(pairs.shared.covariance)
-    state = PairState(start or sound, np.zeros(count))
-    enough = len(pairs) >= _ENOUGH_TO_DOUBT
-    noise = first_guess(pairs, sound, known)
-    X = sound.X  # not of a start that may be far off: weights follow from it
-    for _ in range(_ROUNDS):
-        V = covariances(pairs, X, noise)
-        scale = 1.0 if pairs.covariance is None else noise.camera_scale
-        problem = PairProblem.of(pairs, V, scale)
-        found = solve(
+    near = PairState(sound, np.zeros(count))
+    far = None if start is None else PairState(start, np.zeros(count))
+    return _Search(pairs, known).run(near, far)
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Noise and placements in turn; ``known`` (6,) variances are nan where they are unknown."""
+
+    pairs: PosePairs
+    known: Array
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """(6,) variances to be estimated."""
+        return np.isnan(self.known)
+
+    @property
+    def enough(self) -> bool:
+        """Whether the samples can tell outliers and several variances."""
+        return len(self.pairs) >= _ENOUGH_TO_DOUBT
+
+    def run(self, near: PairState, far: PairState | None) -> PairFit:
+        """The fit, from a state near the truth; placements from ``far`` where it is given."""
+        told = None
+        parts = Parts.of(self.pairs, near.at.X)
+        seen = Evidence.of(self.pairs, parts, near)
+        noise, keep = first_guess(seen.rows[:, :, -1], self.known)
+        state = near if far is None else far
+        if np.any(self.free) and self.enough:
+            keep = keep if np.sum(keep) >= _ENOUGH_TO_DOUBT else np.ones_like(keep)
+            told = self._first_noise(seen, near, keep, noise)
+            noise = told.noise
+            state = near.after(told.best) if far is None else far
+        for _ in range(_ROUNDS):
+            V, root = parts.covariances(noise)
+            found = self._placed(state, root, noise)
+            used, state = ~found.rejected, found.state
+            settled = told is None or told.settled
+            if told is None or (np.array_equal(used, keep) and _together(near.at, state.at)):
+                break
+            parts, near, keep = parts.moved(self.pairs, state.at.X), state, used
+            seen = Evidence.of(self.pairs, parts, state).take(used)
+            told = estimate(seen.with_common(self.pairs.shared, state.common), self.free, noise)
+            settled = told.stayed
+            if settled:
+                break
+            noise = told.noise
+        k = len(found.names)
+        spread = np.zeros((k, k)) if told is None else told.spread
+        return PairFit(self.pairs, noise, V, found, settled, spread)
+
+    def _first_noise(
+        self, seen: Evidence, near: PairState, keep: NDArray[np.bool_], guess: PairNoise
+    ) -> Found:
+        """The likeliest noise by samples to keep (m,), first by some of them."""
+        shared = self.pairs.shared
+        if np.sum(keep) > _MANY:
+            few = seen.take(_thinned(keep)).with_common(shared, near.common)
+            guess = estimate(few, self.free, guess).noise
+        return estimate(seen.take(keep).with_common(shared, near.common), self.free, guess)
+
+    def _placed(self, state: PairState, root: Array, noise: PairNoise) -> Estimate[PairState]:
+        """The most likely placements for one noise."""
+        problem = PairProblem(self.pairs, root, noise.camera_scale)
+        return solve(
             problem,
             state,
             prior_information=problem.prior_information,
-            noise_known=enough or not np.any(free),
-            robust=enough,
+            noise_known=self.enough or not np.any(self.free),
+            robust=self.enough,
         )
-        before, settled, state, X = noise, True, found.state, found.state.at.X
-        if np.any(free) and enough:
-            miss, J = linearised(pairs, state)
-            keep = ~found.rejected
-            used = pairs if np.all(keep) else pairs.take(keep)
-            seen = Evidence.of(used, X, miss[keep], J[keep], state.common)
-            noise, settled = estimate(seen, free, noise)
-        settled = settled and _same(before, noise)
-        if settled:
-            break
-    return PairFit(pairs, noise, V, found, settled)
 
 
-def _same(before: PairNoise, after: PairNoise) -> bool:
-    old, new = np.sqrt(before.variances), np.sqrt(after.variances)
-    return bool(np.all(np.abs(new - old) <= _SETTLED * np.maximum(old, new)))
+def _together(a: Placement, b: Placement) -> bool:
+    """Whether weights that follow from one placement do for the other."""
+    away = max(float(np.abs(a.X - b.X).max()), float(np.abs(a.Z - b.Z).max()))
+    return away < _SAME
+
+
+def _thinned(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """About 30 of many samples, spread evenly."""
+    rows = np.flatnonzero(keep)
+    few = np.zeros_like(keep)
+    few[rows[np.linspace(0, len(rows) - 1, _MANY).astype(int)]] = True
+    return few
 
 
 def correlation(residual: Array) -> float:

@@ -1,13 +1,19 @@
 """The model of a hand-eye calibration, as the estimators take it."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.increments import moved
-from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs, differences, predicted
+from robocal_ros.core.hand_eye.camera_kernels import advance, differentiate, whiten
+from robocal_ros.core.hand_eye.pose_pairs import (
+    Placement,
+    PosePairs,
+    differences,
+    plain,
+    predicted,
+)
 
 Array = NDArray[np.float64]
 
@@ -27,6 +33,13 @@ class PairState:
     at: Placement
     common: Array
 
+    def after(self, step: Array) -> "PairState":
+        """The state after increments (12 + s,), as of `linearised`."""
+        X, Z = np.empty((4, 4)), np.empty((4, 4))
+        advance(plain(self.at.X), step[:6], X)
+        advance(plain(self.at.Z), step[6:12], Z)
+        return PairState(Placement(X, Z), self.common + step[12:])
+
 
 def linearised(pairs: PosePairs, state: PairState) -> tuple[Array, Array]:
     """Differences (m, 6), camera axes, m and rad, and their Jacobian (m, 6, 12 + s).
@@ -35,16 +48,9 @@ def linearised(pairs: PosePairs, state: PairState) -> tuple[Array, Array]:
     common to all.
     """
     T = predicted(pairs, state.at)
-    R, p = T[:, :3, :3], T[:, :3, 3]
     miss = differences(T, pairs)
-    m, s = len(pairs), len(state.common)
-    J = np.zeros((m, 6, 12 + s))
-    turning = frames.left_jacobian_inverse(miss[:, 3:])
-    J[:, :3, :3] = -np.eye(3)
-    J[:, :3, 3:6] = frames.skew(p)
-    J[:, 3:, 3:6] = -turning
-    J[:, :3, 6:9] = R
-    J[:, 3:, 9:12] = turning @ R
+    J = np.zeros((len(pairs), 6, 12 + len(state.common)))
+    differentiate(T, miss, J)
     if pairs.shared is not None:
         J[:, :, 12:] = -pairs.shared.sensitivity
         miss = miss - pairs.shared.sensitivity @ state.common
@@ -53,30 +59,33 @@ def linearised(pairs: PosePairs, state: PairState) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class PairProblem:
-    """`linearised`, whitened by the covariance (m, 6, 6) of each sample's differences."""
+    """`linearised`, whitened by the lower roots (m, 6, 6) of the differences' covariances.
+
+    ``common_scale``: by how much common errors are larger than told.
+    """
 
     pairs: PosePairs
-    whitening: Array
-    names: tuple[str, ...]
+    root: Array
     common_scale: float
     scale_components: int = 6
 
-    @classmethod
-    def of(cls, pairs: PosePairs, covariance: Array, common_scale: float) -> "PairProblem":
-        """With the inverse roots of the covariances; common errors so much larger than told."""
-        count = 0 if pairs.shared is None else len(pairs.shared.covariance)
-        names = (*NAMES, *(f"common_{i + 1}" for i in range(count)))
-        return cls(pairs, np.linalg.inv(np.linalg.cholesky(covariance)), names, common_scale)
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of the unknowns."""
+        count = 0 if self.pairs.shared is None else len(self.pairs.shared.covariance)
+        return (*NAMES, *(f"common_{i + 1}" for i in range(count)))
 
     def linearise(self, state: PairState) -> tuple[Array, Array]:
         """Whitened differences (m, 6) and their Jacobian."""
         miss, J = linearised(self.pairs, state)
-        return (self.whitening @ miss[..., None])[..., 0], self.whitening @ J
+        white = miss[:, :, None]
+        whiten(self.root, white)
+        whiten(self.root, J)
+        return miss, J
 
     def retract(self, state: PairState, step: Array) -> PairState:
         """The state after a step (12 + s,)."""
-        at = Placement(moved(state.at.X, step[:6]), moved(state.at.Z, step[6:12]))
-        return PairState(at, state.common + step[12:])
+        return state.after(step)
 
     def deviation(self, state: PairState) -> Array:
         """Of the common errors from their mean, zero."""

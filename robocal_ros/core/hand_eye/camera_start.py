@@ -60,12 +60,12 @@ def score(pairs: PosePairs, at: Placement) -> float:
 
 def _closed_forms(pairs: PosePairs, weights: Array) -> list[Placement]:
     """Placements for each set of weights (s, m)."""
-    carrier, board = pairs.T_boardside_cameraside, pairs.T_camera_board
+    carrier, board = pairs.for_kernels
     Ra, Rb = carrier[:, :3, :3], board[:, :3, :3]
-    m = len(Ra)
     # vec(R_Z) = (R_board_camera (x) R_carrier) vec(R_X), columns stacked
-    products = np.einsum("mji,mkl->mikjl", Rb, Ra).reshape(m, 81)
-    U, _, Vt = np.linalg.svd((weights @ products).reshape(-1, 9, 9))
+    sums = (weights[:, None, :] * Rb.reshape(-1, 9).T) @ Ra.reshape(-1, 9)
+    products = sums.reshape(-1, 3, 3, 3, 3).transpose(0, 2, 3, 1, 4)
+    U, _, Vt = np.linalg.svd(products.reshape(-1, 9, 9))
     R_X = _rotations(Vt[:, 0].reshape(-1, 3, 3).swapaxes(1, 2))
     R_Z = _rotations(U[:, :, 0].reshape(-1, 3, 3).swapaxes(1, 2))
     found = []

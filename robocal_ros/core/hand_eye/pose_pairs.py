@@ -1,15 +1,16 @@
 """Pairs of a robot's pose and of what a camera (or a tracker) saw from there."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.camera_kernels import compare, predict
 
 Array = NDArray[np.float64]
-_STRAIGHT = 1e-12  # sine of an angle that is its sine to the last digit
 _NEARLY_BACK = -0.9
 Mount = Literal["in-hand", "to-hand"]
 
@@ -65,6 +66,11 @@ class PosePairs:
         """
         return self.T_base_flange if self.mount == "in-hand" else frames.invert(self.T_base_flange)
 
+    @cached_property
+    def for_kernels(self) -> tuple[Array, Array]:
+        """``T_boardside_cameraside`` and ``T_camera_board``, as kernels take them."""
+        return plain(self.T_boardside_cameraside), plain(self.T_camera_board)
+
     @property
     def distance_m(self) -> float:
         """Mean distance of the board from the camera."""
@@ -96,29 +102,25 @@ class Placement:
 
 def predicted(pairs: PosePairs, at: Placement) -> Array:
     """T_camera_board (m, 4, 4) as the robot's poses have it."""
-    return np.asarray(frames.invert(pairs.T_boardside_cameraside @ at.X) @ at.Z)
+    carrier, _ = pairs.for_kernels
+    T = np.empty_like(carrier)
+    predict(carrier, plain(at.X), plain(at.Z), T)
+    return T
 
 
 def differences(predicted_T: Array, pairs: PosePairs) -> Array:
     """Difference (m, 6) of predicted from seen board poses: position and turn, camera axes."""
-    seen = pairs.T_camera_board
-    turn = _log(predicted_T[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2))
-    return np.concatenate([predicted_T[:, :3, 3] - seen[:, :3, 3], turn], axis=1)
+    _, seen = pairs.for_kernels
+    miss = np.empty((len(seen), 6))
+    if compare(plain(predicted_T), seen, miss) < _NEARLY_BACK:
+        turn = predicted_T[:, :3, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2)
+        miss[:, 3:] = frames.log_rotation(turn)
+    return miss
 
 
-def _log(R: Array) -> Array:
-    """`frames.log_rotation` of many rotations (m, 3, 3), most of them small."""
-    sine = 0.5 * np.stack(
-        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], 1
-    )
-    length = np.sqrt(np.einsum("mi,mi->m", sine, sine))
-    cosine = 0.5 * (np.einsum("mii->m", R) - 1.0)
-    w = sine * (np.arctan2(length, cosine) / np.maximum(length, np.finfo(float).tiny))[:, None]
-    w[length < _STRAIGHT] = sine[length < _STRAIGHT]
-    large = cosine < _NEARLY_BACK
-    if np.any(large):  # the sine loses the axis
-        w[large] = frames.log_rotation(R[large])
-    return np.asarray(w)
+def plain(values: Array) -> Array:
+    """As kernels take it: in one piece, and not read-only, which would be another type to them."""
+    return np.require(values, np.float64, ("C", "W"))
 
 
 def levers(pairs: PosePairs, X: Array) -> Array:
