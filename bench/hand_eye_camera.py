@@ -37,7 +37,7 @@ from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePo
 
 Array = NDArray[np.float64]
 
-RUNS, SAMPLES = 500, 20
+RUNS, SAMPLES = 2000, 20  # a ratio to within one part in a hundred
 IMAGE_RUNS, IMAGES, NOISE_PX = 100, 15, 0.2
 MANY = 200
 NOISE = BoardNoise()
