@@ -31,7 +31,8 @@ from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.run import run
 from robocal_ros.sessions.correction.inputs import trajectory_command
 from robocal_ros.sim.beams import RoundTool
-from robocal_ros.sim.cell import TICK_S, SimulatedCell, known_laser
+from robocal_ros.sim.cell import TICK_S, SimulatedCell
+from robocal_ros.sim.cell_plan import known_laser
 from robocal_ros.storage.files import write_text
 
 BEHIND_S = 1.0  # a longer pause of the process, or a jump of its clock, is none of the cell's
@@ -71,7 +72,6 @@ class CellSimNode(HouseNode):
     def activate(self) -> None:
         """The cell goes on from where it stood."""
         self._origin_ns: int | None = None
-        self._joints_ns = 0
         self._step: PlannedStep | None = None
         self._driven: tuple[int, int] | None = None
         self._shown: RoundTool | None = None
@@ -89,7 +89,7 @@ class CellSimNode(HouseNode):
     def settings_changed(self) -> None:
         """Another fault, or another bend: each from the next motion on."""
         if self._cell is not None:
-            self._cell.fault = self.settings["fault"]
+            self._cell.set_fault(self.settings["fault"])
             self._cell.next_tool = bent_tool(self.settings, self._arm)
 
     # ---- what comes in --------------------------------------------------------------------------
@@ -129,9 +129,9 @@ class CellSimNode(HouseNode):
             self._drive(cell, self._step)
         came = cell.advance((now_ns - self._origin_ns) * 1e-9)
         self._show_truth(cell, now_ns)
-        self._tell_joints(cell, came.time_s, came.q, came.qd)
+        self._tell_joints(came.time_s, came.q, came.qd)
         station = self.settings["station"]
-        if cell.fault == "wrong_station":
+        if "wrong_station" in cell.faults:
             station += OTHER_STATION
         for edge in came.edges:
             self._edges.publish(beam_event(edge, self._stamp_ns(edge.time_s), station))
@@ -150,15 +150,10 @@ class CellSimNode(HouseNode):
 
     # ---- what goes out --------------------------------------------------------------------------
 
-    def _tell_joints(self, cell: SimulatedCell, time_s: Any, q: Any, qd: Any) -> None:
-        if cell.fault == "joints_silent":
-            return
-        names, frozen = list(self._arm.joint_names), cell.fault == "frozen_clock"
+    def _tell_joints(self, time_s: Any, q: Any, qd: Any) -> None:
+        names = list(self._arm.joint_names)
         for t, position, velocity in zip(time_s.tolist(), q, qd, strict=True):
-            stamp_ns = self._stamp_ns(t)
-            if not frozen:
-                self._joints_ns = stamp_ns
-            self._joints.publish(joint_state(names, self._joints_ns, position, velocity))
+            self._joints.publish(joint_state(names, self._stamp_ns(t), position, velocity))
             self._told += 1
 
     def _show_truth(self, cell: SimulatedCell, now_ns: int) -> None:
@@ -179,8 +174,8 @@ class CellSimNode(HouseNode):
             return health
         if self._refused:
             health.worsen(WARN, self._refused)
-        if cell.fault != "none":
-            health.worsen(WARN, f"simulated fault: {cell.fault}")
+        if cell.faults.sizes:
+            health.worsen(WARN, f"simulated fault: {', '.join(cell.faults.sizes)}")
         health.values = {
             "moving": cell.moving,
             "joint states sent": self._told,

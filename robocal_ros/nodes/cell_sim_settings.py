@@ -12,8 +12,8 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
-from robocal_ros.sim.cell import CellPlan, rigid_robot
 from robocal_ros.sim.cell_faults import FAULTS
+from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]

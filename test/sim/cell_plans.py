@@ -11,7 +11,9 @@ from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
 from robocal_ros.sim.beams import NO_NOISE, PERFECT, RoundTool, TrueInput, TrueNoise, bent
-from robocal_ros.sim.cell import CellPlan, Happened, SimulatedCell, rigid_robot
+from robocal_ros.sim.cell import SimulatedCell
+from robocal_ros.sim.cell_outputs import Happened
+from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
 from robocal_ros.sim.ur10_station import TAUGHT
 from robocal_ros.storage.robots import load_robot
 

@@ -14,7 +14,8 @@ from robocal_ros.core.tool.laser_frame import calibrate_laser
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
 from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise
-from robocal_ros.sim.cell import TICK_S, SimulatedCell, known_laser
+from robocal_ros.sim.cell import TICK_S, SimulatedCell
+from robocal_ros.sim.cell_plan import known_laser
 from robocal_ros.sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
 
 NOISE = TrueNoise(3e-5, 1e-5)
@@ -164,18 +165,18 @@ def test_the_seed_tells_everything_whenever_the_cell_is_asked():
 )
 def test_faults_of_the_input_from_the_next_motion_on(fault, x, y):
     cell = SimulatedCell(plan_of())
-    cell.fault = fault
-    assert cell.fault == "none"
+    cell.set_fault(fault)
+    assert not cell.faults.sizes
     came = keys(driven(cell, circle()).edges)
-    assert cell.fault == fault
+    assert list(cell.faults.sizes) == [fault]
     assert [sum(beam == b for beam, _ in came) for b in "xy"] == [x, y]
-    cell.fault = "none"
+    cell.set_fault("none")
     assert len(driven(cell, circle()).edges) == 8
 
 
 def test_chatter_does_not_settle():
     cell = SimulatedCell(plan_of())
-    cell.fault = "chatter"
+    cell.set_fault("chatter")
     edges = driven(cell, circle()).edges
     with pytest.raises(BeamError, match="chatters"):
         debounced(edges, 5e-4)
@@ -183,7 +184,7 @@ def test_chatter_does_not_settle():
 
 def test_a_hand_moves_the_flange_and_no_joint():
     cell = SimulatedCell(plan_of())
-    cell.fault = "moved_by_hand"
+    cell.set_fault("moved_by_hand")
     cell.drive(circle())
     time = np.arange(0.0, cell.motion.end_s, 1e-3)
     q = cell.motion.at(time)[0]
