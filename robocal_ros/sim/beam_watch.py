@@ -29,14 +29,16 @@ class BeamWatch:
         tool: RoundTool,
         ticks: NDArray[np.int64],
         time_s: Array,
+        q: Array,
         joints: Callable[[Array], Array],
         flange: Callable[[Array], Array],
     ) -> list[BeamEdge]:
         """Edges between ticks (k,) at times (k,), in the order of the ticks.
 
-        ``joints`` and ``flange``: readings (m, n) and true T_base_flange (m, 4, 4) at times (m,).
+        ``q`` (k, n): joints there; ``joints`` and ``flange``: joints (m, n) and true T_base_flange
+        (m, 4, 4) at times (m,).
         """
-        first, last = self._near(station, tool, joints(time_s))
+        first, last = self._near(station, tool, q)
         if last - first < 1:
             return []
         inside = slice(first, last + 1)

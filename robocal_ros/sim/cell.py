@@ -75,9 +75,8 @@ class SimulatedCell:
         self._ticks = self._motions = 0
         self._way = np.zeros((BEAT, plan.arm.n))
         self._out = Outbox()
-        self._see_edges(
-            np.arange(2), TICK_S * np.arange(2)
-        )  # what it loads shall not stop a motion
+        # What it loads at its first use shall not stop a motion.
+        self._see_edges(np.arange(2), np.array([0.0, TICK_S]), np.tile(plan.q_start, (2, 1)))
 
     @property
     def now_s(self) -> float:
@@ -190,7 +189,7 @@ class SimulatedCell:
         return plan.robot.point(plan.working, Warmth.cold(plan.arm.n), p)
 
     def _joints(self, time_s: Array) -> Array:
-        return self.motion.at(time_s)[0]
+        return self.motion.joints(time_s)
 
     def _pass(self, stop: int) -> None:
         """From tick to tick, at most to the next beat."""
@@ -202,9 +201,9 @@ class SimulatedCell:
         for tick in departed.tolist():
             self._depart(tick)
         if not np.all(stood) or self._scatter.settled_s > time[0]:
-            self._see_edges(ticks, time)
+            self._see_edges(ticks, time, q)
         if self.plan.sphere:
-            self._see_sphere(self.plan.sphere, ticks[1:], stood)
+            self._see_sphere(self.plan.sphere, ticks[1:], q[1:], stood)
         begin = now % BEAT
         self._way[begin : begin + len(way)] = way
         self._ticks = stop
@@ -213,20 +212,21 @@ class SimulatedCell:
             swapped = "swapped_temperatures" in self.faults
             self._out.temperatures.append(self.heating.tell(self.now_s, stop // BEAT, swapped))
 
-    def _see_edges(self, ticks: Index, time_s: Array) -> None:
+    def _see_edges(self, ticks: Index, time_s: Array, q: Array) -> None:
         station = self.faults.station(self._station)
-        found = self._watch.edges(station, self.tool, ticks, time_s, self._joints, self.flange)
+        found = self._watch.edges(station, self.tool, ticks, time_s, q, self._joints, self.flange)
         lost = self.faults.size("lost_messages")
         for edge in self._input.passed(found):
             place = round(edge.time_s * 1e9)
             if not lost or self._draws.of(Stream.LOST_EDGES, place).random() >= lost:
                 self._out.add_edge(edge)
 
-    def _see_sphere(self, sphere: SphereStation, ticks: Index, stood: Index) -> None:
+    def _see_sphere(self, sphere: SphereStation, ticks: Index, q: Array, stood: Index) -> None:
         """Measure where the robot has ``stood`` still for so many ticks."""
         settle, period = round(sphere.settle_s / TICK_S), round(sphere.period_s / TICK_S)
-        due = (stood >= settle) & ((stood - settle) % period == 0)
-        for tick in ticks[due].tolist():
+        due = np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0))
+        near = [i for i in due.tolist() if sphere.near(self.plan.arm.fk(q[i]))]
+        for tick in ticks[near].tolist():
             T = self.flange(np.array([tick * TICK_S]))[0]
             if sphere.sees(T):
                 rise = float(self.warmth.link[-1])

@@ -79,9 +79,15 @@ class JointMotion:
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Joints (k, n) and their velocities at times (k,) from the last trajectory's begin on."""
         t = np.asarray(time_s, dtype=np.float64)
-        inside = np.clip(t, self._begin_s - EARLIER_S, self.end_s)
         moving = (t < self.end_s)[:, None]
-        return np.asarray(self._path(inside)), np.where(moving, self._rate(inside), 0.0)
+        return self.joints(t), np.where(moving, self._rate(self._inside(t)), 0.0)
+
+    def joints(self, time_s: Array) -> Array:
+        """The joints (k, n) alone."""
+        return np.asarray(self._path(self._inside(time_s)))
+
+    def _inside(self, time_s: Array) -> Array:
+        return np.clip(time_s, self._begin_s - EARLIER_S, self.end_s)
 
     def _stand(self, now_s: float, q: Array) -> None:
         from scipy.interpolate import BPoly

@@ -20,7 +20,6 @@ from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, 
 from robocal_ros.sim.cell_plan import CellPlan
 from robocal_ros.sim.drift import UNCORRECTED
 from robocal_ros.sim.heating import HeatPlan
-from robocal_ros.sim.motion import JITTER_RAD
 from robocal_ros.sim.poses import read_poses
 from robocal_ros.sim.robot import Effects, TrueRobot
 from robocal_ros.sim.sphere_station import SphereStation
@@ -50,12 +49,17 @@ def poses(kind: str) -> Array:
 
 
 def kr150_cell(
-    nominal: SerialArm, seed: int = 1, effects: Effects | None = None, points: int = 2000
+    nominal: SerialArm,
+    seed: int = 1,
+    effects: Effects | None = None,
+    points: int = 2000,
+    reading_noise_rad: float = 0.0,
 ) -> CellPlan:
     """The cell with an individual robot, at home.
 
-    ``nominal``: the type's arm; ``points`` of a sphere's cloud, 0: centres alone. The robot's drift
-    has the published size: with the programme all day, 45 % of the tip's coordinates at the working
+    ``nominal``: the type's arm; ``points`` of a sphere's cloud, 0: centres alone;
+    ``reading_noise_rad``: of the encoders, which then show whole counts too. The robot's drift has
+    the published size: with the programme all day, 45 % of the tip's coordinates at the working
     poses stay within 0.1 mm.
     """
     arm = replace(nominal, T_flange_tool=TAUGHT)
@@ -65,7 +69,7 @@ def kr150_cell(
         station=BeamStation(beams_of(T_BASE_LASER, BEAM_ANGLE_RAD, BEAM_GAP_M), INPUT, NOISE),
         tool=RoundTool.cylinder(TAUGHT, PIN_RADIUS_M),
         q_start=poses("home")[0],
-        reading_noise_rad=JITTER_RAD,
+        reading_noise_rad=reading_noise_rad,
         heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),
         working=poses("work"),
