@@ -26,7 +26,8 @@ class CellPlan:
     robot : the true one; its ``nominal`` is what the program and the readings' users know.
     station : the true one; its ``noise`` is the robot's scatter there.
     tool : as it is mounted at the begin.
-    q_start : (n,) where the robot stands then, with a straight tool above the station.
+    q_start : (n,) where the robot stands then.
+    q_above : (n,) with a straight tool above the station; None: as ``q_start``.
     rate_hz, reading_noise_rad : of the joint readings; without noise they are exact.
     ripple : relative, of the speed of circles that the robot's program drives.
     heat : what warms it up; None: it stays cold.
@@ -41,6 +42,7 @@ class CellPlan:
     rate_hz: float = 125.0
     reading_noise_rad: float = 0.0
     ripple: float = 0.02
+    q_above: Array | None = None
     heat: HeatPlan | None = None
     sphere: SphereStation | None = None
     working: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -75,12 +77,18 @@ def rigid_robot(nominal: SerialArm, error_m: float, rng: np.random.Generator) ->
 def known_laser(plan: CellPlan, T_base_laser: Array, rng: np.random.Generator) -> dict[str, Array]:
     """Flange positions (3,) A1 ... D4 with which this robot places the station's beams, base, m.
 
-    They bear its scatter, the input's errors, and its geometric error as it is at ``q_start``.
+    They bear its scatter, the input's errors, and its geometric error as it is above the station.
     """
-    arm, q = plan.arm, plan.q_start
+    arm, q = plan.arm, plan.q_start if plan.q_above is None else plan.q_above
     true = plan.robot.flange(q, Warmth.cold(arm.n))[0]
     T_known_true = arm.fk(q) @ frames.invert(true)
-    points = laser_points(plan.station, T_base_laser, rng)
-    return {
-        name: T_known_true[:3, :3] @ place + T_known_true[:3, 3] for name, place in points.items()
-    }
+    seen = [
+        replace(beam, start=_moved(T_known_true, beam.start), end=_moved(T_known_true, beam.end))
+        for beam in plan.station.beams
+    ]
+    station = replace(plan.station, beams=(seen[0], seen[1]))
+    return laser_points(station, T_known_true @ T_base_laser, rng)
+
+
+def _moved(T: Array, p: Array) -> Array:
+    return np.asarray(T[:3, :3] @ p + T[:3, 3])

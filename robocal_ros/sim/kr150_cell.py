@@ -29,10 +29,8 @@ Array = NDArray[np.float64]
 
 TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.40])  # the pin, longer than the ball's stem
 PIN_RADIUS_M = 2.5e-3
-T_BASE_LASER = frames.transform(
-    frames.exp_rotation([0.0, 0.0, np.radians(-135.0)]) @ frames.exp_rotation([0.02, -0.03, 0.0]),
-    [1.25, 1.00, 0.60],
-)
+T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.03, 0.01]), [1.25, 1.00, 0.60])
+SPIN_RAD = float(np.radians(-135.0))  # of the flange about the laser's z, where the robot measures
 BEAM_ANGLE_RAD = float(np.radians(91.4))
 BEAM_GAP_M = 5.8e-5
 INPUT = TrueInput(latency_s=0.004)
@@ -69,6 +67,7 @@ def kr150_cell(
         station=BeamStation(beams_of(T_BASE_LASER, BEAM_ANGLE_RAD, BEAM_GAP_M), INPUT, NOISE),
         tool=RoundTool.cylinder(TAUGHT, PIN_RADIUS_M),
         q_start=poses("home")[0],
+        q_above=poses("tool")[0],
         reading_noise_rad=reading_noise_rad,
         heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),

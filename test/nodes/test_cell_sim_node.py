@@ -301,8 +301,8 @@ class WholeCell(Cell):
             "/cell_sim_node/truth/state": String,
         }
         self.told = {topic: graph.collect(kind, topic) for topic, kind in kinds.items()}
-        self.to_judge = graph.publisher(JointTrajectory, "/cell_sim_node/truth/commanded")
         super().__init__(graph, cell="kr150", **parameters)
+        self.to_judge = graph.publisher(JointTrajectory, "/cell_sim_node/truth/commanded")
 
     @property
     def names(self) -> list[str]:

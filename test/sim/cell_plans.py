@@ -43,10 +43,14 @@ def driven(cell: SimulatedCell, step) -> Happened:
 
 
 def measured(
-    cell: SimulatedCell, laser: LaserFrame, noise: RobotNoise, taught: np.ndarray = TAUGHT
+    cell: SimulatedCell,
+    laser: LaserFrame,
+    noise: RobotNoise,
+    taught: np.ndarray = TAUGHT,
+    spin_rad: float = 0.0,
 ) -> tuple[ToolEstimate, list[int]]:
     """A whole run with each step driven as it follows from those before; edges of each step."""
-    plan, arm = MeasuringPlan("full", laser, taught), cell.plan.arm
+    plan, arm = MeasuringPlan("full", laser, taught, spin_rad=spin_rad), cell.plan.arm
     steps, time, q, seen = [], [], [], None
 
     def estimate(held: Held) -> ToolEstimate:

@@ -8,7 +8,7 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_outputs import Happened
-from robocal_ros.sim.kr150_cell import TAUGHT, kr150_cell, poses
+from robocal_ros.sim.kr150_cell import SPIN_RAD, TAUGHT, kr150_cell, poses
 from robocal_ros.sim.production import programme
 from robocal_ros.sim.robot import Effects
 from robocal_ros.sim.ur10_station import laser_of
@@ -56,4 +56,6 @@ def true_laser(cell: SimulatedCell) -> LaserFrame:
 
 
 def first_circle(cell: SimulatedCell):
-    return replace(MeasuringPlan("full", true_laser(cell), TAUGHT).step(1), speed_m_s=0.1)
+    return replace(
+        MeasuringPlan("full", true_laser(cell), TAUGHT, spin_rad=SPIN_RAD).step(1), speed_m_s=0.1
+    )

@@ -27,7 +27,7 @@ from robocal_ros.core.tool.crossed_model import RobotNoise
 from robocal_ros.sim import kr150
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_samples import CellSamples
-from robocal_ros.sim.kr150_cell import DUTY, TAUGHT, kr150_cell
+from robocal_ros.sim.kr150_cell import DUTY, SPIN_RAD, TAUGHT, kr150_cell
 from robocal_ros.sim.production import programme
 from robocal_ros.sim.robot import Effects
 from robocal_ros.sim.thermal import Warmth
@@ -204,9 +204,9 @@ def test_a_bend_is_found_at_the_beams():
     cell, noise = cell_of(2), RobotNoise(3e-5, 1e-5)
     went(cell, ABOVE)
     laser = true_laser(cell)
-    healthy, _ = measured(cell, laser, noise, TAUGHT)
+    healthy, _ = measured(cell, laser, noise, TAUGHT, SPIN_RAD)
     cell.set_fault("collision", 3.0)
-    bent, counts = measured(cell, laser, noise, TAUGHT)
+    bent, counts = measured(cell, laser, noise, TAUGHT, SPIN_RAD)
     assert counts == [8, 8, 8, 4, 4]
     change = cell.tool.T_flange_tool[:3, 3] - TAUGHT[:3, 3]
     sigma = np.sqrt(np.diag(healthy.covariance + bent.covariance)[:3])

@@ -11,7 +11,7 @@ from robocal_ros.core.motion.housing import Housing, ToolBody
 from robocal_ros.core.motion.measuring import approach, measuring
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
 from robocal_ros.sim import kr150
-from robocal_ros.sim.kr150_cell import FLOOR, T_BASE_LASER, TAUGHT
+from robocal_ros.sim.kr150_cell import FLOOR, SPIN_RAD, T_BASE_LASER, TAUGHT
 from robocal_ros.sim.robot import shift, turn
 from robocal_ros.sim.thermal import Warmth
 
@@ -130,7 +130,7 @@ def test_a_whole_tool_measurement_can_be_driven_from_above_the_station():
     body = ToolBody(TAUGHT, 0.10, 0.01, 0.06)
     laser = true_laser(cell)
     motion = MotionCell(ARM, body, laser.T_base_laser, Housing(0.06, 0.03, -0.12, 0.10))
-    plan, q, after = MeasuringPlan("full", laser, TAUGHT), ABOVE, False
+    plan, q, after = MeasuringPlan("full", laser, TAUGHT, spin_rad=SPIN_RAD), ABOVE, False
     for number in range(1, len(plan.names) + 1):
         step = plan.step(number, TAUGHT if plan.needs_tool(number) else None)
         q = approach(motion, step, q, after_circle=after).q[-1]
