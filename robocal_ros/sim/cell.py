@@ -6,6 +6,7 @@ each time it moves after a rest. Every random number belongs to its place in tim
 not matter when the cell is asked, and what is switched on or off leaves all else alone.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -31,6 +32,7 @@ from robocal_ros.sim.draws import Draws, Stream
 from robocal_ros.sim.heating import Heating
 from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.joint_readings import JointReadings
+from robocal_ros.sim.profile_station import ProfileStation
 from robocal_ros.sim.scatter import Scatter
 from robocal_ros.sim.sphere_station import SphereStation
 from robocal_ros.sim.standing import Standing
@@ -204,6 +206,8 @@ class SimulatedCell:
             self._see_edges(ticks, time, q)
         if self.plan.sphere:
             self._see_sphere(self.plan.sphere, ticks[1:], q[1:], stood)
+        if self.plan.profile:
+            self._see_profile(self.plan.profile, ticks[1:], q[1:], stood)
         begin = now % BEAT
         self._way[begin : begin + len(way)] = way
         self._ticks = stop
@@ -222,17 +226,30 @@ class SimulatedCell:
                 self._out.add_edge(edge)
 
     def _see_sphere(self, sphere: SphereStation, ticks: Index, q: Array, stood: Index) -> None:
-        """Measure where the robot has ``stood`` still for so many ticks."""
-        settle, period = round(sphere.settle_s / TICK_S), round(sphere.period_s / TICK_S)
-        due = np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0))
-        near = [i for i in due.tolist() if sphere.near(self.plan.arm.fk(q[i]))]
-        for tick in ticks[near].tolist():
-            T = self.flange(np.array([tick * TICK_S]))[0]
+        """Measure the ball where the robot has ``stood`` still for so many ticks."""
+        for tick, T in self._standstills(sphere, ticks, q, stood):
             if sphere.sees(T):
                 rise = float(self.warmth.link[-1])
                 shot = sphere.shoot(T, rise, tick, tick * TICK_S, self.faults, self._draws)
                 if shot is not None:
                     self._out.shots.append(shot)
+
+    def _see_profile(self, profile: ProfileStation, ticks: Index, q: Array, stood: Index) -> None:
+        """Look at the target with the robot's own sensor."""
+        for tick, T in self._standstills(profile, ticks, q, stood):
+            shot = profile.shoot(T, tick, tick * TICK_S, self._draws)
+            if shot is not None:
+                self._out.profiles.append(shot)
+
+    def _standstills(
+        self, station: SphereStation | ProfileStation, ticks: Index, q: Array, stood: Index
+    ) -> Iterator[tuple[int, Array]]:
+        """Ticks at which a station near the robot measures, and true flange poses (4, 4) there."""
+        settle, period = round(station.settle_s / TICK_S), round(station.period_s / TICK_S)
+        for i in np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0)):
+            if station.near(self.plan.arm.fk(q[i])):
+                tick = int(ticks[i])
+                yield tick, self.flange(np.array([tick * TICK_S]))[0]
 
     # ---- what changes ---------------------------------------------------------------------------
 

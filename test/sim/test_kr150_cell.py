@@ -27,7 +27,16 @@ from robocal_ros.core.tool.crossed_model import RobotNoise
 from robocal_ros.sim import kr150
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_samples import CellSamples
-from robocal_ros.sim.kr150_cell import DUTY, SPIN_RAD, TAUGHT, kr150_cell
+from robocal_ros.sim.kr150_cell import (
+    DUTY,
+    SPIN_RAD,
+    T_FLANGE_LASER,
+    TARGET,
+    TARGET_RADIUS_M,
+    TAUGHT,
+    kr150_cell,
+    poses,
+)
 from robocal_ros.sim.production import programme
 from robocal_ros.sim.robot import Effects
 from robocal_ros.sim.thermal import Warmth
@@ -244,3 +253,19 @@ def test_the_programme_keeps_its_speed_and_rests():
     assert seen[-1] == pytest.approx(WORK[-1], abs=1e-9)
     resting = np.all(moving == 0.0, axis=1) | (np.max(np.abs(moving), axis=1) < 1e-9)
     assert resting.mean() == pytest.approx(0.5 * len(WORK) / time[-1], rel=0.05)
+
+
+def test_the_line_laser_sees_its_target_at_each_of_its_poses():
+    """A ball's section is a circle about where the ball is; the rest are stem and table."""
+    cell = SimulatedCell(kr150_cell(NOMINAL, profile=True, points=0))
+    came = went(cell, np.vstack([poses("profile"), HOME]))
+    assert len(came.profiles) == len(poses("profile"))
+    robot, cold = cell.plan.robot, Warmth.cold(6)
+    for shot, q in zip(came.profiles, poses("profile"), strict=True):
+        T = robot.flange(q, cold)[0] @ T_FLANGE_LASER
+        x, y, z = np.linalg.inv(T)[:3] @ np.append(TARGET, 1.0)
+        reach = np.sqrt(TARGET_RADIUS_M**2 - y**2)
+        away = np.hypot(shot.points[:, 0] - x, shot.points[:, 1] - z) - reach
+        assert np.sum(np.abs(away) < 2e-4) > 50
+    assert went(cell, [CYCLE[0]]).profiles == []
+    assert went(cell_of(), np.vstack([poses("profile")[:1], HOME])).profiles == []

@@ -11,7 +11,7 @@ from robocal_ros.core.motion.housing import Housing, ToolBody
 from robocal_ros.core.motion.measuring import approach, measuring
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
 from robocal_ros.sim import kr150
-from robocal_ros.sim.kr150_cell import FLOOR, SPIN_RAD, T_BASE_LASER, TAUGHT
+from robocal_ros.sim.kr150_cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
 from robocal_ros.sim.robot import shift, turn
 from robocal_ros.sim.thermal import Warmth
 
@@ -26,6 +26,7 @@ STANDING = {
     "post": ([1.70, -1.00, 0.0], [1.70, -1.00, 1.20], 0.07),
     "sensor": ([1.70, -0.95, 1.23], [1.70, -0.90, 1.20], 0.10),
     "floor sphere": (SEEN_FLOOR * [1.0, 1.0, 0.0], SEEN_FLOOR, 0.025),
+    "target": (TARGET * [1.0, 1.0, 0.0], TARGET - [0.0, 0.0, 0.02], 0.015),
     "station": (CROSSING * [1.0, 1.0, 0.0], CROSSING - [0.0, 0.0, 0.07], 0.10),
 }
 
@@ -88,9 +89,10 @@ def test_the_skeleton_is_the_robots():
     assert joints_of(q)[-1] == pytest.approx(ARM.fk(q)[:, :3, 3], abs=1e-9)
 
 
-@pytest.mark.parametrize("way", [CYCLE, WORK, ABOVE[None]], ids=["cycle", "work", "tool"])
-def test_ways_are_clear(way):
+@pytest.mark.parametrize("kind", ["cycle", "work", "tool", "profile"])
+def test_ways_are_clear(kind):
     """From home to each pose, and from each to the next, straight in the joints."""
+    way = poses(kind)
     ways = [straight(HOME, q) for q in way]
     ways += [straight(a, b) for a, b in pairwise(way)]
     for q in ways:
@@ -105,7 +107,7 @@ def test_a_way_into_the_sensor_is_seen():
 
 
 def test_poses_are_within_limits():
-    for q in (HOME, ABOVE, *CYCLE, *WORK):
+    for q in (HOME, ABOVE, *CYCLE, *WORK, *poses("profile")):
         assert np.all(q > ARM.lower + np.radians(2.0))
         assert np.all(q < ARM.upper - np.radians(2.0))
 
