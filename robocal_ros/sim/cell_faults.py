@@ -112,7 +112,7 @@ class Faults:
         if "wrong_tool" in self:
             longer = self.size("wrong_tool")
             T = mounted.T_flange_tool @ frames.transform(np.eye(3), [0.0, 0.0, longer])
-            wider, height = THICKER * longer, mounted.height + longer
+            wider, height = THICKER * max(longer, 0.0), mounted.height + longer
             height[0] = mounted.height[0] + wider
             mounted = RoundTool(T, height, mounted.radius + wider)
         if "collision" in self:

@@ -224,3 +224,18 @@ def test_a_fault_may_begin_in_the_middle_of_a_motion():
     cell.advance(1.2)
     cell.set_fault("frozen_encoder", 1.0)
     assert cell.advance(1.3).q[0, 0] == pytest.approx(HOME[0] + 0.3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "size"),
+    [
+        ("frozen_encoder", 99.0),
+        ("frozen_encoder", -1.0),
+        ("wrong_tool", -40.0),
+        ("beam_dirty", 2.0),
+    ],
+)
+def test_no_size_brings_the_cell_down(fault, size):
+    told = tour(fault, size)
+    for name in ("stamps", "joints", "ball", "error"):
+        assert np.all(np.isfinite(told[name]))
