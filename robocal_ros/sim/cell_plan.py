@@ -28,7 +28,6 @@ class CellPlan:
     station : the true one; its ``noise`` is the robot's scatter there.
     tool : as it is mounted at the begin.
     q_start : (n,) where the robot stands then.
-    q_above : (n,) with a straight tool above the station; None: as ``q_start``.
     rate_hz, reading_noise_rad : of the joint readings; without noise they are exact.
     ripple : relative, of the speed of circles that the robot's program drives.
     heat : what warms it up; None: it stays cold.
@@ -44,7 +43,6 @@ class CellPlan:
     rate_hz: float = 125.0
     reading_noise_rad: float = 0.0
     ripple: float = 0.02
-    q_above: Array | None = None
     heat: HeatPlan | None = None
     sphere: SphereStation | None = None
     profile: ProfileStation | None = None
@@ -77,21 +75,18 @@ def rigid_robot(nominal: SerialArm, error_m: float, rng: np.random.Generator) ->
     )
 
 
-def known_laser(plan: CellPlan, T_base_laser: Array, rng: np.random.Generator) -> dict[str, Array]:
+def known_laser(
+    plan: CellPlan, T_base_laser: Array, q_there: Array, rng: np.random.Generator
+) -> dict[str, Array]:
     """Flange positions (3,) A1 ... D4 with which this robot places the station's beams, base, m.
 
-    They bear its scatter, the input's errors, and its geometric error as it is above the station.
+    They bear its scatter, the input's errors, and its geometric error as it is at joints
+    ``q_there`` (n,), at the station: what it takes for upright is not.
     """
-    arm, q = plan.arm, plan.q_start if plan.q_above is None else plan.q_above
-    true = plan.robot.flange(q, Warmth.cold(arm.n))[0]
-    T_known_true = arm.fk(q) @ frames.invert(true)
-    seen = [
-        replace(beam, start=_moved(T_known_true, beam.start), end=_moved(T_known_true, beam.end))
-        for beam in plan.station.beams
-    ]
-    station = replace(plan.station, beams=(seen[0], seen[1]))
-    return laser_points(station, T_known_true @ T_base_laser, rng)
-
-
-def _moved(T: Array, p: Array) -> Array:
-    return np.asarray(T[:3, :3] @ p + T[:3, 3])
+    true = plan.robot.flange(q_there, Warmth.cold(plan.arm.n))[0]
+    T_known_true = plan.arm.fk(q_there) @ frames.invert(true)
+    R, p = T_known_true[:3, :3], T_known_true[:3, 3]
+    x, y = (
+        replace(beam, start=R @ beam.start + p, end=R @ beam.end + p) for beam in plan.station.beams
+    )
+    return laser_points(replace(plan.station, beams=(x, y)), T_known_true @ T_base_laser, rng)
