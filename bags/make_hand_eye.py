@@ -45,7 +45,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
 from robocal_ros.sim.hand_eye_sets import (
     TrueStairs,

@@ -30,7 +30,7 @@ from robocal_ros.core.hand_eye.mount_problem import pivot_of
 from robocal_ros.core.hand_eye.quality import expected_error_m
 from robocal_ros.core.hand_eye.result import HandEyeResult, at_origin, increment
 from robocal_ros.core.hand_eye.solve import field_of
-from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
 from robocal_ros.sim.profile_sensor import ProfileSensor
 from robocal_ros.sim.ur10_station import Q_NEAR

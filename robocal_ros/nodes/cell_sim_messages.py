@@ -4,9 +4,10 @@ from array import array
 from collections.abc import Mapping
 
 import numpy as np
+from geometry_msgs.msg import PointStamped
 from numpy.typing import NDArray
 from robocal_msgs.msg import BeamEvent, ToolStep
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, PointCloud2, PointField, Temperature
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
@@ -102,3 +103,41 @@ def joint_state(names: list[str], stamp_ns: int, q: Array, qd: Array) -> JointSt
         position=array("d", q.tobytes()),
         velocity=array("d", qd.tobytes()),
     )
+
+
+def point(stamp_ns: int, frame: str, p: Array) -> PointStamped:
+    """A sphere's centre (3,)."""
+    message = PointStamped(header=header(stamp_ns, frame))
+    message.point.x, message.point.y, message.point.z = p.tolist()
+    return message
+
+
+def cloud(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
+    """Points (m, 3), as a sensor sends them: 32 bit."""
+    fields = [
+        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+        for i, name in enumerate("xyz")
+    ]
+    return PointCloud2(
+        header=header(stamp_ns, frame),
+        height=1,
+        width=len(points),
+        fields=fields,
+        point_step=12,
+        row_step=12 * len(points),
+        data=array("B", points.astype("<f4").tobytes()),
+        is_dense=True,
+    )
+
+
+def profile(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
+    """A profile (m, 2), x and z, in its sensor's plane y = 0."""
+    x, z = points.T
+    message = cloud(stamp_ns, frame, np.column_stack([x, np.zeros_like(x), z]))
+    message.is_dense = bool(np.all(np.isfinite(points)))
+    return message
+
+
+def temperature(stamp_ns: int, joint: str, celsius: float) -> Temperature:
+    """A motor's."""
+    return Temperature(header=header(stamp_ns, joint), temperature=celsius, variance=0.01)

@@ -4,38 +4,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import TransformStamped
-from robocal_msgs.msg import BeamEvent, ToolStep
-from sensor_msgs.msg import JointState
+from robocal_msgs.msg import ToolStep
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.cell_sim_messages import (
-    beam_event,
-    in_joint_order,
-    joint_state,
-    planned_step,
-)
+from robocal_ros.nodes.cell_sim_messages import in_joint_order, planned_step
+from robocal_ros.nodes.cell_sim_outputs import CellOutputs
 from robocal_ros.nodes.cell_sim_settings import (
     SETTINGS,
+    at_station,
     bent_tool,
     cell_plan,
     laser_pose,
-    straight_arm,
 )
-from robocal_ros.nodes.conversions import header, transform_message
 from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.run import run
 from robocal_ros.sessions.correction.inputs import trajectory_command
-from robocal_ros.sim.beams import RoundTool
-from robocal_ros.sim.cell import TICK_S, SimulatedCell, known_laser
+from robocal_ros.sim.cell import TICK_S, SimulatedCell
+from robocal_ros.sim.cell_plan import known_laser
 from robocal_ros.storage.files import write_text
 
 BEHIND_S = 1.0  # a longer pause of the process, or a jump of its clock, is none of the cell's
-OTHER_STATION = "_other"
 
 
 class CellSimNode(HouseNode):
@@ -51,30 +43,29 @@ class CellSimNode(HouseNode):
     def configure(self) -> None:
         """Build the cell, let its robot place the beams, then open the topics."""
         settings = self.settings
-        self._arm = straight_arm(settings["robot"])
-        plan = cell_plan(settings, self._arm)
+        plan = cell_plan(settings)
         self._cell = SimulatedCell(plan)
         if settings["laser_csv"]:
             rng = np.random.default_rng([settings["seed"], 2])
-            points = known_laser(plan, laser_pose(settings), rng)
+            there = at_station(settings, plan)
+            points = known_laser(plan, laser_pose(settings), there, rng)
             rows = [f"{name},{_mm(place)}\n" for name, place in sorted(points.items())]
             write_text(Path(settings["laser_csv"]), "point,x_mm,y_mm,z_mm\n" + "".join(rows))
-        self._joints = self.add_output(JointState, "joint_states", qos.RELIABLE)
-        self._edges = self.add_output(BeamEvent, "beam_events", qos.RELIABLE)
-        self._truth = self.add_output(TransformStamped, "~/truth", qos.LATCHED)
+        self._out = CellOutputs(self.add_output, settings, self._cell)
         self.add_input(JointTrajectory, "joint_trajectory", self._follow, qos.RELIABLE)
+        self.add_input(JointTrajectory, "~/truth/commanded", self._judge, qos.RELIABLE)
         if settings["run_program"]:
             self.add_input(ToolStep, "next_step", self._await_step, qos.LATCHED)
-        self._told, self._edges_told, self._refused = 0, 0, ""
+        self._refused = ""
         self.add_timer(TICK_S, self._tick, steady=True)
 
     def activate(self) -> None:
         """The cell goes on from where it stood."""
         self._origin_ns: int | None = None
-        self._joints_ns = 0
         self._step: PlannedStep | None = None
         self._driven: tuple[int, int] | None = None
-        self._shown: RoundTool | None = None
+        self._fault: tuple[str, float] = ("none", 0.0)
+        self._out.forget()
         self.settings_changed()
 
     def deactivate(self) -> None:
@@ -87,10 +78,17 @@ class CellSimNode(HouseNode):
         self._cell = None
 
     def settings_changed(self) -> None:
-        """Another fault, or another bend: each from the next motion on."""
-        if self._cell is not None:
-            self._cell.fault = self.settings["fault"]
-            self._cell.next_tool = bent_tool(self.settings, self._arm)
+        """Another fault, another bend, another heat."""
+        cell, settings = self._cell, self.settings
+        if cell is None:
+            return
+        fault = settings["fault"], settings["fault_size"]
+        if fault != self._fault:
+            cell.set_fault(*fault)
+            self._fault = fault
+        cell.next_tool = bent_tool(settings, cell.plan)
+        if cell.heating:
+            cell.heating.level = settings["warm_up"]
 
     # ---- what comes in --------------------------------------------------------------------------
 
@@ -106,8 +104,18 @@ class CellSimNode(HouseNode):
         start_s = cell.now_s
         if command.stamp_ns:
             start_s = (command.stamp_ns - self._origin_ns) * 1e-9
-        q, qd, qdd = in_joint_order(command, self._arm)
+        q, qd, qdd = in_joint_order(command, cell.plan.arm)
         cell.follow(start_s + command.time_from_start_s, q, qd, qdd)
+
+    def _judge(self, message: Any) -> None:
+        """Joints commanded at the working poses: the truth tells what would come of them."""
+        cell = self._cell
+        if cell is None:
+            return
+        q, _, _ = in_joint_order(trajectory_command(message), cell.plan.arm)
+        if q.shape != cell.plan.working.shape:
+            raise InputError(f"{len(q)} points for {len(cell.plan.working)} working poses")
+        self._out.commanded = q
 
     def _await_step(self, message: Any) -> None:
         if message.kind == ToolStep.NONE:
@@ -128,14 +136,8 @@ class CellSimNode(HouseNode):
         if self._step is not None and not cell.moving:
             self._drive(cell, self._step)
         came = cell.advance((now_ns - self._origin_ns) * 1e-9)
-        self._show_truth(cell, now_ns)
-        self._tell_joints(cell, came.time_s, came.q, came.qd)
-        station = self.settings["station"]
-        if cell.fault == "wrong_station":
-            station += OTHER_STATION
-        for edge in came.edges:
-            self._edges.publish(beam_event(edge, self._stamp_ns(edge.time_s), station))
-        self._edges_told += len(came.edges)
+        self._out.tell_truth(now_ns)
+        self._out.tell(came, self._stamp_ns)
 
     def _drive(self, cell: SimulatedCell, step: PlannedStep) -> None:
         self._step, self._refused = None, ""
@@ -148,30 +150,6 @@ class CellSimNode(HouseNode):
     def _stamp_ns(self, time_s: float) -> int:
         return (self._origin_ns or 0) + round(time_s * 1e9)
 
-    # ---- what goes out --------------------------------------------------------------------------
-
-    def _tell_joints(self, cell: SimulatedCell, time_s: Any, q: Any, qd: Any) -> None:
-        if cell.fault == "joints_silent":
-            return
-        names, frozen = list(self._arm.joint_names), cell.fault == "frozen_clock"
-        for t, position, velocity in zip(time_s.tolist(), q, qd, strict=True):
-            stamp_ns = self._stamp_ns(t)
-            if not frozen:
-                self._joints_ns = stamp_ns
-            self._joints.publish(joint_state(names, self._joints_ns, position, velocity))
-            self._told += 1
-
-    def _show_truth(self, cell: SimulatedCell, now_ns: int) -> None:
-        if self._shown is cell.tool:
-            return
-        self._shown = cell.tool
-        message = TransformStamped(
-            header=header(now_ns, self.settings["flange_frame"]),
-            child_frame_id=self.settings["tool_frame"],
-            transform=transform_message(cell.tool.T_flange_tool),
-        )
-        self._truth.publish(message)
-
     def health(self) -> Health:
         """Tell that all of it is simulated, and what goes wrong on purpose."""
         cell, health = self._cell, Health(message="simulated")
@@ -179,13 +157,10 @@ class CellSimNode(HouseNode):
             return health
         if self._refused:
             health.worsen(WARN, self._refused)
-        if cell.fault != "none":
-            health.worsen(WARN, f"simulated fault: {cell.fault}")
-        health.values = {
-            "moving": cell.moving,
-            "joint states sent": self._told,
-            "beam events sent": self._edges_told,
-        }
+        if cell.faults.sizes:
+            health.worsen(WARN, f"simulated fault: {', '.join(cell.faults.sizes)}")
+        health.values = {"moving": cell.moving}
+        health.values |= {f"{topic} sent": count for topic, count in self._out.told.items()}
         return health
 
 

@@ -12,8 +12,9 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
-from robocal_ros.sim.cell import CellPlan, rigid_robot
 from robocal_ros.sim.cell_faults import FAULTS
+from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
+from robocal_ros.sim.kr150_cell import T_BASE_LASER, kr150_cell, poses
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -23,6 +24,8 @@ PIN_M = 0.15  # tip of the straight tool along the flange's z, where the robot f
 TAPER = 0.1  # of the cone
 NOZZLE_M = 3.5e-3  # by so much the torch's nozzle is wider than its wire
 TOOLS = ("cylinder", "cone", "torch")
+CELLS = ("tool", "kr150")
+KR150 = "kr150_r3100"
 
 
 def _numbers(count: int) -> Callable[[Any], str | None]:
@@ -38,6 +41,13 @@ def _ms(name: str, default: float, what: str, high: float) -> Setting:
 
 
 SETTINGS = (
+    Setting(
+        "cell",
+        "tool",
+        "tool: a robot that stays cold, at a beam station, as the parameters describe it; kr150: a "
+        "whole cell with a KR 150 that warms up, a sphere sensor and a beam station",
+        choices=CELLS,
+    ),
     Setting(
         "robot",
         "ur10",
@@ -57,6 +67,17 @@ SETTINGS = (
     _mm("repeatability_mm", 0.03, "Scatter of a motion in each axis", 2.0),
     _mm("edge_noise_mm", 0.01, "Further scatter at each edge", 2.0),
     Setting("ripple", 0.02, "Relative ripple of the program's speed", low=0.0, high=0.5),
+    Setting("warm_up", 1.0, "Heat of the kr150, over the usual", low=0.0, high=10.0, live=True),
+    Setting(
+        "cloud_points",
+        2000,
+        "Of a sphere's cloud of the kr150; 0: its centre is told instead",
+        low=0,
+        high=100_000,
+    ),
+    Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
+    Setting("profile", False, "A line laser on the flange of the kr150"),
+    Setting("profile_frame", "profile_sensor", "Frame of the line laser"),
     Setting("station", "station", "Name of the beam station: frame_id of its edges"),
     Setting(
         "laser_xyz_mm",
@@ -113,7 +134,15 @@ SETTINGS = (
     Setting("run_program", False, "Drive each step that is announced on next_step"),
     Setting("flange_frame", "tool0", "Parent frame of ~/truth"),
     Setting("tool_frame", "true_tool", "Child frame of ~/truth"),
-    Setting("fault", "none", "What goes wrong from the next motion on", choices=FAULTS, live=True),
+    Setting("fault", "none", "What goes wrong", choices=FAULTS, live=True),
+    Setting(
+        "fault_size",
+        0.0,
+        "Its size, in the unit that belongs to it; 0: the usual one",
+        low=-1e4,
+        high=1e4,
+        live=True,
+    ),
     Setting("seed", 1, "Of everything that is random", low=0, high=2**31 - 1),
 )
 
@@ -126,25 +155,27 @@ def straight_arm(name: str) -> SerialArm:
     return replace(arm, T_flange_tool=frames.transform(np.eye(3), [0.0, 0.0, PIN_M]))
 
 
-def bent_tool(settings: Mapping[str, Any], arm: SerialArm) -> RoundTool:
+def bent_tool(settings: Mapping[str, Any], plan: CellPlan) -> RoundTool:
     """The tool as it is mounted."""
     shift = np.array(settings["tool_bend_mm"]) * MM
     tilt = np.radians([*settings["tool_tilt_deg"], 0.0])
-    T, radius = bent(arm.T_flange_tool, shift, tilt), settings["tool_radius_mm"] * MM
-    if settings["tool"] == "cone":
-        return RoundTool.cone(T, radius, TAPER)
-    if settings["tool"] == "torch":
-        return RoundTool.torch(T, radius, radius + NOZZLE_M)
-    return RoundTool.cylinder(T, radius)
+    return plan.tool.mounted(bent(plan.arm.T_flange_tool, shift, tilt))
 
 
 def laser_pose(settings: Mapping[str, Any]) -> Array:
     """T_base_laser (4, 4), true."""
+    if settings["cell"] == "kr150":
+        return T_BASE_LASER
     R = frames.exp_rotation(np.radians(settings["laser_rotation_deg"]))
     return frames.transform(R, np.array(settings["laser_xyz_mm"]) * MM)
 
 
-def cell_plan(settings: Mapping[str, Any], arm: SerialArm) -> CellPlan:
+def at_station(settings: Mapping[str, Any], plan: CellPlan) -> Array:
+    """Joints (n,) with which the robot stands above the beams."""
+    return poses("tool")[0] if settings["cell"] == "kr150" else plan.q_start
+
+
+def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
     """The cell that the parameters describe.
 
     Raises
@@ -152,24 +183,54 @@ def cell_plan(settings: Mapping[str, Any], arm: SerialArm) -> CellPlan:
     InputError
         When ``q_start_deg`` has not a number for each joint.
     """
-    given = np.array(settings["q_start_deg"], dtype=np.float64)
-    if given.shape != (arm.n,):
-        raise InputError(f"q_start_deg has {given.size} numbers, {arm.name} has {arm.n} joints")
-    gap_m, angle = settings["beam_gap_mm"] * MM, float(np.radians(settings["beam_angle_deg"]))
+    seed = settings["seed"]
+    if settings["cell"] == "kr150":
+        plan = kr150_cell(
+            load_robot(KR150),
+            seed,
+            points=settings["cloud_points"],
+            profile=settings["profile"],
+        )
+    else:
+        plan = _tool_cell(settings)
     source = TrueInput(
         latency_s=settings["input_latency_ms"] * MS,
         jitter_s=settings["input_jitter_ms"] * MS,
         sample_period_s=settings["input_period_ms"] * MS,
         bounce_s=settings["input_bounce_ms"] * MS,
     )
+    return replace(
+        plan,
+        station=replace(plan.station, input=source),
+        rate_hz=settings["rate_hz"],
+        tool=bent_tool(settings, plan),
+        ripple=settings["ripple"],
+        seed=seed,
+    )
+
+
+def _tool_cell(settings: Mapping[str, Any]) -> CellPlan:
+    """A robot that stays cold, at a beam station."""
+    arm = straight_arm(settings["robot"])
+    given = np.array(settings["q_start_deg"], dtype=np.float64)
+    if given.shape != (arm.n,):
+        raise InputError(f"q_start_deg has {given.size} numbers, {arm.name} has {arm.n} joints")
+    gap_m, angle = settings["beam_gap_mm"] * MM, float(np.radians(settings["beam_angle_deg"]))
     noise = TrueNoise(settings["repeatability_mm"] * MM, settings["edge_noise_mm"] * MM)
     rng = np.random.default_rng([settings["seed"], 1])
     return CellPlan(
         robot=rigid_robot(arm, settings["arm_error_mm"] * MM, rng),
-        station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), source, noise),
-        tool=bent_tool(settings, arm),
+        station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), noise=noise),
+        tool=_tool(settings, arm.T_flange_tool),
         q_start=np.where(arm.prismatic, given * MM, np.radians(given)),
-        rate_hz=settings["rate_hz"],
-        ripple=settings["ripple"],
-        seed=settings["seed"],
     )
+
+
+def _tool(settings: Mapping[str, Any], T: Array) -> RoundTool:
+    """The straight tool."""
+    radius = settings["tool_radius_mm"] * MM
+    if settings["tool"] == "cone":
+        return RoundTool.cone(T, radius, TAPER)
+    if settings["tool"] == "torch":
+        return RoundTool.torch(T, radius, radius + NOZZLE_M)
+    return RoundTool.cylinder(T, radius)

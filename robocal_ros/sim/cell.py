@@ -1,78 +1,49 @@
-"""The simulated cell with a beam station, driven by time; all of it follows from one seed.
+"""The simulated cell, driven by time; all of it follows from one seed.
 
 The joints go where they are told; their readings show just that. The flange is where the true
-robot's geometry puts it, off by a scatter that is drawn anew for each motion.
+robot's geometry puts it, as warm as its motion has made it, off by a scatter that is drawn anew
+each time it moves after a rest. Every random number belongs to its place in time, so that it does
+not matter when the cell is asked, and what is switched on or off leaves all else alone.
 """
 
-from bisect import insort
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.sim.beam_calibration import laser_points
 from robocal_ros.sim.beam_moves import Circle, Plunge
 from robocal_ros.sim.beam_program import program
+from robocal_ros.sim.beam_watch import BeamWatch
 from robocal_ros.sim.beams import BeamStation, RoundTool, TrueNoise
-from robocal_ros.sim.cell_faults import Fault, FaultyInput
+from robocal_ros.sim.cell_faults import (
+    LASTING,
+    NEXT_MOTION,
+    Fault,
+    Faults,
+    FaultyInput,
+    size_of,
+)
+from robocal_ros.sim.cell_outputs import Happened, Outbox
+from robocal_ros.sim.cell_plan import CellPlan
+from robocal_ros.sim.draws import Draws, Stream
+from robocal_ros.sim.heating import Heating
 from robocal_ros.sim.joint_motion import JointMotion
-from robocal_ros.sim.robot import Body, Effects, TrueRobot
+from robocal_ros.sim.joint_readings import JointReadings
+from robocal_ros.sim.profile_station import ProfileStation
+from robocal_ros.sim.scatter import Scatter
+from robocal_ros.sim.sphere_station import SphereStation
+from robocal_ros.sim.standing import Standing
 from robocal_ros.sim.thermal import Warmth
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 TICK_S = 8e-3  # the cell works in whole ticks, so that it does not matter when it is asked
-SETTLE_S = 0.05  # a new scatter is reached smoothly: the flange never jumps
-HAND = np.array([7e-4, -7e-4, 0.0])  # how far a hand moves the flange, base, m
-SETTLED = -np.inf
-
-
-@dataclass(frozen=True, eq=False)
-class CellPlan:
-    """What the cell is made of.
-
-    Attributes
-    ----------
-    robot : the true one; its ``nominal`` is what the program and the readings' users know.
-    station : the true one; its ``noise`` is the robot's scatter there.
-    tool : as it is mounted at the begin.
-    q_start : (n,) where the robot stands then, with a straight tool above the station.
-    rate_hz : of the joint readings.
-    ripple : relative, of the speed of circles that the robot's program drives.
-    """
-
-    robot: TrueRobot
-    station: BeamStation
-    tool: RoundTool
-    q_start: Array
-    rate_hz: float = 125.0
-    ripple: float = 0.02
-    seed: int = 1
-
-    @property
-    def arm(self) -> SerialArm:
-        """The nominal robot."""
-        return self.robot.nominal
-
-
-@dataclass(frozen=True, eq=False)
-class Happened:
-    """What came of a stretch of time.
-
-    Attributes
-    ----------
-    time_s, q, qd : (k,), (k, n), (k, n) joint readings.
-    edges : those whose stamp has passed, in its order; the stamp bears what the input did to it.
-    """
-
-    time_s: Array
-    q: Array
-    qd: Array
-    edges: list[BeamEdge] = field(default_factory=list)
+BEAT = 125  # ticks in which warmth is taken as constant: a second
+STILL = 1e-9  # a joint that goes less in a tick stands, rad (prismatic: m)
 
 
 class SimulatedCell:
@@ -82,26 +53,32 @@ class SimulatedCell:
     ----------
     motion : of the joints.
     next_tool : mounted when the next motion begins: how a tool gets bent.
+    faults : what is wrong now.
+    heating : None where the robot stays cold.
     """
 
     def __init__(self, plan: CellPlan) -> None:
         self.plan = plan
-        self._tool = self.next_tool = plan.tool
+        self._mounted = self.next_tool = plan.tool
         self.motion = JointMotion(plan.q_start)
-        self._rng = np.random.default_rng(plan.seed)
-        self._fault: Fault = "none"
-        self._next_fault: Fault = "none"
-        self._input = FaultyInput()
-        self._ticks = self._readings = 0
-        self._pending: list[BeamEdge] = []
-        self._cold = Warmth.cold(plan.arm.n)
-        source = plan.station.input
-        self._station = replace(
-            plan.station,
-            input=replace(source, first_sample_s=source.sample_period_s * self._rng.random()),
-            noise=TrueNoise(0.0, plan.station.noise.edge_m),
+        self.faults = Faults()
+        self._waiting: tuple[Fault, float] | None = None
+        self._draws = Draws(plan.seed)
+        self.heating = Heating(plan.heat, self._draws) if plan.heat else None
+        self._readings = JointReadings(
+            plan.rate_hz, plan.reading_noise_rad, self.faults, self._draws, plan.arm.n
         )
-        self._shifts, self._shift_s = np.zeros((2, 3)), SETTLED
+        self._input = FaultyInput(self.faults)
+        self._watch = BeamWatch(plan.arm, self._draws)
+        self._station = _on_one_clock(plan.station, self._draws)
+        self._standing = Standing()
+        self._scatter = Scatter(3 + plan.arm.n)
+        self._hand, self._drawn = np.zeros(3), np.zeros(3 + plan.arm.n)
+        self._ticks = self._motions = 0
+        self._way = np.zeros((BEAT, plan.arm.n))
+        self._out = Outbox()
+        # What it loads at its first use shall not stop a motion.
+        self._see_edges(np.arange(2), np.array([0.0, TICK_S]), np.tile(plan.q_start, (2, 1)))
 
     @property
     def now_s(self) -> float:
@@ -116,19 +93,29 @@ class SimulatedCell:
     @property
     def tool(self) -> RoundTool:
         """The tool as it is."""
-        return self._tool
+        return self.faults.tool(self._mounted)
 
     @property
-    def fault(self) -> Fault:
-        """The fault in force; one that is set takes effect with the next motion, "none" at once."""
-        return self._fault
+    def warmth(self) -> Warmth:
+        """The robot's."""
+        return self.heating.warmth if self.heating else Warmth.cold(self.plan.arm.n)
 
-    @fault.setter
-    def fault(self, fault: Fault) -> None:
-        self._next_fault = fault
+    # ---- what is told to it ---------------------------------------------------------------------
+
+    def set_fault(self, fault: Fault, size: float = 0.0) -> None:
+        """Let something go wrong, in place of what went wrong before; "none" ends all at once.
+
+        What `NEXT_MOTION` names begins with the next motion, all else now; what `LASTING` names
+        stays until "none". ``size`` in the unit that `SIZES` gives; 0: the usual one.
+        """
         if fault == "none":
-            self._fault = fault
-            self._input.begin(fault)
+            self._waiting = None
+            self.faults.sizes.clear()
+        elif fault in NEXT_MOTION:
+            self._waiting = fault, size_of(fault, size)
+        else:
+            self._waiting = None
+            self._replace_fault(fault, size_of(fault, size))
 
     def follow(
         self,
@@ -160,78 +147,149 @@ class SimulatedCell:
             When it is out of reach.
         """
         q_now = self.motion.at([self.now_s])[0][0]
-        phase = 2.0 * np.pi * self._rng.random()
+        phase = 2.0 * np.pi * self._draws.of(Stream.RIPPLE, self._motions).random()
         time, q, qd, move = program(self.plan.arm, step, q_now, self.plan.ripple, phase)
         self.follow(self.now_s + time, q, qd)
         return replace(move, start_s=self.now_s + move.start_s)
 
-    def advance(self, to_s: float) -> Happened:
-        """Let time pass, in whole ticks, up to ``to_s``."""
-        while self.now_s + TICK_S <= to_s:
-            begin, end = self.now_s, (self._ticks + 1) * TICK_S
-            if begin < max(self.motion.end_s, self._shift_s + SETTLE_S):
-                found = self._station.edges(self._tool, self.flange, (begin, end), self._rng)
-                for edge in self._input.passed(found):
-                    insort(self._pending, edge, key=lambda e: e.time_s)
-            self._ticks += 1
-        due = [edge for edge in self._pending if edge.time_s <= self.now_s]
-        del self._pending[: len(due)]
-        first, rate = self._readings, self.plan.rate_hz
-        self._readings = int(np.floor(self.now_s * rate * (1.0 + 1e-12))) + 1
-        time = np.arange(first, self._readings) / rate
-        return Happened(time, *self.motion.at(time), due)
+    # ---- time -----------------------------------------------------------------------------------
+
+    def advance(self, to_s: float, readings: bool = True) -> Happened:
+        """Let time pass, in whole ticks, up to ``to_s``.
+
+        Without ``readings`` no joints are read: a long stretch of work takes less time.
+        """
+        last = int(np.floor(to_s / TICK_S * (1.0 + 1e-12)))
+        while self._ticks < last:
+            self._pass(min(last, (self._ticks // BEAT + 1) * BEAT))
+        number = self._readings.due(self.now_s)
+        joints = self._readings.read(number if readings else number[:0], self.motion)
+        return self._out.told(self.now_s, *joints)
 
     def flange(self, time_s: Array) -> Array:
-        """True T_base_flange (m, 4, 4) at times (m,)."""
-        T = self.plan.robot.flange(self.motion.at(time_s)[0], self._cold)
-        T[:, :3, 3] += self._shift(time_s)
+        """True T_base_flange (m, 4, 4) at times (m,), the robot as warm as it is now."""
+        off = self._scatter.at(time_s)
+        T = self.plan.robot.flange(self._joints(time_s) + off[:, 3:], self.warmth)
+        T[:, :3, 3] += off[:, :3]
         return T
 
-    def _shift(self, time_s: Array) -> Array:
-        share = np.clip((time_s - self._shift_s) / SETTLE_S, 0.0, 1.0)[:, None]
-        smooth = share**2 * (3.0 - 2.0 * share)
-        before, after = self._shifts
-        return np.asarray(before + smooth * (after - before))
+    def tcp_error(self, q: ArrayLike) -> Array:
+        """True error (k, 3) of the tool's tip at the working poses, base, m.
+
+        For joints (k, n) commanded there: where they put the tip, mean over visits, with robot
+        and tool as they are now, from where the cold robot put the taught tool at the taught pose.
+        """
+        plan, now = self.plan, self.tool.T_flange_tool[:3, 3]
+        tip = plan.robot.point(q, self.warmth, now) + self._hand
+        return np.asarray(tip - self._taught)
+
+    @cached_property
+    def _taught(self) -> Array:
+        """Where (k, 3) the cold robot put the taught tool."""
+        plan = self.plan
+        p = plan.arm.T_flange_tool[:3, 3]
+        return plan.robot.point(plan.working, Warmth.cold(plan.arm.n), p)
+
+    def _joints(self, time_s: Array) -> Array:
+        return self.motion.joints(time_s)
+
+    def _pass(self, stop: int) -> None:
+        """From tick to tick, at most to the next beat."""
+        ticks = np.arange(self._ticks, stop + 1)
+        time, now = np.asarray(ticks * TICK_S), self._ticks
+        q = self._joints(time)
+        way = np.abs(np.diff(q, axis=0))
+        departed, stood = self._standing.look(now, np.max(way, axis=1) > STILL)
+        for tick in departed.tolist():
+            self._depart(tick)
+        if not np.all(stood) or self._scatter.settled_s > time[0]:
+            self._see_edges(ticks, time, q)
+        if self.plan.sphere:
+            self._see_sphere(self.plan.sphere, ticks[1:], q[1:], stood)
+        if self.plan.profile:
+            self._see_profile(self.plan.profile, ticks[1:], q[1:], stood)
+        begin = now % BEAT
+        self._way[begin : begin + len(way)] = way
+        self._ticks = stop
+        if stop % BEAT == 0 and self.heating:
+            self.heating.step(np.sum(self._way, axis=0), BEAT * TICK_S)
+            swapped = "swapped_temperatures" in self.faults
+            self._out.temperatures.append(self.heating.tell(self.now_s, stop // BEAT, swapped))
+
+    def _see_edges(self, ticks: Index, time_s: Array, q: Array) -> None:
+        station = self.faults.station(self._station)
+        found = self._watch.edges(station, self.tool, ticks, time_s, q, self._joints, self.flange)
+        lost = self.faults.size("lost_messages")
+        for edge in self._input.passed(found):
+            place = round(edge.time_s * 1e9)
+            if not lost or self._draws.of(Stream.LOST_EDGES, place).random() >= lost:
+                self._out.add_edge(edge)
+
+    def _see_sphere(self, sphere: SphereStation, ticks: Index, q: Array, stood: Index) -> None:
+        """Measure the ball where the robot has ``stood`` still for so many ticks."""
+        for tick, T in self._standstills(sphere, ticks, q, stood):
+            if sphere.sees(T):
+                rise = float(self.warmth.link[-1])
+                shot = sphere.shoot(T, rise, tick, tick * TICK_S, self.faults, self._draws)
+                if shot is not None:
+                    self._out.shots.append(shot)
+
+    def _see_profile(self, profile: ProfileStation, ticks: Index, q: Array, stood: Index) -> None:
+        """Look at the target with the robot's own sensor."""
+        for tick, T in self._standstills(profile, ticks, q, stood):
+            shot = profile.shoot(T, tick, tick * TICK_S, self._draws)
+            if shot is not None:
+                self._out.profiles.append(shot)
+
+    def _standstills(
+        self, station: SphereStation | ProfileStation, ticks: Index, q: Array, stood: Index
+    ) -> Iterator[tuple[int, Array]]:
+        """Ticks at which a station near the robot measures, and true flange poses (4, 4) there."""
+        settle, period = round(station.settle_s / TICK_S), round(station.period_s / TICK_S)
+        for i in np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0)):
+            if station.near(self.plan.arm.fk(q[i])):
+                tick = int(ticks[i])
+                yield tick, self.flange(np.array([tick * TICK_S]))[0]
+
+    # ---- what changes ---------------------------------------------------------------------------
 
     def _begin(self) -> None:
-        """A motion begins: another scatter, the tool and the fault that wait for it."""
-        self._tool, self._fault = self.next_tool, self._next_fault
-        self._input.begin(self._fault)
-        hand = HAND if self._fault == "moved_by_hand" else np.zeros(3)
-        scatter = self.plan.station.noise.step_m * self._rng.standard_normal(3)
-        before = self._shift(np.array([self.now_s]))[0]
-        self._shifts, self._shift_s = np.array([before, hand + scatter]), self.now_s
+        """A motion is told: the tool, the fault and the hand that wait for it."""
+        self._mounted = self.next_tool
+        if self._waiting:
+            self._replace_fault(*self._waiting)
+        self._waiting = None
+        self._input.begin()
+        self._motions += 1
+        if not np.array_equal(self._hand, self.faults.hand):
+            self._hand = self.faults.hand
+            self._scatter.begin(self.now_s, self._offset)
+
+    def _depart(self, tick: int) -> None:
+        """The robot moves after a rest: another scatter."""
+        rng, noise = self._draws.of(Stream.SCATTER, tick), self.plan.station.noise.step_m
+        robot = self.plan.robot
+        in_joints = robot.repeatability if robot.effects.noise else 0.0
+        drawn = rng.standard_normal(3 + self.plan.arm.n)
+        self._drawn = np.append(noise * drawn[:3], in_joints * drawn[3:])
+        self._scatter.begin(tick * TICK_S, self._offset)
+
+    @property
+    def _offset(self) -> Array:
+        return np.append(self._drawn[:3] + self._hand, self._drawn[3:])
+
+    def _replace_fault(self, fault: Fault, size: float) -> None:
+        sizes = self.faults.sizes
+        for other in [name for name in sizes if name not in LASTING]:
+            del sizes[other]
+        sizes[fault] = size
 
 
-def rigid_robot(nominal: SerialArm, error_m: float, rng: np.random.Generator) -> TrueRobot:
-    """A true robot that neither bends nor warms up, with errors in all its parameters.
-
-    ``error_m``: standard deviation of its lengths, m; its angles err by as much at 1 m.
-    """
-    n = nominal.n
-    still = np.zeros((n, 5, n))
-    return TrueRobot(
-        nominal=nominal,
-        static_error=error_m * rng.standard_normal((n, 5)),
-        motor_gain=still,
-        link_gain=still,
-        body=Body(np.zeros(n), np.zeros((n, 3)), np.ones(n), 0.0),
-        eccentricity=np.zeros(n),
-        phase=np.zeros(n),
-        repeatability=0.0,
-        effects=replace(Effects.none(), static=True),
+def _on_one_clock(station: BeamStation, draws: Draws) -> BeamStation:
+    """The station whose input is sampled on one clock; the scatter of motions is the robot's."""
+    source, phase = station.input, draws.of(Stream.STATION).random()
+    return replace(
+        station,
+        input=replace(source, first_sample_s=source.sample_period_s * phase),
+        noise=TrueNoise(0.0, station.noise.edge_m),
     )
-
-
-def known_laser(plan: CellPlan, T_base_laser: Array, rng: np.random.Generator) -> dict[str, Array]:
-    """Flange positions (3,) A1 ... D4 with which this robot places the station's beams, base, m.
-
-    They bear its scatter, the input's errors, and its geometric error as it is at ``q_start``.
-    """
-    arm, q = plan.arm, plan.q_start
-    true = plan.robot.flange(q, Warmth.cold(arm.n))[0]
-    T_known_true = arm.fk(q) @ frames.invert(true)
-    points = laser_points(plan.station, T_base_laser, rng)
-    return {
-        name: T_known_true[:3, :3] @ place + T_known_true[:3, 3] for name, place in points.items()
-    }

@@ -1,30 +1,152 @@
 """What may go wrong in the simulated cell, and what faults of the input make of its edges."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from robocal_ros.core import frames
 from robocal_ros.core.tool.beam_edges import Beam, BeamEdge
+from robocal_ros.sim.beams import BeamStation, RoundTool, bent
+
+Array = NDArray[np.float64]
 
 Fault = Literal[
     "none",
+    "collision",
+    "wrong_tool",
+    "sensor_knocked",
+    "sphere_knocked",
+    "beam_dirty",
     "beam_x_dead",
     "beam_y_dead",
     "chatter",
     "lost_edge",
     "double_edge",
+    "swapped_cables",
     "wrong_station",
+    "input_latency",
+    "lost_messages",
     "joints_silent",
     "frozen_clock",
+    "clock_jump",
+    "sensor_clock_jump",
+    "frozen_encoder",
+    "swapped_temperatures",
     "moved_by_hand",
 ]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 
+SIZES: Mapping[Fault, tuple[float, float, str]] = {
+    "collision": (2.0, 1e-3, "mm"),
+    "wrong_tool": (10.0, 1e-3, "mm"),
+    "sensor_knocked": (1.0, 1e-3, "mm"),
+    "sphere_knocked": (1.0, 1e-3, "mm"),
+    "beam_dirty": (0.4, 1.0, ""),
+    "input_latency": (20.0, 1e-3, "ms"),
+    "lost_messages": (0.2, 1.0, ""),
+    "clock_jump": (1.0, 1.0, "s"),
+    "sensor_clock_jump": (1.0, 1.0, "s"),
+    "frozen_encoder": (3.0, 1.0, ""),
+    "moved_by_hand": (1.0, 1e-3, "mm"),
+}
+"""Faults that have a size: the usual one, the factor of its unit, and this unit."""
+
+NEXT_MOTION: frozenset[Fault] = frozenset(
+    {
+        "beam_x_dead",
+        "beam_y_dead",
+        "chatter",
+        "lost_edge",
+        "double_edge",
+        "wrong_station",
+        "joints_silent",
+        "frozen_clock",
+        "moved_by_hand",
+    }
+)
+"""Faults that begin with the robot's next motion; the others begin at once."""
+
+LASTING: frozenset[Fault] = frozenset(
+    {"collision", "wrong_tool", "sensor_knocked", "sphere_knocked"}
+)
+"""What was moved or mounted stays so while other faults come and go."""
+
+FAR = np.array([0.0, 0.0, -1e3])  # m
+BENT = np.array([0.6, -0.7, 0.38])  # of a collision, flange axes; about unit length
+LEVER_M = 0.15  # between the bend and the tip
+THICKER = 0.1  # of a wrong tool: growth of its radius over that of its length
+KNOCK = np.array([0.8, 0.3, -0.5])  # of the sensor, its own axes
+TURN = np.array([0.6, -0.8, 0.0])
+TURN_RAD_PER_M = 1.0
+BALL_KNOCK = np.array([0.6, 0.0, -0.8])  # flange axes
+HAND = np.array([0.7, -0.7, 0.0])  # base
 CHATTER = 7  # edges that one edge becomes
 CHATTER_S = 3e-4
 AGAIN_S = 5e-3  # a double edge comes so much later
+
+
+def size_of(fault: Fault, size: float = 0.0) -> float:
+    """A fault's size in SI from one in its own unit; 0: the usual one."""
+    usual, unit, _ = SIZES.get(fault, (0.0, 1.0, ""))
+    return (size or usual) * unit
+
+
+@dataclass
+class Faults:
+    """What is wrong now: size, in SI, of each fault in force."""
+
+    sizes: dict[Fault, float] = field(default_factory=dict)
+
+    def __contains__(self, fault: Fault) -> bool:
+        return fault in self.sizes
+
+    def size(self, fault: Fault) -> float:
+        """Size of a fault, 0 where it is not in force."""
+        return self.sizes.get(fault, 0.0)
+
+    def tool(self, mounted: RoundTool) -> RoundTool:
+        """The tool as it is after a collision, or another one in its place."""
+        if "wrong_tool" in self:
+            longer = self.size("wrong_tool")
+            T = mounted.T_flange_tool @ frames.transform(np.eye(3), [0.0, 0.0, longer])
+            wider, height = THICKER * max(longer, 0.0), mounted.height + longer
+            height[0] = mounted.height[0] + wider
+            mounted = RoundTool(T, height, mounted.radius + wider)
+        if "collision" in self:
+            shift = self.size("collision") * BENT
+            tilt = np.array([-shift[1], shift[0], 0.0]) / LEVER_M
+            mounted = mounted.mounted(bent(mounted.T_flange_tool, shift, tilt))
+        return mounted
+
+    @property
+    def T_sensor_knock(self) -> Array:
+        """Takes points (4, 4) in the sensor's frame to where the knocked sensor sees them."""
+        size = self.size("sensor_knocked")
+        return frames.transform(frames.exp_rotation(size * TURN_RAD_PER_M * TURN), size * KNOCK)
+
+    @property
+    def ball_shift(self) -> Array:
+        """How far (3,) the sphere sits from its place, flange axes, m."""
+        return self.size("sphere_knocked") * BALL_KNOCK
+
+    @property
+    def hand(self) -> Array:
+        """How far (3,) a hand moves the flange, base, m."""
+        return self.size("moved_by_hand") * HAND
+
+    def station(self, clean: BeamStation) -> BeamStation:
+        """The station with dirt before the x-beam's receiver: it goes dark earlier, or for good."""
+        left = 1.0 - self.size("beam_dirty")
+        if left == 1.0:
+            return clean
+        x, y = clean.beams
+        if max(x.dark_at, x.light_at) >= left:  # dark for good: no tool ever meets it
+            return replace(clean, beams=(replace(x, start=x.start + FAR, end=x.end + FAR), y))
+        x = replace(x, dark_at=x.dark_at / left, light_at=x.light_at / left)
+        return replace(clean, beams=(x, y))
 
 
 class FaultyInput:
@@ -33,30 +155,37 @@ class FaultyInput:
     ``lost_edge`` and ``double_edge`` befall the second edge of a step's y-beam.
     """
 
-    def __init__(self) -> None:
-        self.begin("none")
+    def __init__(self, faults: Faults) -> None:
+        self._faults, self._seen = faults, 0
 
-    def begin(self, fault: Fault) -> None:
+    def begin(self) -> None:
         """A step begins."""
-        self._fault, self._seen = fault, 0
+        self._seen = 0
 
     def passed(self, edges: Sequence[BeamEdge]) -> list[BeamEdge]:
         """What comes through of edges, in order of time."""
-        dead: dict[Fault, Beam] = {"beam_x_dead": "x", "beam_y_dead": "y"}
         out: list[BeamEdge] = []
         for edge in edges:
-            self._seen += edge.beam == "y"
-            if edge.beam == dead.get(self._fault):
-                continue
-            if self._fault == "chatter":
-                out += _chattered(edge)
-            elif edge.beam == "y" and self._seen == 2 and self._fault == "lost_edge":
-                continue
-            elif edge.beam == "y" and self._seen == 2 and self._fault == "double_edge":
-                out += [edge, replace(edge, time_s=edge.time_s + AGAIN_S)]
-            else:
-                out.append(edge)
+            out += self._passed(edge)
         return out
+
+    def _passed(self, edge: BeamEdge) -> list[BeamEdge]:
+        faults = self._faults
+        if f"beam_{edge.beam}_dead" in faults.sizes:
+            return []
+        self._seen += edge.beam == "y"
+        second = edge.beam == "y" and self._seen == 2
+        if second and "lost_edge" in faults:
+            return []
+        edge = replace(edge, time_s=edge.time_s + faults.size("input_latency"))
+        if "swapped_cables" in faults:
+            other: Beam = "y" if edge.beam == "x" else "x"
+            edge = replace(edge, beam=other)
+        if "chatter" in faults:
+            return _chattered(edge)
+        if second and "double_edge" in faults:
+            return [edge, replace(edge, time_s=edge.time_s + AGAIN_S)]
+        return [edge]
 
 
 def _chattered(edge: BeamEdge) -> list[BeamEdge]:

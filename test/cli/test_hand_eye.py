@@ -29,7 +29,7 @@ from scipy.stats import chi2
 from robocal_ros.cli.main import main
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.targets import LineTarget
-from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, Shots, View, view
 from robocal_ros.sim.hand_eye_sets import DOWN, sphere_shots
 from robocal_ros.sim.profile_targets import ball_on_table

@@ -10,7 +10,7 @@ from hand_eye_driver import ARM, FRAME, Q_NEAR, Recorded
 
 from robocal_ros.sessions.hand_eye_shots import IMAGE
 from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose, true_pose
-from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot
 from robocal_ros.sim.robot import Effects
 from robocal_ros.storage.bag_writer import ros_time

@@ -18,7 +18,7 @@ from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
 from robocal_ros.sessions.observations import JOINTS
-from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
 from robocal_ros.sim.hand_eye_sets import sphere_shots
 from robocal_ros.sim.profile_sensor import ProfileSensor

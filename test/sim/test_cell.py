@@ -14,7 +14,8 @@ from robocal_ros.core.tool.laser_frame import calibrate_laser
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
 from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise
-from robocal_ros.sim.cell import TICK_S, SimulatedCell, known_laser
+from robocal_ros.sim.cell import TICK_S, SimulatedCell
+from robocal_ros.sim.cell_plan import known_laser
 from robocal_ros.sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
 
 NOISE = TrueNoise(3e-5, 1e-5)
@@ -100,7 +101,7 @@ def test_a_run_without_noise_gives_the_tool_back():
 def test_a_noisy_run_gives_the_tool_back_within_its_covariance():
     plan = plan_of(source=SAMPLED, noise=NOISE, ripple=0.02)
     laser = calibrate_laser(
-        known_laser(plan, T_BASE_LASER, rng()), point_sigma(plan.station), CYLINDER_M
+        known_laser(plan, T_BASE_LASER, Q_START, rng()), point_sigma(plan.station), CYLINDER_M
     )
     found, _ = measured(SimulatedCell(plan), laser, RobotNoise(NOISE.step_m, NOISE.edge_m))
     off = found.tip - TRUTH[:3, 3]
@@ -113,7 +114,7 @@ def test_the_arms_own_error_is_in_the_flange_and_in_the_known_laser():
     cell = SimulatedCell(plan)
     wrong = ARM.fk(Q_START)[:3, 3] - cell.flange(np.zeros(1))[0, :3, 3]
     assert 1e-4 < np.linalg.norm(wrong) < 2e-3
-    laser = calibrate_laser(known_laser(plan, T_BASE_LASER, rng()))
+    laser = calibrate_laser(known_laser(plan, T_BASE_LASER, Q_START, rng()))
     moved = laser.T_base_laser[:3, 3] - LASER.T_base_laser[:3, 3]
     # The robot sees its station where its own error puts it, up to the turn over the tool.
     assert np.linalg.norm(moved - wrong) < 0.5 * np.linalg.norm(wrong)
@@ -164,18 +165,18 @@ def test_the_seed_tells_everything_whenever_the_cell_is_asked():
 )
 def test_faults_of_the_input_from_the_next_motion_on(fault, x, y):
     cell = SimulatedCell(plan_of())
-    cell.fault = fault
-    assert cell.fault == "none"
+    cell.set_fault(fault)
+    assert not cell.faults.sizes
     came = keys(driven(cell, circle()).edges)
-    assert cell.fault == fault
+    assert list(cell.faults.sizes) == [fault]
     assert [sum(beam == b for beam, _ in came) for b in "xy"] == [x, y]
-    cell.fault = "none"
+    cell.set_fault("none")
     assert len(driven(cell, circle()).edges) == 8
 
 
 def test_chatter_does_not_settle():
     cell = SimulatedCell(plan_of())
-    cell.fault = "chatter"
+    cell.set_fault("chatter")
     edges = driven(cell, circle()).edges
     with pytest.raises(BeamError, match="chatters"):
         debounced(edges, 5e-4)
@@ -183,7 +184,7 @@ def test_chatter_does_not_settle():
 
 def test_a_hand_moves_the_flange_and_no_joint():
     cell = SimulatedCell(plan_of())
-    cell.fault = "moved_by_hand"
+    cell.set_fault("moved_by_hand")
     cell.drive(circle())
     time = np.arange(0.0, cell.motion.end_s, 1e-3)
     q = cell.motion.at(time)[0]

@@ -7,7 +7,7 @@ import pytest
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import LimitError
-from robocal_ros.sim.cell import rigid_robot
+from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Shots
 from robocal_ros.sim.hand_eye_sets import (
     TrueStairs,
