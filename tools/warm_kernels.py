@@ -5,7 +5,7 @@ Numba keeps the machine code beside the source, so that no node pays for it at i
 
 import numpy as np
 
-from robocal_ros.core import serialized_path
+from robocal_ros.core import mcap_records, serialized_joints, serialized_path
 from robocal_ros.core.identification import identify
 from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.core.kinematics import SerialArm
@@ -53,7 +53,8 @@ def main() -> None:
     data = Measurements(q=q, position=position, target=("tool",) * POSES, sample=names)
     identify(arm, data).cell.residual(data)
     load_kernels(arm)
-    serialized_path.load_kernels()
+    for serialized in (mcap_records, serialized_joints, serialized_path):
+        serialized.load_kernels()
 
 
 if __name__ == "__main__":
