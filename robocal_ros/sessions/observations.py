@@ -122,7 +122,7 @@ class ObservationDesk:
             return
         left = self.stream.newest_ns
         try:
-            added = self.stream.add(sample, self._gap_ns)
+            added = self.stream.add(sample, int(self.rule.gap_s * 1e9))
         except InputError as error:
             self.ignored.add(JOINTS, str(error))
             return
@@ -145,15 +145,11 @@ class ObservationDesk:
         if self._pending:
             complete_ns = self._pending[0].stamp_ns + int(self.rule.after_s * 1e9)
             before_ns = complete_ns if before_ns is None else min(before_ns, complete_ns)
-        count = self.stream.extend(block, start, before_ns, self._gap_ns)
+        count = self.stream.extend(block, start, before_ns, int(self.rule.gap_s * 1e9))
         if count:
             self.received[JOINTS] += count
             self.newest_ns[JOINTS] = int(block.stamp_ns[start + count - 1])
         return count
-
-    @property
-    def _gap_ns(self) -> int:
-        return int(self.rule.gap_s * 1e9)
 
     def _settle(self) -> None:
         """Make observations of the waiting measurements whose joints are complete."""
