@@ -42,15 +42,14 @@ def _gather(
         first = begin[i]
         if end[i] - first != size:
             return i
+        message = content[first : first + size]
         other = np.uint8(0)
         for j in range(size):
-            other |= (content[first + j] ^ pattern[j]) & fixed[j]
+            other |= np.uint8((message[j] ^ pattern[j]) & fixed[j])
         if other != 0:
             return i
-        for j in range(stamps.shape[1]):
-            stamps[i, j] = content[first + ENCAPSULATION + j]
-        for j in range(positions.shape[1]):
-            positions[i, j] = content[first + at + j]
+        stamps[i] = message[ENCAPSULATION : ENCAPSULATION + STAMP]
+        positions[i] = message[at : at + positions.shape[1]]
     return int(begin.shape[0])
 
 
