@@ -1,12 +1,12 @@
 """Joint readings in blocks do what they do one by one, to the last bit, however odd the stream."""
 
-from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from joint_blocks import in_blocks
 from tool_driver import config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
@@ -67,31 +67,6 @@ def streams(draw: st.DrawFn, names: tuple[str, ...] = NAMES) -> list[Any]:
             case "zero":
                 joints(0)
     return found
-
-
-def in_blocks(samples: Sequence[Any], sizes: Sequence[int]) -> Iterator[Any]:
-    """The same samples, those of the same joints together, at most as many as ``sizes`` say."""
-    waiting: list[JointSample] = []
-    turn = 0
-
-    def together() -> Iterator[JointBlock]:
-        if waiting:
-            stamps = np.array([s.stamp_ns for s in waiting], dtype=np.int64)
-            yield JointBlock(stamps, waiting[0].names, np.array([s.position for s in waiting]))
-            waiting.clear()
-
-    for sample in samples:
-        joint = isinstance(sample, JointSample)
-        if not joint or (waiting and waiting[0].names != sample.names):
-            yield from together()
-        if not joint:
-            yield sample
-            continue
-        waiting.append(sample)
-        if len(waiting) >= sizes[turn % len(sizes)]:
-            yield from together()
-            turn += 1
-    yield from together()
 
 
 class Desk:
