@@ -5,8 +5,6 @@ Source: the MCAP specification, https://mcap.dev/spec: a record is an opcode (1 
 publish time (8), then data. Numbers are little endian.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,32 +16,6 @@ MESSAGE_HEAD = 22
 CHANNEL, LOG_TIME = 0, 6  # places in a message's head
 
 Places = NDArray[np.int64]
-
-
-class Messages(NamedTuple):
-    """Messages (k,) in the bytes that they came from.
-
-    Attributes
-    ----------
-    content : the bytes.
-    log_time_ns : when each was recorded.
-    channel : its number.
-    begin, end : where its data lies.
-    """
-
-    content: memoryview
-    log_time_ns: Places
-    channel: Places
-    begin: Places
-    end: Places
-
-    def data(self, place: int) -> memoryview:
-        """A message's data."""
-        return self.content[self.begin[place] : self.end[place]]
-
-    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> "Messages":
-        """Return those at ``rows``."""
-        return Messages(self.content, *(column[rows] for column in self[1:]))
 
 
 @lean
@@ -81,8 +53,10 @@ def _scan(content: NDArray[np.uint8], columns: Places) -> int:
     return count
 
 
-def find_messages(content: memoryview) -> Messages:
+def find_messages(content: memoryview) -> Places:
     """Messages among the records in ``content``, as they are stored.
+
+    Columns (4, k): log time, ns; channel; begin and end of the data in ``content``.
 
     Raises
     ------
@@ -93,7 +67,7 @@ def find_messages(content: memoryview) -> Messages:
     count = _scan(np.frombuffer(content, dtype=np.uint8), columns)
     if count < 0:
         raise ValueError(f"no whole record at byte {-1 - count} of the content")
-    return Messages(content, *columns[:, :count].copy())
+    return columns[:, :count].copy()
 
 
 def load_kernels() -> None:

@@ -17,13 +17,13 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.mcap_records import Messages
 from robocal_ros.storage import bag_types
 from robocal_ros.storage.bag_writer import BagWriter
 from robocal_ros.storage.files import read_text
 from robocal_ros.storage.mcap_files import Block, Lost, McapFile, open_file, read_block
 from robocal_ros.storage.merging import in_order
 from robocal_ros.storage.message_readers import message_reader
+from robocal_ros.storage.messages import Messages
 
 __all__ = ["BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "read_bag"]
 

@@ -22,8 +22,8 @@ from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from zstandard import ZstdError
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.mcap_records import Messages, find_messages
 from robocal_ros.storage.bag_types import full_name
+from robocal_ros.storage.messages import Messages
 
 MAGIC = b"\x89MCAP0\r\n"
 OTHER_FORMATS = {
@@ -115,7 +115,7 @@ def read_block(
     try:
         stream.seek(block.offset)
         data = stream.read(block.size)
-        found = find_messages(_unpacked(data) if block.chunked else memoryview(data))
+        found = Messages.among(_unpacked(data) if block.chunked else memoryview(data))
     except (*DAMAGE, OSError) as error:
         _lose(file, block, data, error)
         return None
@@ -236,7 +236,7 @@ def _add_block(stream: IO[bytes], file: McapFile, block: Block) -> None:
     try:
         content = _unpacked(data) if block.chunked else memoryview(data)
         _definitions(content, file)
-        found = find_messages(content)
+        found = Messages.among(content)
     except DAMAGE as error:
         _lose(file, block, data, error)
         return

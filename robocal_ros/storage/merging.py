@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from robocal_ros.core.mcap_records import Messages
 from robocal_ros.storage.mcap_files import Block
+from robocal_ros.storage.messages import Messages
 
 
 class Stretch(NamedTuple):

@@ -4,18 +4,20 @@ A reader takes messages and a range of them, and gives contents with the place o
 """
 
 from collections.abc import Callable, Collection, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.serde.errors import SerdeError
 from rosbags.typesys.store import Typestore
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.mcap_records import Messages
 from robocal_ros.core.samples import JointBlock, joint_sample
-from robocal_ros.core.serialized_joints import JointLayout
 from robocal_ros.storage.bag_types import ros_types
 from robocal_ros.storage.mcap_files import McapFile
+from robocal_ros.storage.messages import Messages
+
+if TYPE_CHECKING:
+    from robocal_ros.core.serialized_joints import JointLayout
 
 Decode = Callable[[Messages, int], Any]
 Reader = Callable[[Messages, int, int], Iterator[tuple[int, Any]]]
@@ -99,6 +101,8 @@ class _JointReader(_OneByOne):
 
     def _learn(self, found: Messages, place: int) -> bool:
         """Take the layout of a message, if it is one that can be used."""
+        from robocal_ros.core.serialized_joints import JointLayout
+
         layout = JointLayout.of(bytes(found.data(place)))
         if layout is None:
             return False

@@ -33,10 +33,10 @@ def test_the_messages_of_a_file_without_chunks_are_those_that_the_library_reads(
         channel, data = channels[int(rng.integers(3))], rng.bytes(int(rng.integers(50)))
         writer.add_message(channel, log_time=int(rng.integers(2**62)), data=data, publish_time=0)
     writer.finish()
-    found = find_messages(memoryview(stream.getvalue()[8:-8]))
+    records = memoryview(stream.getvalue()[8:-8])
     ours = [
-        (channel, at, bytes(found.data(i)))
-        for i, (channel, at) in enumerate(zip(found.channel, found.log_time_ns, strict=True))
+        (channel, log_time, bytes(records[begin:end]))
+        for log_time, channel, begin, end in find_messages(records).T
     ]
     theirs = make_reader(BytesIO(stream.getvalue())).iter_messages(log_time_order=False)
     assert ours == [(m.channel_id, m.log_time, m.data) for _, _, m in theirs]
@@ -45,14 +45,15 @@ def test_the_messages_of_a_file_without_chunks_are_those_that_the_library_reads(
 
 def test_a_message_is_read_as_the_library_reads_it():
     content = message(513, 2**62 + 3)
-    found = find_messages(memoryview(record(99, b"unknown") + content))
+    records = memoryview(record(99, b"unknown") + content)
+    ((log_time, channel, begin, end),) = find_messages(records).T
     read = Message.read(ReadDataStream(BytesIO(content[HEAD.size :])), len(content) - HEAD.size)
-    assert (found.channel[0], found.log_time_ns[0]) == (read.channel_id, read.log_time)
-    assert bytes(found.data(0)) == read.data
+    assert (channel, log_time) == (read.channel_id, read.log_time)
+    assert bytes(records[begin:end]) == read.data
 
 
 def test_nothing_holds_no_message():
-    assert len(find_messages(memoryview(b"")).channel) == 0
+    assert find_messages(memoryview(b"")).shape == (4, 0)
 
 
 @pytest.mark.parametrize(
