@@ -90,12 +90,13 @@ class _JointReader(_OneByOne):
         """The readings from ``start`` on that are laid out alike and finite; None without."""
         begin, end = found.begin[start:stop], found.end[start:stop]
         content = np.frombuffer(found.content, dtype=np.uint8)
-        for place, (layout, names) in enumerate(self._layouts):
+        for layout, names in self._layouts:
+            if len(layout.pattern) != end[0] - begin[0]:
+                continue
             stamps, position = layout.gather(content, begin, end)
             finite = np.isfinite(position).all(axis=1)
             count = len(stamps) if finite.all() else int(np.argmin(finite))
             if count:
-                self._layouts.insert(0, self._layouts.pop(place))
                 return JointBlock(stamps[:count], names, position[:count])
         return None
 
