@@ -24,6 +24,7 @@ Reader = Callable[[Messages, int, int], Iterator[tuple[int, Any]]]
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 MOST_LAYOUTS = 8  # of a topic: a gripper and an arm may take turns
+MOST_TOGETHER = 1024  # readings: where all are odd, each is looked for among so many
 
 
 def message_reader(
@@ -76,9 +77,10 @@ class _JointReader(_OneByOne):
 
     def __call__(self, found: Messages, start: int, stop: int) -> Iterator[tuple[int, Any]]:
         while start < stop:
-            block = self._block(found, start, stop)
+            until = min(stop, start + MOST_TOGETHER)
+            block = self._block(found, start, until)
             if block is None and self._learn(found, start):
-                block = self._block(found, start, stop)
+                block = self._block(found, start, until)
             if block is None:
                 yield start, self._decode(found, start)
                 start += 1
