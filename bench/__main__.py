@@ -35,6 +35,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         hand_eye_tracker,
         monte_carlo,
         real_data,
+        replay_speed,
         speed,
         startup,
         thermal,
@@ -69,6 +70,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "startup": start,
         "correction_stream": streams,
         "files": lambda: [files.file_times()],
+        "replay_speed": replay_speed.tables,
     }
 
 

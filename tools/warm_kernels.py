@@ -5,7 +5,7 @@ Numba keeps the machine code beside the source, so that no node pays for it at i
 
 import numpy as np
 
-from robocal_ros.core import frames, serialized_path
+from robocal_ros.core import frames, mcap_records, serialized_joints, serialized_path
 from robocal_ros.core.hand_eye.camera_fit import fit_pairs
 from robocal_ros.core.hand_eye.pose_pairs import PosePairs
 from robocal_ros.core.identification import identify
@@ -56,7 +56,8 @@ def main() -> None:
     identify(arm, data).cell.residual(data)
     fit_pairs(PosePairs(T, frames.invert(T), names))
     load_kernels(arm)
-    serialized_path.load_kernels()
+    for serialized in (mcap_records, serialized_joints, serialized_path):
+        serialized.load_kernels()
 
 
 if __name__ == "__main__":

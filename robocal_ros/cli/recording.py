@@ -54,6 +54,11 @@ class Recording:
         """Messages of the inputs, as they were recorded."""
         return self.reader.messages(self.inputs)
 
+    def blocks(self) -> Iterator[BagMessage]:
+        """As `samples`, with the joint states that follow each other together."""
+        joints = [topic for topic, kind in self.inputs.items() if kind == JOINTS]
+        return self.reader.messages(self.inputs, blocks=joints)
+
 
 def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
     """Read the events and find the inputs.

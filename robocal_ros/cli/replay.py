@@ -21,7 +21,7 @@ NAME = "replay"
 HELP = "run a recorded bag (MCAP) through the sessions of the live nodes"
 
 _NO_ANSWER = (Code.RANK_DEFICIENT.name, Code.TOO_FEW_SAMPLES.name)
-_SHOW_EVERY = 1000
+_SHOW_EVERY = 100
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -104,14 +104,14 @@ def _status(document: dict[str, Any]) -> int:
 def _watch(what: str, recording: "Recording") -> "Iterator[BagMessage]":
     """Samples of a recording, with a progress bar on a terminal."""
     if not sys.stderr.isatty():
-        yield from recording.samples()
+        yield from recording.blocks()
         return
     from rich.progress import Progress
 
     with Progress(console=progress_console(), transient=True) as progress:
         start_ns, end_ns = recording.span_ns
         task = progress.add_task(what, total=(end_ns - start_ns) * 1e-9)
-        for number, sample in enumerate(recording.samples()):
+        for number, sample in enumerate(recording.blocks()):
             if number % _SHOW_EVERY == 0:
                 progress.update(task, completed=(sample.log_time_ns - start_ns) * 1e-9)
             yield sample

@@ -25,6 +25,7 @@ from robocal_ros.sessions.replay import (
     accepting,
     automatic_commands,
     feed,
+    one_by_one,
     replay,
     window_commands,
 )
@@ -154,7 +155,7 @@ def _commands(
     if not request.auto:
         return recording.commands
     scout = _session(recording, arm, history)
-    for sample in watch("looking for cycles", recording):
+    for sample in one_by_one(scout, watch("looking for cycles", recording)):
         feed(scout, sample, recording.inputs, take_message)
     observed = scout.desk.window(-1, scout.desk.clock_ns, scout.desk.marks)
     if not observed:

@@ -48,6 +48,25 @@ class JointSample:
         return np.array([self.names.index(name) for name in names], dtype=np.int64)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class JointBlock:
+    """Readings of the same joints, one after another as they came, each as in `JointSample`.
+
+    ``stamp_ns`` (k,) int64, ``position`` (k, n).
+    """
+
+    stamp_ns: NDArray[np.int64]
+    names: tuple[str, ...]
+    position: Array
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def sample(self, place: int) -> JointSample:
+        """Return one of the readings."""
+        return JointSample(int(self.stamp_ns[place]), self.names, self.position[place])
+
+
 @dataclass(frozen=True, slots=True)
 class PointSample:
     """A target's position (3,) in the measuring frame, in m.
@@ -172,7 +191,7 @@ def stamp_ns(stamp: Any) -> int:
 
 
 def joint_sample(message: Any) -> JointSample:
-    """Build a sample from a ``sensor_msgs/JointState``.
+    """Build a sample from a ``sensor_msgs/JointState``; a sample is one already.
 
     Raises
     ------
@@ -180,6 +199,8 @@ def joint_sample(message: Any) -> JointSample:
         When names and positions differ in number, a name is doubled or a value is not finite,
         or the readings are not the controller's own.
     """
+    if isinstance(message, JointSample):
+        return message
     if message.header.frame_id in (CORRECTED, TAUGHT):
         raise InputError(
             "joint states come from a joint correction: subscribe to the robot's own, or the model "

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import JointSample
+from robocal_ros.core.samples import JointBlock, JointSample
 
 Array = NDArray[np.float64]
 
@@ -122,6 +122,42 @@ class JointStream:
             self._append(reading, gap_ns)
         return Added(began_ns, lone_ns)
 
+    def extend(self, block: JointBlock, start: int, before_ns: int | None, gap_ns: int) -> int:
+        """Append the readings from ``start`` on that just follow each other: how many these are.
+
+        Each is what `add` would have done. The first one that leaps, is not after the one before
+        it, or is stamped ``before_ns`` or later is left to the caller.
+        """
+        order, newest = self._order.get(block.names), self.newest_ns
+        if order is None or newest is None or self._held is not None:
+            return 0
+        stamps = block.stamp_ns[start:]
+        steps = stamps - np.concatenate(([newest], stamps[:-1]))
+        plain = (steps > 0) & (steps <= max(CLOCK_JUMP_NS, gap_ns))
+        if before_ns is not None:
+            plain &= stamps < before_ns
+        count = len(plain) if plain.all() else int(np.argmin(plain))
+        pauses = steps[:count][steps[:count] > gap_ns]
+        if len(pauses):
+            self.gap_count += len(pauses)
+            self.longest_gap_ns = max(self.longest_gap_ns, int(pauses.max()))
+        rows = slice(start, start + count)
+        stamps, q = block.stamp_ns[rows], block.position[rows][:, order]
+        while len(stamps):
+            self._make_room()
+            room = len(self._stamp) - self._size
+            end = self._size + min(room, len(stamps))
+            self._stamp[self._size : end], self._q[self._size : end] = stamps[:room], q[:room]
+            self._size, stamps, q = end, stamps[room:], q[room:]
+        return count
+
+    def _make_room(self) -> None:
+        """Forget the older half of the readings where there is no room for more."""
+        if self._size == len(self._stamp):
+            self._stamp[: self._capacity] = self._stamp[self._capacity :]
+            self._q[: self._capacity] = self._q[self._capacity :]
+            self._size = self._capacity
+
     def _append(self, reading: tuple[int, Array], gap_ns: int) -> None:
         """Append a reading, and count the pause before it."""
         stamp_ns, q = reading
@@ -129,10 +165,7 @@ class JointStream:
         if newest is not None and stamp_ns - newest > gap_ns:
             self.gap_count += 1
             self.longest_gap_ns = max(self.longest_gap_ns, stamp_ns - newest)
-        if self._size == len(self._stamp):
-            self._stamp[: self._capacity] = self._stamp[self._capacity :]
-            self._q[: self._capacity] = self._q[self._capacity :]
-            self._size = self._capacity
+        self._make_room()
         self._stamp[self._size], self._q[self._size] = stamp_ns, q
         self._size += 1
 

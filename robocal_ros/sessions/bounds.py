@@ -49,13 +49,20 @@ class Bounds:
 
     def ready(self, command: Command) -> bool:
         """Whether its samples are complete."""
-        newest = self._desk.newest_ns
+        return reached(self._wanted(command), self._desk.newest_ns, self._desk.jumps)
+
+    def joints_awaited_ns(self, command: Command) -> int | None:
+        """Stamp of the joint reading that it waits for; None when it waits for none."""
+        return joints_awaited_ns(self._wanted(command), self._desk.newest_ns)
+
+    def _wanted(self, command: Command) -> Mapping[str, int]:
+        """Marks up to which samples must have come."""
         if command.marks is not None:
-            return reached(command.marks, newest, self._desk.jumps)
-        if command.name not in events.MEASURED:
-            return True
-        wanted = (command.stamp_ns or 0) + int(self._config.lateness_s * 1e9)
-        return newest.get(JOINTS, -1) >= wanted
+            return command.marks
+        marks = {JUMPS: self._desk.jumps}
+        if command.name in events.MEASURED:
+            marks[JOINTS] = (command.stamp_ns or 0) + int(self._config.lateness_s * 1e9)
+        return marks
 
 
 def reached(marks: Mapping[str, int], newest_ns: Mapping[str, int], jumps: int) -> bool:
@@ -64,3 +71,9 @@ def reached(marks: Mapping[str, int], newest_ns: Mapping[str, int], jumps: int) 
     topics = (topic for topic in marks if topic != JUMPS)
     near = all(newest_ns.get(topic, -1) >= marks[topic] for topic in topics)
     return jumps > wanted or (jumps == wanted and near)
+
+
+def joints_awaited_ns(marks: Mapping[str, int], newest_ns: Mapping[str, int]) -> int | None:
+    """Stamp of the joint reading with which the marks may be reached; None: not by one."""
+    wanted = marks.get(JOINTS, -1)
+    return wanted if newest_ns.get(JOINTS, -1) < wanted else None

@@ -1,7 +1,4 @@
-"""The hand-eye session: joints, what the sensor sees, and commands in; the sensor's place out.
-
-No clock, no ROS.
-"""
+"""The hand-eye session: samples and commands in, the sensor's place out. No clock, no ROS."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -101,6 +98,9 @@ class HandEyeSession(Commanded):
             self._shots.clear()
             self._found = self.broken_off(Code.CONFLICT, "the clock jumped back: capture again")
         self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
+
+    def _watches_joints(self) -> bool:
+        return self.data is not None and self.data.waiting is not None and self._found is None
 
     def refuse(self, kind: str, error: RobocalError) -> None:
         """Count a message that cannot be used; a capture that waits for it tells why."""

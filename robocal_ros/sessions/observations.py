@@ -13,6 +13,7 @@ from robocal_ros.core.samples import (
     MEASURED_POINT,
     REFERENCE_SPHERE,
     SPHERE_CLOUD,
+    JointBlock,
     JointSample,
     PointSample,
     PoseSample,
@@ -133,6 +134,22 @@ class ObservationDesk:
         if self.stream.newest_ns is not None:
             self.newest_ns[JOINTS] = self.stream.newest_ns
             self._settle()
+
+    def take_plain(self, block: JointBlock, start: int, before_ns: int | None) -> int:
+        """Take the readings from ``start`` on with which nothing happens: how many these are.
+
+        ``add_joints`` of each would do the same. The first one with which the clock may jump, or
+        a measurement's joints are complete, or that is stamped ``before_ns`` or later, is left to
+        the caller.
+        """
+        if self._pending:
+            complete_ns = self._pending[0].stamp_ns + int(self.rule.after_s * 1e9)
+            before_ns = complete_ns if before_ns is None else min(before_ns, complete_ns)
+        count = self.stream.extend(block, start, before_ns, int(self.rule.gap_s * 1e9))
+        if count:
+            self.received[JOINTS] += count
+            self.newest_ns[JOINTS] = int(block.stamp_ns[start + count - 1])
+        return count
 
     def _settle(self) -> None:
         """Make observations of the waiting measurements whose joints are complete."""

@@ -8,7 +8,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import stamp_ns
+from robocal_ros.core.samples import JointBlock, stamp_ns
 from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
 from robocal_ros.sessions.decisions import NEWEST
@@ -24,7 +24,10 @@ LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cy
 
 
 class Recorded(Protocol):
-    """A message of a bag: its topic and the message with the attributes of the ROS type."""
+    """A message of a bag: its topic and the message with the attributes of the ROS type.
+
+    In place of messages that follow each other there may be a ``JointBlock``.
+    """
 
     @property
     def topic(self) -> str:
@@ -41,6 +44,9 @@ class Replayed(Protocol):
     @property
     def newest_joints_ns(self) -> int:
         """Time of the data: what a replay's history has in place of the wall clock."""
+
+    def take_plain(self, block: JointBlock, start: int) -> int:
+        """Take the readings from ``start`` on that decide nothing: how many these are."""
 
     def submit(self, command: Command, clock_ns: int | None = None) -> None:
         """Queue a command."""
@@ -132,6 +138,31 @@ def input_topics(topics: Iterable[str], configured: Command | None = None) -> di
     return found
 
 
+@dataclass(frozen=True)
+class One:
+    """One sample of a recording."""
+
+    topic: str
+    message: Any
+
+
+def one_by_one(session: Replayed, messages: Iterable[Recorded]) -> Iterator[Recorded]:
+    """Samples that may decide something; joint readings that do not, the session takes at once.
+
+    It has the rest of a block of them before the next sample is asked for.
+    """
+    for recorded in messages:
+        block = recorded.message
+        if not isinstance(block, JointBlock):
+            yield recorded
+            continue
+        start = session.take_plain(block, 0)
+        while start < len(block):
+            yield One(recorded.topic, block.sample(start))
+            start += 1
+            start += session.take_plain(block, start)
+
+
 def feed(
     session: S,
     recorded: Recorded,
@@ -164,7 +195,7 @@ def replay(
     expected = iter(commands)
     ids: dict[int, int] = {}
     awaited = _submit_next(session, expected, ids)
-    for recorded in messages:
+    for recorded in one_by_one(session, messages):
         feed(session, recorded, topics, take)
         while awaited is not None and (done := session.step(wall_ns=session.newest_joints_ns)):
             awaited = _take(session, report, done, awaited, expected, ids)

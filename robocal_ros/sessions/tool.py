@@ -97,6 +97,9 @@ class ToolSession(Commanded):
                 )
                 self._end_early(f"{run.awaited.name}: {why}")
 
+    def _watches_joints(self) -> bool:
+        return self.run is not None and self._over is None
+
     def _end_early(self, reason: str) -> None:
         if self.run is not None:
             arguments = {"code": int(Code.BEAM_EDGES_WRONG), "reason": reason}

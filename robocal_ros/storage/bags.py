@@ -3,17 +3,16 @@
 A message read from a bag has the attributes of the ROS message of its type.
 """
 
-import heapq
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 import yaml
-from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -21,7 +20,10 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.storage import bag_types
 from robocal_ros.storage.bag_writer import BagWriter
 from robocal_ros.storage.files import read_text
-from robocal_ros.storage.mcap_files import Lost, McapFile, Raw, open_file, read_block
+from robocal_ros.storage.mcap_files import Block, Lost, McapFile, open_file, read_block
+from robocal_ros.storage.merging import in_order
+from robocal_ros.storage.message_readers import message_reader
+from robocal_ros.storage.messages import Messages
 
 __all__ = ["BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "read_bag"]
 
@@ -101,7 +103,7 @@ class BagReader:
         for file in self._files:
             for number, channel in file.channels.items():
                 counts[channel.topic] = counts.get(channel.topic, 0) + file.counts[number]
-                types[channel.topic] = _msgtype(file, number)
+                types[channel.topic] = file.msgtype(number)
         starts = [file.start_ns for file in self._files if file.start_ns is not None]
         ends = [file.end_ns for file in self._files if file.end_ns is not None]
         return BagInfo(
@@ -124,10 +126,16 @@ class BagReader:
                 )
 
     def messages(
-        self, topics: Collection[str] | None = None, *, raw: bool = False
+        self,
+        topics: Collection[str] | None = None,
+        *,
+        raw: bool = False,
+        blocks: Collection[str] = (),
     ) -> Iterator[BagMessage]:
         """Messages of all topics, or of ``topics``, by log time, ties as they were recorded.
 
+        On the topics of ``blocks``, joint states that follow each other come together, as a
+        ``JointBlock`` with the log time of its first; those that are odd come as messages.
         A damaged chunk is left out; afterwards ``info`` tells of it.
 
         Raises
@@ -137,7 +145,7 @@ class BagReader:
         """
         wanted = [
             {
-                number: (channel.topic, _msgtype(file, number))
+                number: file.msgtype(number)
                 for number, channel in file.channels.items()
                 if topics is None or channel.topic in topics
             }
@@ -146,10 +154,7 @@ class BagReader:
         if not raw:
             for number, channels in enumerate(wanted):
                 self._learn_types(number, channels)
-        for index, message in self._in_order(wanted):
-            topic, msgtype = wanted[index][message.channel]
-            content = bytes(message.data) if raw else self._decode(index, topic, msgtype, message)
-            yield BagMessage(topic, msgtype, message.log_time_ns, content)
+        yield from self._read(wanted, raw, blocks)
         if (lost := self.info.lost) and all(
             block.offset in file.lost for file in self._files for block in file.blocks
         ):
@@ -173,61 +178,43 @@ class BagReader:
             text = schema.data.decode("utf-8", "replace") if schema else ""
             encoding = schema.encoding if schema else ""
             bag_types.register_schema(
-                self._types[index], _msgtype(file, number), encoding, text, str(file.path)
+                self._types[index], file.msgtype(number), encoding, text, str(file.path)
             )
 
-    def _in_order(self, wanted: list[dict[int, tuple[str, str]]]) -> Iterator[tuple[int, Raw]]:
-        """Merge the blocks of all files; a block is in memory only while it is needed."""
+    def _read(
+        self, wanted: list[dict[int, str]], raw: bool, blocks: Collection[str]
+    ) -> Iterator[BagMessage]:
+        readers = [
+            {
+                number: message_reader(file, number, None if raw else types, blocks)
+                for number in channels
+            }
+            for file, types, channels in zip(self._files, self._types, wanted, strict=True)
+        ]
         streams = [self._open(file) for file in self._files]
-        blocks = [
-            (block.start_ns, index, block)
+        needed = (
+            (index, block)
             for index, file in enumerate(self._files)
             for block in file.blocks
-            if wanted[index]
-        ]
-        heap: list[_Entry] = []
-        for start_ns, index, block in sorted(blocks):
-            yield from _earlier(heap, start_ns)
-            messages = read_block(streams[index], self._files[index], block, wanted[index])
-            if messages:
-                heapq.heappush(heap, (messages[0].log_time_ns, index, block.offset, 0, messages))
-        yield from _earlier(heap, None)
+            if wanted[index] and (not block.channels or block.channels & wanted[index].keys())
+        )
+
+        def read(index: int, block: Block) -> Messages | None:
+            return read_block(streams[index], self._files[index], block, wanted[index])
+
+        for index, messages, first, last in in_order(needed, read):
+            turns = np.flatnonzero(np.diff(messages.channel[first:last])) + first + 1
+            for start, stop in pairwise([first, *turns.tolist(), last]):
+                number = int(messages.channel[start])
+                of = self._files[index].channels[number].topic, wanted[index][number]
+                for place, content in readers[index][number](messages, start, stop):
+                    yield BagMessage(*of, int(messages.log_time_ns[place]), content)
 
     def _open(self, file: McapFile) -> IO[bytes]:
         try:
             return self._stack.enter_context(file.path.open("rb"))
         except OSError as error:
             raise InputError(f"cannot be read: {error.strerror}", file=str(file.path)) from error
-
-    def _decode(self, index: int, topic: str, msgtype: str, message: Raw) -> Any:
-        try:
-            return self._types[index].deserialize_cdr(message.data, msgtype)
-        except (SerdeError, KeyError) as error:
-            raise InputError(
-                f"a message of {topic} at {message.log_time_ns} ns is not a {msgtype}: {error}",
-                file=str(self._files[index].path),
-            ) from error
-
-
-# time, file, block's offset, place in the block, the block's messages
-_Entry = tuple[int, int, int, int, list[Raw]]
-
-
-def _earlier(heap: list[_Entry], before_ns: int | None) -> Iterator[tuple[int, Raw]]:
-    """Take the messages before ``before_ns`` (None: all) off the heap, in order."""
-    while heap and (before_ns is None or heap[0][0] < before_ns):
-        _, index, offset, place, messages = heap[0]
-        yield index, messages[place]
-        if place + 1 < len(messages):
-            entry = (messages[place + 1].log_time_ns, index, offset, place + 1, messages)
-            heapq.heapreplace(heap, entry)
-        else:
-            heapq.heappop(heap)
-
-
-def _msgtype(file: McapFile, channel: int) -> str:
-    schema = file.schemas.get(file.channels[channel].schema_id)
-    return bag_types.full_name(schema.name) if schema else "unknown"
 
 
 def _bag_files(path: Path) -> tuple[list[Path], list[str]]:

@@ -12,6 +12,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -21,6 +22,8 @@ from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
 from zstandard import ZstdError
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.bag_types import full_name
+from robocal_ros.storage.messages import Messages
 
 MAGIC = b"\x89MCAP0\r\n"
 OTHER_FORMATS = {
@@ -29,7 +32,6 @@ OTHER_FORMATS = {
     b"\x28\xb5\x2f\xfd": "compressed as a whole; unpack it with 'zstd -d'",
 }
 HEAD = struct.Struct("<BQ")  # opcode, length
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 TIMES = struct.Struct("<QQ")
 # what the libraries raise when bytes make no sense: MCAP, zstd, lz4, numbers and text
 DAMAGE = (McapError, CRCValidationError, ZstdError, RuntimeError, struct.error, ValueError)
@@ -38,12 +40,16 @@ LOOSE_BLOCK = 1 << 20  # bytes of messages outside chunks that are read at a tim
 
 
 class Block(NamedTuple):
-    """A chunk, or (``chunked`` False) a run of records outside chunks, by its place in the file."""
+    """A chunk, or (``chunked`` False) a run of records outside chunks, by its place in the file.
+
+    ``channels`` that have messages in it; empty where the index does not tell.
+    """
 
     start_ns: int
     offset: int
     size: int
     chunked: bool
+    channels: frozenset[int] = frozenset()
 
 
 class Lost(NamedTuple):
@@ -52,15 +58,6 @@ class Lost(NamedTuple):
     from_ns: int | None
     to_ns: int | None
     why: str
-
-
-class Raw(NamedTuple):
-    """A message as stored; ``position`` in its block makes the order of equal times certain."""
-
-    log_time_ns: int
-    position: int
-    channel: int
-    data: memoryview
 
 
 @dataclass
@@ -81,6 +78,11 @@ class McapFile:
     notes: list[str] = field(default_factory=list)
     nameless: int = 0
     lost: dict[int, Lost] = field(default_factory=dict)
+
+    def msgtype(self, channel: int) -> str:
+        """Full name of a channel's type; ``unknown`` where the file does not define it."""
+        schema = self.schemas.get(self.channels[channel].schema_id)
+        return full_name(schema.name) if schema else "unknown"
 
 
 def open_file(path: Path) -> McapFile:
@@ -104,8 +106,8 @@ def open_file(path: Path) -> McapFile:
 
 def read_block(
     stream: IO[bytes], file: McapFile, block: Block, wanted: Collection[int]
-) -> list[Raw]:
-    """Messages of a block on the ``wanted`` channels, in order of log time.
+) -> Messages | None:
+    """Messages of a block on the ``wanted`` channels, in order of log time, ties as stored.
 
     A damaged block has none, and is added to what the file has lost.
     """
@@ -113,12 +115,12 @@ def read_block(
     try:
         stream.seek(block.offset)
         data = stream.read(block.size)
-        found = _messages(_unpacked(data) if block.chunked else memoryview(data), wanted)
+        found = Messages.among(_unpacked(data) if block.chunked else memoryview(data))
     except (*DAMAGE, OSError) as error:
         _lose(file, block, data, error)
-        return []
-    found.sort()
-    return found
+        return None
+    found = found.take(np.isin(found.channel, list(wanted)))
+    return found.take(np.argsort(found.log_time_ns, kind="stable"))
 
 
 def _lose(file: McapFile, block: Block, data: bytes, error: Exception) -> None:
@@ -164,7 +166,13 @@ def _indexed(stream: IO[bytes], path: Path) -> McapFile | None:
         return None
     file = McapFile(path, summary.schemas, summary.channels)
     file.blocks = [
-        Block(chunk.message_start_time, chunk.chunk_start_offset, chunk.chunk_length, True)
+        Block(
+            chunk.message_start_time,
+            chunk.chunk_start_offset,
+            chunk.chunk_length,
+            True,
+            frozenset(chunk.message_index_offsets),
+        )
         for chunk in summary.chunk_indexes
     ]
     file.counts = Counter(statistics.channel_message_counts)
@@ -228,19 +236,20 @@ def _add_block(stream: IO[bytes], file: McapFile, block: Block) -> None:
     try:
         content = _unpacked(data) if block.chunked else memoryview(data)
         _definitions(content, file)
-        found = _messages(content, None)
+        found = Messages.among(content)
     except DAMAGE as error:
         _lose(file, block, data, error)
         return
-    messages = [message for message in found if message.channel in file.channels]
-    file.nameless += len(found) - len(messages)
-    if not messages:
+    named = found.take(np.isin(found.channel, list(file.channels)))
+    file.nameless += len(found.channel) - len(named.channel)
+    if not len(named.channel):
         return
-    first, last = min(messages).log_time_ns, max(messages).log_time_ns
-    file.counts.update(message.channel for message in messages)
+    first, last = int(named.log_time_ns.min()), int(named.log_time_ns.max())
+    counts = Counter(named.channel.tolist())
+    file.counts.update(counts)
     file.start_ns = first if file.start_ns is None else min(first, file.start_ns)
     file.end_ns = last if file.end_ns is None else max(last, file.end_ns)
-    file.blocks.append(block._replace(start_ns=first))
+    file.blocks.append(block._replace(start_ns=first, channels=frozenset(counts)))
 
 
 def _unpacked(record: bytes) -> memoryview:
@@ -263,18 +272,3 @@ def _definitions(content: memoryview, file: McapFile) -> None:
                 channel = Channel.read(body)
                 file.channels[channel.id] = channel
         at += HEAD.size + length
-
-
-def _messages(content: memoryview, wanted: Collection[int] | None) -> list[Raw]:
-    found = []
-    at, size = 0, len(content)
-    head, message, skip = HEAD.unpack_from, MESSAGE.unpack_from, HEAD.size + MESSAGE.size
-    while at < size:
-        opcode, length = head(content, at)
-        end = at + HEAD.size + length
-        if opcode == Opcode.MESSAGE:
-            channel, _, log_time, _ = message(content, at + HEAD.size)
-            if wanted is None or channel in wanted:
-                found.append(Raw(log_time, at, channel, content[at + skip : end]))
-        at = end
-    return found

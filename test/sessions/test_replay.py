@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from joint_blocks import in_blocks
 from shift import Shift, built, postures, warmed
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import Proposal
-from robocal_ros.core.samples import JointSample
+from robocal_ros.core.samples import JointBlock, JointSample
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import CONFIGURE, Command
 from robocal_ros.sessions.inputs import take_message
@@ -62,6 +63,8 @@ def point_message(ns: int, frame_id: str, x: float, y: float, z: float) -> Messa
 
 
 def recorded(sample: Any) -> Recorded:
+    if isinstance(sample, JointBlock):
+        return Recorded("/cell/joint_states", sample)
     if isinstance(sample, JointSample):
         return Recorded("/cell/joint_states", joint_message(sample))
     frame_id = f"{sample.frame}/{sample.target}"
@@ -128,14 +131,15 @@ def live(session: ThermalSession, visits: Sequence[Sequence[Any]]) -> list[Recor
     return found
 
 
-def test_a_recording_gives_the_live_results_bit_for_bit(nominal, visits, tmp_path):
+@pytest.mark.parametrize("sizes", [[1], [10_000], [3, 50, 8]])
+def test_a_recording_gives_the_live_results_bit_for_bit(nominal, visits, tmp_path, sizes):
     node = session_in(tmp_path / "live", nominal)
     log = live(node, visits)
     names = [r.message.command for r in log]
     assert names == [CONFIGURE, "capture_reference", "identify", "accept", "identify", "accept"]
     configured, commands = read_events(log)
     again = session_in(tmp_path / "again", nominal, config_of(configured.arguments))
-    samples = [recorded(s) for part in visits for s in part]
+    samples = [recorded(s) for s in in_blocks([s for part in visits for s in part], sizes)]
     report = replay(again, samples, commands, None, take_message)
     assert report.differs == []
     assert [digest(o.document) for o in report.outcomes] == [
@@ -198,8 +202,8 @@ def test_a_recording_that_began_later_starts_from_what_was_then_in_force(nominal
     assert len(commands) == 5
 
 
-@pytest.mark.parametrize("jumped_before", [0, 3])
-def test_a_clock_that_jumped_back_in_the_recording(nominal, visits, tmp_path, jumped_before):
+@pytest.mark.parametrize(("jumped_before", "sizes"), [(0, [1]), (3, [1]), (0, [10_000])])
+def test_a_clock_that_jumped_back_in_the_recording(nominal, visits, tmp_path, jumped_before, sizes):
     """A simulation that began again: a command belongs to its own run of the clock."""
     parts = [visits[1], visits[0], visits[1], visits[3]]
     node = session_in(tmp_path / "live", nominal)
@@ -222,7 +226,7 @@ def test_a_clock_that_jumped_back_in_the_recording(nominal, visits, tmp_path, ju
     assert node.desk.jumps == jumped_before + 1
     assert [r.message.command for r in log[1:]] == ["reject", "capture_reference", "identify"]
     _, commands = read_events(log)
-    samples = [recorded(s) for part in parts for s in part]
+    samples = [recorded(s) for s in in_blocks([s for part in parts for s in part], sizes)]
     report = replay(session_in(tmp_path / "again", nominal), samples, commands, None, take_message)
     assert report.differs == []
     assert [o.samples for o in report.outcomes] == [0, POSES, POSES]
