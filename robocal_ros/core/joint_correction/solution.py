@@ -48,7 +48,7 @@ class Room(NamedTuple):
     here : (4, 4) pose of the tool at the joints tried last.
     turns, frames : scratch of `walk`.
     J, L : (n, 6) Jacobian, and the factor for its steps.
-    e, spare : (6,) residual to ``aim``, and scratch.
+    e, spare, spare_twist : (6,) residual to ``aim``, and scratch.
     x, step : (n,) shift of the joints, and its last step.
     """
 
@@ -69,17 +69,18 @@ class Room(NamedTuple):
     L: Array
     e: Array
     spare: Array
+    spare_twist: Array
     x: Array
     step: Array
 
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    return 18 * (n + 2) + 7 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 12 + 2 * n
+    return 18 * (n + 2) + 7 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 18 + 2 * n
 
 
 @lean
-def _room(work: Array, n: int, free: bool) -> Room:
+def room_in(work: Array, n: int, free: bool) -> Room:
     """Divide ``work``."""
     m = 9 * (n + 2)
     taught, actual, at = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9), 2 * m
@@ -89,16 +90,16 @@ def _room(work: Array, n: int, free: bool) -> Room:
     J, at = work[at : at + 6 * n].reshape(n, 6), at + 6 * n
     size = equations.unknowns(n, free)
     L, at = work[at : at + size * size].reshape(size, size), at + size * size
-    twists, at = work[at : at + 12].reshape(2, 6), at + 12
+    twists, at = work[at : at + 18].reshape(3, 6), at + 18
     return Room(
         taught, actual, taught[:n], actual[:n], poses[0], poses[1], poses[2], poses[3], poses[4],
-        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1],
+        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1], twists[2],
         work[at : at + n], work[at + n : at + 2 * n],
     )  # fmt: skip
 
 
 @lean
-def _settle(models: Array, s: float, room: Room) -> None:
+def settle(models: Array, s: float, room: Room) -> None:
     """Models at blend s, and their ends."""
     n = room.links.shape[0]
     k.blend(models[0], models[1], s, room.taught)
@@ -244,6 +245,16 @@ def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> No
 
 
 @lean
+def correct_point(
+    q: Array, models: Array, s: float, largest: Array, free: bool, work: Array, out: Array
+) -> None:
+    """`correct_batch` for one point (n,)."""
+    room = room_in(work, q.shape[0], free)
+    settle(models, s, room)
+    _correct(q, largest, free, room, out)
+
+
+@lean
 def correct_batch(
     q: Array, models: Array, s: Array, largest: Array, free: bool, work: Array, out: Array
 ) -> None:
@@ -253,8 +264,8 @@ def correct_batch(
     tool's z is free. ``out`` (m, n + 7): joints, then the report. See
     `joint_correction.JointCorrection`.
     """
-    room = _room(work, q.shape[1], free)
+    room = room_in(work, q.shape[1], free)
     for i in range(q.shape[0]):
         if i == 0 or s[i] != s[i - 1]:
-            _settle(models, s[i], room)
+            settle(models, s[i], room)
         _correct(q[i], largest, free, room, out[i])

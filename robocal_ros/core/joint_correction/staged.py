@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.joint_correction import rates
+from robocal_ros.core.joint_correction import rates, solution
 from robocal_ros.core.joint_correction.correction import (
     CorrectionResult,
     JointCorrection,
@@ -78,6 +78,7 @@ class StagedCorrection:
         self._models = np.stack([reference, reference, start, end])
         # six joints and six equations: rates by the chain rule
         self._analytic = self.n == 6 and not free_axis
+        self._work = np.empty(solution.work_size(self.n))
         self._tool: JointCorrection | None = None
         if not (np.array_equal(start[-1], taught) and np.array_equal(end[-1], taught)):
             self._tool = JointCorrection(np.stack([*bare, start, end]), tool_largest, free_axis)
@@ -137,7 +138,9 @@ class StagedCorrection:
         rough = np.ones(len(q), dtype=np.bool_)
         if self._analytic:
             blends = plain(s)
-            rates.rates_batch(points, qd, qdd, plain(result.q), self._models, blends, out_v, out_a)
+            rates.rates_batch(
+                points, qd, qdd, plain(result.q), self._models, blends, self._work, out_v, out_a
+            )
             rough = ~(result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1))
         if np.any(rough):
 
@@ -158,7 +161,7 @@ class StagedCorrection:
         models, ones = self._models[[2, 3, 0, 1]], np.ones(len(q))
         if not self._analytic:
             return path_rates(lambda p, _: self.uncorrect(p, ones), corrected, velocity, zero)[0]
-        rates.rates_batch(corrected, velocity, zero, q, models, ones, out, unused)
+        rates.rates_batch(corrected, velocity, zero, q, models, ones, self._work, out, unused)
         exact = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
         return np.where(exact[:, None], out, velocity)
 

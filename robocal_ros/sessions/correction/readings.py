@@ -29,7 +29,7 @@ class Readings:
         index, place = self._joints.read(state, now_s, age_s)
         self._guard.accept_order(READING, state.stamp_ns, now_s)
         taught, position, velocity = self._un_corrected(state, index, place, now_s)
-        self._joints.taught = taught
+        self._joints.taught[:] = taught
         return replace(state, position=position, velocity=velocity, mark=TAUGHT)
 
     def taught(

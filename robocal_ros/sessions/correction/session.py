@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.memory import blank
 from robocal_ros.core.joint_correction.refusals import RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.commands import Commands
@@ -56,13 +57,16 @@ class CorrectionSession:
         config = config or CorrectionConfig()
         self._reference = reference
         self._gate = CorrectionGate(nominal, reference, serial, config)
-        self._guard = CorrectionGuard()
+        self._block, memory = blank(reference.n)
+        self._guard = CorrectionGuard(memory)
         self._config = config
-        self._joints = JointBook(reference, config.joint_state_age_s)
-        self._corrector = Corrector(reference, config)
+        self._joints = JointBook(reference, config.joint_state_age_s, memory)
+        self._corrector = Corrector(reference, config, memory)
         self._enabled = False
-        self._starts = Starts(reference, config, self._corrector)
-        self._commands = Commands(config, self._joints, self._guard, self._corrector, self._starts)
+        self._starts = Starts(reference, config, self._corrector, memory)
+        self._commands = Commands(
+            config, self._joints, self._guard, self._corrector, self._starts, memory
+        )
         self._readings = Readings(self._joints, self._guard, self._corrector, config.shadow)
 
     # ---- what the operator and the estimators decide --------------------------------------------
@@ -122,6 +126,7 @@ class CorrectionSession:
         return np.asarray(places[np.isfinite(places).all(axis=1)])
 
     def _want(self) -> None:
+        self._commands.settled = None
         self._corrector.want(self._gate.actual, self._enabled)
 
     # ---- commands -------------------------------------------------------------------------------
@@ -197,7 +202,7 @@ class CorrectionSession:
         tool = self._gate.tools.in_use if self._enabled else None
         return Offset(
             names=self._reference.joint_names,
-            offset=self._commands.offset if streams else self._readings.offset(now_s),
+            offset=self._commands.offset.copy() if streams else self._readings.offset(now_s),
             revision=self._gate.revision if self._enabled and not self._gate.stale else None,
             tool_revision=None if tool is None else tool.revision,
             s=self._corrector.progress(now_s),
@@ -222,9 +227,9 @@ class CorrectionSession:
             tool_revision=None if tools.in_use is None else tools.in_use.revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
             stale=self._gate.stale,
-            tcp_shift_m=corrector.figures[0],
-            largest_shift=corrector.figures[1],
-            remaining_m=corrector.figures[2],
+            tcp_shift_m=float(corrector.figures[0]),
+            largest_shift=float(corrector.figures[1]),
+            remaining_m=float(corrector.figures[2]),
             held=corrector.held,
             waits=corrector.waits,
             mismatch=self._starts.mismatch,
