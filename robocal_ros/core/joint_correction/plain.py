@@ -209,8 +209,8 @@ def plain_target(
 @lean
 def plain_reading(
     came: Array, form: Array, layout: Index, place: Index, goes: Array, now_s: float, now_ns: int,
-    block: Array, limits: Array, bounds: Array, models: Array, largest: Array, free_axis: bool,
-    clamped: bool, work: Array,
+    clamped: bool, block: Array, limits: Array, bounds: Array, models: Array, largest: Array,
+    free_axis: bool, work: Array,
 ) -> bool:  # fmt: skip
     """Un-correct readings of all joints; False, and nothing done, where that is not plain.
 

@@ -38,7 +38,7 @@ class Commands:
     ----------
     goal : (n,) taught joints that were commanded last, NaN before the first.
     offset : (n,) what was added to the target corrected last; in shadow mode what would have been.
-    settled : names of a stream of targets whose correction stays the same; None while it may not.
+    settled : the last target taken here, when the next ones of its stream are corrected alike.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Commands:
         self._stream = StreamPeriod(memory, config.stream_gap_s)
         self._out, self._times = memory.out, memory.times  # of the last target
         self.goal, self.offset = memory.goal, memory.offset
-        self.settled: tuple[str, ...] | None = None
+        self.settled: JointCommand | None = None
 
     def streams(self, now_s: float) -> bool:
         """Whether a stream of targets is under way."""
@@ -94,7 +94,7 @@ class Commands:
         self._out[:] = np.nan
         self._out[index], self._times[of.OUT] = out, now_s
         self._starts.note_target(index)
-        self.settled = command.names if self._is_settled(index) else None
+        self.settled = command if self._is_settled(index) else None
         return corrected
 
     def _is_settled(self, index: Index) -> bool:

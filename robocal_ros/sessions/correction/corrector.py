@@ -110,7 +110,14 @@ class Corrector:
 
     def commanded(self, now_s: float) -> StagedCorrection | None:
         """The correction in the commands at an instant, at blend 1; None when there is none."""
-        model = self._commanded.at(now_s)
+        return self.stage(self._commanded.at(now_s))
+
+    def settled_on(self, now_s: float) -> Array | None:
+        """The packed model in the commands from an instant on; None while it is to change."""
+        return self._commanded.settled(now_s)
+
+    def stage(self, model: Array) -> StagedCorrection | None:
+        """The correction with a packed model; None for no correction."""
         return None if model is self.reference else self._proposer.stage(model, model)
 
     # ---- corrected joints -----------------------------------------------------------------------

@@ -26,9 +26,11 @@ from robocal_ros.sessions.correction.inputs import (
     TrajectoryCommand,
 )
 from robocal_ros.sessions.correction.offers import CorrectionGate
+from robocal_ros.sessions.correction.plain import Limits, PlainReadings, PlainTargets
 from robocal_ros.sessions.correction.readings import Readings
 from robocal_ros.sessions.correction.starts import Starts
 from robocal_ros.sessions.correction.status import CorrectionStatus, Offset
+from robocal_ros.sessions.correction.wire import JointWire
 
 Array = NDArray[np.float64]
 Answer = TypeVar("Answer")
@@ -68,6 +70,7 @@ class CorrectionSession:
             config, self._joints, self._guard, self._corrector, self._starts, memory
         )
         self._readings = Readings(self._joints, self._guard, self._corrector, config.shadow)
+        self._limits = Limits(reference, config, self._joints.doubtful)
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
@@ -137,6 +140,18 @@ class CorrectionSession:
         The blend advances with ``now_s``, at most by the configured longest step.
         """
         return self._guard.counted(lambda: self._commands.target(command, now_s))
+
+    def plain_targets(self, wire: JointWire) -> PlainTargets:
+        """A shorter way for the settled messages of a topic; each is to be offered there first."""
+        return PlainTargets(
+            self._commands, self._limits, self._block, self._corrector, wire
+        )
+
+    def plain_readings(self, wire: JointWire) -> PlainReadings:
+        """As `plain_targets`, for readings."""
+        return PlainReadings(
+            self._readings, self._limits, self._block, self._corrector, wire
+        )
 
     def trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float = 0.0
