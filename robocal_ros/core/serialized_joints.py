@@ -40,7 +40,7 @@ def is_laid_out_as(came: Array, known: Array, mask: Array) -> bool:
 def stamp_of(came: Array) -> int:
     """Stamp of the header, ns."""
     sec, nanosec = came.view(np.int32)[2 * _STAMP], came.view(np.uint32)[2 * _STAMP + 1]
-    return np.int64(sec) * _NS + np.int64(nanosec)
+    return int(np.int64(sec) * _NS + np.int64(nanosec))
 
 
 @lean

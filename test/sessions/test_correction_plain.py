@@ -127,8 +127,8 @@ class Both:
         one, other = a.offset(self.now), b.offset(self.now)
         assert one.offset.tobytes() == other.offset.tobytes()
         assert (one.revision, one.s) == (other.revision, other.s)
-        assert a._block.tobytes() == b._block.tobytes()  # noqa: SLF001
-        assert a._starts.under_way(self.now) == b._starts.under_way(self.now)  # noqa: SLF001
+        assert a._block.tobytes() == b._block.tobytes()
+        assert a._starts.under_way(self.now) == b._starts.under_way(self.now)
 
     def target(self, data: bytes) -> bytes | str:
         answer = self.do(lambda desk: desk.target(data, self.now))

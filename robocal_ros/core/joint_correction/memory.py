@@ -17,8 +17,8 @@ Counts = NDArray[np.int64]
 # of ``times``: the clock of what was acted on last; when a target went out last; of a stream of
 # targets, its last message and its period
 CLOCK, OUT, LAST, PERIOD = range(4)
-# of ``counts``: source stamps (0: none) in ns; how many came or were kept so far; the oldest place
-READING, TARGET, ARRIVED, BETWEEN, ECHOED, OLDEST, PLACES = range(7)
+# of ``counts``: how many came or were kept so far; the oldest place
+ARRIVED, BETWEEN, ECHOED, OLDEST, PLACES = range(5)
 
 INTERVALS = 9
 ARRIVALS = 128  # more than the messages that a stall holds up, which then come in a burst
@@ -75,14 +75,14 @@ class Memory(NamedTuple):
 
 def memory_size(n: int) -> int:
     """How many numbers are remembered for n joints."""
-    return 4 + 7 + INTERVALS + ARRIVALS + 3 + 6 * n + ECHOES * (n + 1) + TRACK * (n + 1)
+    return 4 + 5 + INTERVALS + ARRIVALS + 3 + 6 * n + ECHOES * (n + 1) + TRACK * (n + 1)
 
 
 @lean
 def divide(block: Array, n: int) -> Memory:
     """Divide an array of `memory_size` numbers."""
-    counts = block[4:11].view(np.int64)
-    intervals, at = block[11 : 11 + INTERVALS], 11 + INTERVALS
+    counts = block[4:9].view(np.int64)
+    intervals, at = block[9 : 9 + INTERVALS], 9 + INTERVALS
     arrivals, at = block[at : at + ARRIVALS], at + ARRIVALS
     figures, at = block[at : at + 3], at + 3
     joints, at = block[at : at + 6 * n].reshape(6, n), at + 6 * n
@@ -188,9 +188,7 @@ def is_echo(echoes: Array, within: Array, position: Array) -> bool:
 
 
 @kernel
-def remember_echo(
-    echoes: Array, within: Array, kept: int, taught: Array, corrected: Array
-) -> None:
+def remember_echo(echoes: Array, within: Array, kept: int, taught: Array, corrected: Array) -> None:
     """Keep ``corrected`` (k,), after ``kept`` others; one that equals ``taught`` is no echo."""
     i, shift = kept % within.shape[0], 0.0
     for j in range(corrected.shape[0]):
@@ -203,9 +201,7 @@ def remember_echo(
 
 
 @lean
-def note_place(
-    counts: Counts, track_s: Array, track: Array, measured: Array, now_s: float
-) -> None:
+def note_place(counts: Counts, track_s: Array, track: Array, measured: Array, now_s: float) -> None:
     """Keep where the robot is, now and then."""
     newest = (counts[OLDEST] + counts[PLACES] - 1) % TRACK
     if counts[PLACES] and now_s - track_s[newest] < TRACK_S:

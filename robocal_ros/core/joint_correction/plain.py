@@ -10,6 +10,7 @@ Their arguments, for a correction with k stages (0: messages pass as they came):
 ``form`` (2, lanes) : what a message of this layout has, and a mask of the bits that count.
 ``layout`` : of both.
 ``place`` (n,) : of targets, each column's joint; of readings, each joint's column.
+``last`` (1,) : stamp of the message before of these joints, ns; 0: none.
 ``block`` : of the session's `Memory`.
 ``limits`` (6, n), ``bounds`` (4,) : see below.
 ``models`` (2 k + 1, 4, n + 2, 9) : packed models of the arm's correction and of the tool's, of
@@ -59,21 +60,21 @@ def _divide(work: Array, n: int, k: int) -> tuple[Array, Array]:
 
 @lean
 def _is_next(
-    came: Array, form: Array, layout: Index, memory: Memory, kind: int, now_s: float
+    came: Array, form: Array, layout: Index, last: Index, memory: Memory, now_s: float
 ) -> bool:
     """Whether a message is laid out as those before it, and follows them in time."""
     if not (wire.is_laid_out_as(came, form[0], form[1]) and wire.are_finite(came, layout)):
         return False
     stamp = wire.stamp_of(came)
-    return (stamp == 0 or stamp >= memory.counts[kind]) and now_s >= memory.times[of.CLOCK]
+    return bool((stamp == 0 or stamp >= last[0]) and now_s >= memory.times[of.CLOCK])
 
 
 @lean
-def _note_order(came: Array, memory: Memory, kind: int, now_s: float) -> None:
+def _note_order(came: Array, last: Index, memory: Memory, now_s: float) -> None:
     memory.times[of.CLOCK] = now_s
     stamp = wire.stamp_of(came)
     if stamp != 0:
-        memory.counts[kind] = stamp
+        last[0] = stamp
 
 
 @lean
@@ -122,7 +123,9 @@ def _has_rates(
 
 
 @lean
-def _keeps_limits(q: Array, speed: Array, memory: Memory, now_s: float, limits: Array, bounds: Array) -> bool:
+def _keeps_limits(
+    q: Array, speed: Array, memory: Memory, now_s: float, limits: Array, bounds: Array
+) -> bool:
     """Whether joints q and their speed keep the limits on the way from what was put out last."""
     period = of.mean_period(memory.counts, memory.arrivals)
     if not period > 0.0:
@@ -136,9 +139,7 @@ def _keeps_limits(q: Array, speed: Array, memory: Memory, now_s: float, limits: 
 
 
 @lean
-def _note_target(
-    q: Array, corrected: Array, found: Array, memory: Memory, now_s: float
-) -> None:
+def _note_target(q: Array, corrected: Array, found: Array, memory: Memory, now_s: float) -> None:
     n, k = q.shape[0], found.shape[0]
     of.note_arrival(memory.times, memory.counts, memory.intervals, memory.arrivals, now_s)
     shift = 0.0
@@ -156,7 +157,7 @@ def _note_target(
 
 @lean
 def plain_target(
-    came: Array, form: Array, layout: Index, place: Index, goes: Array, now_s: float,
+    came: Array, form: Array, layout: Index, place: Index, goes: Array, last: Index, now_s: float,
     block: Array, limits: Array, bounds: Array, models: Array, largest: Array, free_axis: bool,
     work: Array,
 ) -> bool:  # fmt: skip
@@ -164,7 +165,7 @@ def plain_target(
     n, k = place.shape[0], largest.shape[0] // 2
     memory = of.divide(block, n)
     rows, found = _divide(work, n, k)
-    if not _is_next(came, form, layout, memory, of.TARGET, now_s):
+    if not _is_next(came, form, layout, last, memory, now_s):
         return False
     if not of.goes_on(memory.times, bounds[LEAST_GAP_S], now_s):
         return False
@@ -193,7 +194,7 @@ def plain_target(
             speed = rows[1]
     if not _keeps_limits(corrected, speed, memory, now_s, limits, bounds):
         return False
-    _note_order(came, memory, of.TARGET, now_s)
+    _note_order(came, last, memory, now_s)
     _note_target(q, corrected, found[:k], memory, now_s)
     wire.pass_through(came, layout, goes)
     out = goes[layout[wire.GOES] : layout[wire.GOES] + n]
@@ -208,9 +209,9 @@ def plain_target(
 
 @lean
 def plain_reading(
-    came: Array, form: Array, layout: Index, place: Index, goes: Array, now_s: float, now_ns: int,
-    clamped: bool, block: Array, limits: Array, bounds: Array, models: Array, largest: Array,
-    free_axis: bool, work: Array,
+    came: Array, form: Array, layout: Index, place: Index, goes: Array, last: Index,
+    now_s: float, now_ns: int, clamped: bool, block: Array, limits: Array, bounds: Array,
+    models: Array, largest: Array, free_axis: bool, work: Array,
 ) -> bool:  # fmt: skip
     """Un-correct readings of all joints; False, and nothing done, where that is not plain.
 
@@ -219,7 +220,7 @@ def plain_reading(
     n, k = place.shape[0], largest.shape[0] // 2
     memory = of.divide(block, n)
     rows, found = _divide(work, n, k)
-    if not _is_next(came, form, layout, memory, of.READING, now_s):
+    if not _is_next(came, form, layout, last, memory, now_s):
         return False
     measured, moves = rows[3], layout[wire.COUNT + wire.VELOCITY] > 0
     for i in range(n):
@@ -249,7 +250,7 @@ def plain_reading(
             return False
         if moves:
             speed = rows[1]
-    _note_order(came, memory, of.READING, now_s)
+    _note_order(came, last, memory, now_s)
     stamp = wire.stamp_of(came)
     age = (now_ns - stamp) * 1e-9 if stamp != 0 else 0.0
     wire.pass_through(came, layout, goes)

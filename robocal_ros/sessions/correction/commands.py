@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Command = TypeVar("Command", JointCommand, TrajectoryCommand)
 
+
 class Commands:
     """From taught joints to corrected ones.
 
@@ -72,7 +73,7 @@ class Commands:
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream; the blend advances with ``now_s``."""
         self.settled = None
-        self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s)
+        self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s, command.names)
         self._guard.require_not_own(TARGET, command.names, command.position)
         q, index = self._joints.complete(command.names, command.position[None], now_s)
         speeds = None if command.velocity is None else command.velocity[None]
@@ -88,7 +89,7 @@ class Commands:
         )
         self._stream.note(now_s)
         self.goal[:] = q[0]
-        self._guard.accept_order(TARGET, command.stamp_ns, now_s)
+        self._guard.accept_order(TARGET, command.stamp_ns, now_s, command.names)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
         self._out[:] = np.nan

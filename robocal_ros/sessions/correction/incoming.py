@@ -27,7 +27,8 @@ TRAJECTORY = "trajectory"
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
-STAMPS = {READING: of.READING, TARGET: of.TARGET}  # a trajectory's says when it begins
+MOST_STAMPS = 64  # of so many drivers, or planners, the order in time is watched
+NEVER = 2**63 - 1  # a stamp that none follows
 
 
 class JointBook:
@@ -176,7 +177,8 @@ class CorrectionGuard:
     """
 
     def __init__(self, memory: Memory) -> None:
-        self._times, self._counts = memory.times, memory.counts
+        self._times = memory.times
+        self._stamps: dict[tuple[str, tuple[str, ...]], Index] = {}  # by kind and joints
         self._echoes = {TARGET: Echoes(memory), TRAJECTORY: Echoes()}
         self.refused: Counter[Reason] = Counter()
         self.last_refusal = ""
@@ -186,18 +188,28 @@ class CorrectionGuard:
         try:
             return act()
         except RefusedError as error:
-            self.refused[error.reason] += 1
-            self.last_refusal = str(error)
+            self.count(error)
             raise
 
-    def require_order(self, kind: str, stamp: int, mark: str, now_s: float) -> None:
-        """Refuse what carries a mark of a correction, or is older than the one before."""
+    def count(self, refusal: RefusedError) -> RefusedError:
+        """Count a refusal, and return it."""
+        self.refused[refusal.reason] += 1
+        self.last_refusal = str(refusal)
+        return refusal
+
+    def require_order(
+        self, kind: str, stamp: int, mark: str, now_s: float, names: tuple[str, ...] = ()
+    ) -> None:
+        """Refuse what carries a mark of a correction, or is older than the one before.
+
+        That is the one of the same joints: drivers of others have clocks of their own.
+        """
         if mark == CORRECTED or (mark == TAUGHT and kind == READING):
             raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
         clock_s = float(self._times[of.CLOCK])
         if not now_s >= clock_s:
             raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {clock_s}")
-        last = int(self._counts[STAMPS[kind]]) if kind in STAMPS else 0
+        last = int(self._stamps[kind, names][0]) if (kind, names) in self._stamps else 0
         reset = last - stamp > CLOCK_RESET_NS
         if stamp and stamp < last and not reset:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
@@ -208,15 +220,26 @@ class CorrectionGuard:
         clock_s = float(self._times[of.CLOCK])
         return now_s if now_s >= clock_s else clock_s
 
-    def accept_order(self, kind: str, stamp: int, now_s: float) -> None:
+    def accept_order(
+        self, kind: str, stamp: int, now_s: float, names: tuple[str, ...] = ()
+    ) -> None:
         """Remember the time of what was acted on."""
         self._times[of.CLOCK] = now_s
         if stamp:
-            self._counts[STAMPS[kind]] = stamp
+            last = self.last_stamp(kind, names)
+            last[0] = stamp
+            self._stamps[kind, names] = self._stamps.pop((kind, names))  # the oldest goes first
+            if len(self._stamps) > MOST_STAMPS:
+                self._stamps.pop(next(iter(self._stamps)))[0] = NEVER
+
+    def last_stamp(self, kind: str, names: tuple[str, ...]) -> Index:
+        """Stamp (1,) of the last message of these joints, to go on with; 0: none."""
+        return self._stamps.setdefault((kind, names), np.zeros(1, dtype=np.int64))
 
     def forget_stamps(self) -> None:
         """Start afresh with any source stamp."""
-        self._counts[list(STAMPS.values())] = 0
+        for last in self._stamps.values():
+            last[0] = 0
 
     def note_output(self, kind: str, names: tuple[str, ...], taught: Array, out: Array) -> None:
         """Remember what was put out for what came in."""

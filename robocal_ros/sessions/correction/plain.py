@@ -15,6 +15,7 @@ from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.core.serialized_joints import BEGIN, COUNT, VELOCITY
 from robocal_ros.sessions.correction.commands import Commands
 from robocal_ros.sessions.correction.corrector import Corrector
+from robocal_ros.sessions.correction.incoming import READING, TARGET, CorrectionGuard
 from robocal_ros.sessions.correction.inputs import JointCommand
 from robocal_ros.sessions.correction.readings import Readings
 from robocal_ros.sessions.correction.wire import JointWire, Lanes
@@ -48,10 +49,18 @@ class PlainStream:
     wire : reads the topic's messages for the session.
     """
 
-    mark = ""  # of what goes out
+    kind = mark = ""  # of what comes in; of what goes out
 
-    def __init__(self, limits: Limits, block: Array, corrector: Corrector, wire: JointWire) -> None:
-        self._limits, self._block, self._corrector, self._wire = limits, block, corrector, wire
+    def __init__(
+        self,
+        limits: Limits,
+        block: Array,
+        guard: CorrectionGuard,
+        corrector: Corrector,
+        wire: JointWire,
+    ) -> None:
+        self._limits, self._block, self._wire = limits, block, wire
+        self._guard, self._corrector = guard, corrector
         self._last: JointCommand | None = None
         self._lanes: Lanes | None = None
         self._model: Array | None = None
@@ -76,15 +85,15 @@ class PlainStream:
 
     def _lay_out(self, last: JointCommand, lanes: Lanes | None) -> None:
         """Take over the layout of the ``last`` message."""
-        if lanes is self._lanes:
-            return
-        fits = lanes is not None and lanes.names == last.names
-        if lanes is None or not fits or lanes.frame_id in (CORRECTED, TAUGHT):
+        if lanes is None or lanes.names != last.names or lanes.frame_id in (CORRECTED, TAUGHT):
             self._lanes = None
             return
+        self._stamp = self._guard.last_stamp(self.kind, last.names)
+        if lanes is self._lanes:
+            return
         came, goes = np.zeros_like(lanes.form[0]), lanes.goes.copy()
-        self._came = memoryview(came).cast("B")[BEGIN : BEGIN + lanes.sizes[0]]
-        self._goes = memoryview(goes).cast("B")[BEGIN : BEGIN + lanes.sizes[1]]
+        self._came = came.data.cast("B")[BEGIN : BEGIN + lanes.sizes[0]]
+        self._goes = goes.data.cast("B")[BEGIN : BEGIN + lanes.sizes[1]]
         self._message = came, lanes.form, lanes.layout, self._place(lanes.names), goes
         self._moves, self._lanes = bool(lanes.layout[COUNT + VELOCITY]), lanes
 
@@ -114,7 +123,7 @@ class PlainStream:
 class PlainTargets(PlainStream):
     """Targets of a settled stream."""
 
-    mark = CORRECTED
+    kind, mark = TARGET, CORRECTED
 
     def __init__(self, commands: Commands, *common: Any) -> None:
         super().__init__(*common)
@@ -124,9 +133,9 @@ class PlainTargets(PlainStream):
         """What to put out for a serialized target; None where the session must look at it."""
         if not self._is_ready(data, self._commands.settled, now_s):
             return None
-        if not plain.plain_target(*self._message, now_s, *self._correction):
-            return None
-        return data if self._passes else bytes(self._goes)
+        if plain.plain_target(*self._message, self._stamp, now_s, *self._correction):
+            return data if self._passes else bytes(self._goes)
+        return None
 
     def _place(self, names: tuple[str, ...]) -> Index:
         return np.array([self._limits.names.index(name) for name in names])
@@ -135,7 +144,7 @@ class PlainTargets(PlainStream):
 class PlainReadings(PlainStream):
     """Readings of all joints, while one model is commanded."""
 
-    mark = TAUGHT
+    kind, mark = READING, TAUGHT
 
     def __init__(self, readings: Readings, *common: Any) -> None:
         super().__init__(*common)
@@ -148,10 +157,9 @@ class PlainReadings(PlainStream):
         """
         if not self._is_ready(data, self._readings.whole, now_s):
             return None
-        clamped = self._limits.clamped
-        if not plain.plain_reading(*self._message, now_s, now_ns, clamped, *self._correction):
-            return None
-        return bytes(self._goes)
+        when = now_s, now_ns, self._limits.clamped
+        done = plain.plain_reading(*self._message, self._stamp, *when, *self._correction)
+        return bytes(self._goes) if done else None
 
     def _place(self, names: tuple[str, ...]) -> Index:
         return np.array([names.index(name) for name in self._limits.names])

@@ -31,9 +31,9 @@ class Readings:
 
     def take(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
         """Remember readings that are ``age_s`` old, and un-correct them."""
-        self._guard.require_order(READING, state.stamp_ns, state.mark, now_s)
+        self._guard.require_order(READING, state.stamp_ns, state.mark, now_s, state.names)
         index, place = self._joints.read(state, now_s, age_s)
-        self._guard.accept_order(READING, state.stamp_ns, now_s)
+        self._guard.accept_order(READING, state.stamp_ns, now_s, state.names)
         taught, position, velocity = self._un_corrected(state, index, place, now_s)
         self._joints.taught[:] = taught
         if len(index) == self._joints.count and not self._shadow:

@@ -7,14 +7,14 @@ correct is refused with a reason, counted, and nothing is put out for it: `Refus
 
 import contextlib
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.joint_correction.memory import blank
-from robocal_ros.core.joint_correction.refusals import RefusedError
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.commands import Commands
 from robocal_ros.sessions.correction.corrector import Corrector
@@ -70,7 +70,8 @@ class CorrectionSession:
             config, self._joints, self._guard, self._corrector, self._starts, memory
         )
         self._readings = Readings(self._joints, self._guard, self._corrector, config.shadow)
-        self._limits = Limits(reference, config, self._joints.doubtful)
+        limits = Limits(reference, config, self._joints.doubtful)
+        self._plain = limits, self._block, self._guard, self._corrector
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
@@ -143,15 +144,11 @@ class CorrectionSession:
 
     def plain_targets(self, wire: JointWire) -> PlainTargets:
         """A shorter way for the settled messages of a topic; each is to be offered there first."""
-        return PlainTargets(
-            self._commands, self._limits, self._block, self._corrector, wire
-        )
+        return PlainTargets(self._commands, *self._plain, wire)
 
     def plain_readings(self, wire: JointWire) -> PlainReadings:
         """As `plain_targets`, for readings."""
-        return PlainReadings(
-            self._readings, self._limits, self._block, self._corrector, wire
-        )
+        return PlainReadings(self._readings, *self._plain, wire)
 
     def trajectory(
         self, command: TrajectoryCommand, now_s: float, starts_in_s: float = 0.0
@@ -226,6 +223,10 @@ class CorrectionSession:
     def counted(self, act: Callable[[], Answer]) -> Answer:
         """Do something for this session; a refusal is counted with its own."""
         return self._guard.counted(act)
+
+    def refuse(self, reason: Reason, detail: str) -> NoReturn:
+        """Count a refusal with the session's own, and raise it."""
+        raise self._guard.count(RefusedError(reason, detail))
 
     def status(self) -> CorrectionStatus:
         """What the session does."""
