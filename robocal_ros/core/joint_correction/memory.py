@@ -51,8 +51,8 @@ class Memory(NamedTuple):
     offset : (n,) what was added to the target corrected last.
     measured, taught : (n,) last readings, and the same un-corrected.
     read_s : (n,) when these were taken.
-    echoes, within : (64 n,) rows of the last corrected positions of targets, and (64,) how near
-        they come back.
+    echoes, within : (64, n) ring of the last corrected positions of targets (with fewer joints
+        shorter rows in its place), and (64,) how near they come back.
     track_s, track : (32,) and (32, n) ring of where the robot was within the response time.
     """
 
@@ -86,7 +86,7 @@ def divide(block: Array, n: int) -> Memory:
     arrivals, at = block[at : at + ARRIVALS], at + ARRIVALS
     figures, at = block[at : at + 3], at + 3
     joints, at = block[at : at + 6 * n].reshape(6, n), at + 6 * n
-    echoes, at = block[at : at + ECHOES * n], at + ECHOES * n
+    echoes, at = block[at : at + ECHOES * n].reshape(ECHOES, n), at + ECHOES * n
     within, at = block[at : at + ECHOES], at + ECHOES
     track_s, at = block[at : at + TRACK], at + TRACK
     return Memory(

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 MOST_ITERATIONS = 10
 # How often a step is repeated with the same matrix, from the second one on.
 REPEATS = 3
+# A second step that is at most this share of the first: steps with the same matrix do as well as a
+# new one.
+CALM = 2e-3
 # A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
 SMALL_RESIDUAL = 1e-12
 # A step below which the next one is under the rounding floor (convergence is quadratic).
@@ -196,7 +199,7 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
     # The shortest of many solutions is sought once, in the second iteration: so what is found does
     # not hang on how many there are.
     least = 2 if equations.wide(n, free) else 1
-    share, iterations = 1.0, 0
+    share, iterations, calm = 1.0, 0, False
     converged = newton.largest_of(room.e) <= SMALL_RESIDUAL
     while not converged and iterations < MOST_ITERATIONS:
         newton.columns(room.links, room.frames, room.here, room.J)
@@ -206,22 +209,25 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
             break
         if iterations == 0:
             share = _first_steps(q, largest, free, room, out)
+            small = CALM * newton.largest_of(room.x)
+            calm = least == 1 and share == 1.0 and newton.largest_of(room.step) <= small
         else:
             size = _add_step(free, iterations == 1, room)
         iterations += 1
         converged = _moved(q, free, room, out) <= SMALL_RESIDUAL and iterations >= least
         repeats = 0
-        while iterations > 1 and repeats < REPEATS and not converged:
+        while (calm or iterations > 1) and repeats < REPEATS and not converged:
             # more steps with the same matrix: each raises the order, for little
             repeats += 1
             size = _add_step(free, False, room)
             converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
         if converged or (iterations > 1 and size <= SMALL_STEP):
             _add_step(free, False, room)
-            if repeats > 0:
+            if repeats > 0 and not calm:
                 _moved(q, free, room, out)
                 _add_step(free, False, room)
             converged = True
+        calm = False
     out[n + CONVERGED] = _take(q, room.x, largest, converged, out)
     out[n + ITERATIONS] = iterations
     out[n + SHARE] = share if out[n + CONVERGED] else 0.0

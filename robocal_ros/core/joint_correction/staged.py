@@ -19,12 +19,14 @@ from robocal_ros.core.joint_correction.correction import (
     path_rates,
     plain,
 )
+from robocal_ros.core.joint_correction.plain import load_kernels as load_plain_kernels
+from robocal_ros.core.joint_correction.plainness import EXACT
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 
-# The inverse near a singularity is refined until it is exact to this (rad, m), or so often.
-EXACT, ROUNDING = 1e-13, 1e-9
+# The inverse near a singularity is refined until it is exact, or gets no nearer, or so often.
+ROUNDING = 1e-9
 MOST_REFINEMENTS = 30
 
 
@@ -181,7 +183,8 @@ class StagedCorrection:
 
 
 def load_kernels(arm: SerialArm) -> None:
-    """Call the compiled code of a stage once, so that the first command need not wait for it."""
+    """Call the compiled code once, so that the first command need not wait for it."""
+    load_plain_kernels(arm.n)
     packed, largest = pack_model(arm), np.ones(arm.n)
     q, s = np.zeros((2, arm.n)), np.full(2, 0.5)
     stage = StagedCorrection(packed, packed, packed.copy(), largest, largest)

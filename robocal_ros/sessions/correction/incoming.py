@@ -270,7 +270,7 @@ class Echoes:
             self._names, self._shape = names, corrected.shape
             self._positions = np.zeros((1, corrected.size))
             if self._memory is not None:
-                room = self._memory.echoes[: of.ECHOES * corrected.size]
+                room = self._memory.echoes.reshape(-1)[: of.ECHOES * corrected.size]
                 self._positions = room.reshape(of.ECHOES, -1)
             self._within[:] = -1.0
         flat = plain(taught.reshape(-1)), plain(corrected.reshape(-1))

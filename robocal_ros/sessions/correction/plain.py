@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.joint_correction import plain
+from robocal_ros.core.joint_correction import plain, plainness
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
@@ -31,13 +31,20 @@ class Limits:
         self.names = arm.joint_names
         self.free_axis, self.clamped = config.free_axis, config.policy is not Policy.REFUSE
         fastest, thermal, rows = config.velocity_limits, config.thermal, np.empty((6, arm.n))
-        rows[plain.LOWER], rows[plain.UPPER], rows[plain.DOUBTFUL] = arm.lower, arm.upper, doubtful
-        rows[plain.FASTEST] = np.inf if fastest is None else fastest
-        rows[plain.ARM], rows[plain.TOOL] = thermal.of_joints(arm), config.tool.of_joints(arm)
+        rows[plainness.LOWER], rows[plainness.UPPER], rows[plainness.DOUBTFUL] = (
+            arm.lower,
+            arm.upper,
+            doubtful,
+        )
+        rows[plainness.FASTEST] = np.inf if fastest is None else fastest
+        rows[plainness.ARM], rows[plainness.TOOL] = (
+            thermal.of_joints(arm),
+            config.tool.of_joints(arm),
+        )
         self.rows, self.bounds = rows, np.empty(4)
-        self.bounds[[plain.TCP_M, plain.TCP_RAD]] = thermal.tcp_m, thermal.tcp_rad
-        self.bounds[plain.LONGEST_STEP_S] = config.longest_step_s
-        self.bounds[plain.LEAST_GAP_S] = config.stream_gap_s
+        self.bounds[[plainness.TCP_M, plainness.TCP_RAD]] = thermal.tcp_m, thermal.tcp_rad
+        self.bounds[plainness.LONGEST_STEP_S] = config.longest_step_s
+        self.bounds[plainness.LEAST_GAP_S] = config.stream_gap_s
 
 
 class PlainStream:
