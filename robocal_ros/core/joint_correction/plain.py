@@ -1,25 +1,25 @@
 """Messages of a settled stream, corrected in one call from bytes to bytes.
 
-Nothing is decided here. Each kernel either does to the message and to the session's `Memory` what
+Nothing is decided here. The kernel either does to the message and to the session's `Memory` what
 the session would have done, bit for bit, or leaves both alone and says so: wherever something is
 out of the ordinary, or merely near a bound, the session decides.
 
-Their arguments, for a correction with k stages (0: messages pass as they came):
+Its arguments, for a correction with k stages (0: messages pass as they came):
 
 ``came``, ``goes`` : lanes of the message and of what goes out (see `serialized_joints`).
 ``form`` (2, lanes) : what a message of this layout has, and a mask of the bits that count.
 ``layout`` : of both.
-``place`` (n,) : of targets, each column's joint; of readings, each joint's column.
+``place`` (n,) : each joint's column.
 ``last`` (1,) : stamp of the message before of these joints, ns; 0: none.
+``now_s``, ``now_ns`` : the session's clock, and the one that stamps the readings.
 ``block`` : of the session's `Memory`.
 ``limits`` (6, n), ``bounds`` (4,) : see `plainness`.
 ``models`` (2 k + 1, 4, n + 2, 9) : packed models of the arm's correction and of the tool's, of
 their inverses in reverse order, and of all together (for rates), at the end of the blend.
 ``largest`` (2 k, n) : largest joint shift of each stage.
+``clamped`` : whether it is a `clamping.ClampedCorrection`.
 ``work`` : scratch of `work_size` numbers.
 """
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,28 +73,72 @@ def _is_next(
 
 
 @lean
-def _note_order(came: Array, last: Index, memory: Memory, now_s: float) -> None:
+def _note_order(came: Array, last: Index, memory: Memory, now_s: float, now_ns: int) -> float:
+    """Remember when a message came; returns how old it is."""
     memory.times[of.CLOCK] = now_s
     stamp = wire.stamp_of(came)
-    if stamp != 0:
-        last[0] = stamp
+    if stamp == 0:
+        return 0.0
+    last[0] = stamp
+    return (now_ns - stamp) * 1e-9
+
+
+@lean
+def _take_joints(came: Array, layout: Index, place: Index, q: Array, speed: Array) -> None:
+    """Joints and their speed (zero where none came), in the arm's order."""
+    first, moves = layout[wire.CAME + wire.VELOCITY], layout[wire.COUNT + wire.VELOCITY] > 0
+    for i in range(place.shape[0]):
+        q[i] = came[layout[wire.CAME] + place[i]]
+        speed[i] = came[first + place[i]] if moves else 0.0
+
+
+@lean
+def _put_joints(
+    came: Array, layout: Index, place: Index, q: Array, speed: Array, goes: Array
+) -> None:
+    wire.pass_through(came, layout, goes)
+    first, moves = layout[wire.GOES + wire.VELOCITY], layout[wire.COUNT + wire.VELOCITY] > 0
+    for i in range(place.shape[0]):
+        goes[layout[wire.GOES] + place[i]] = q[i]
+        if moves:
+            goes[first + place[i]] = speed[i]
+
+
+@lean
+def _solve(
+    q: Array, is_reading: bool, limits: Array, bounds: Array, models: Array, largest: Array,
+    free_axis: bool, clamped: bool, work: Array, found: Array,
+) -> bool:  # fmt: skip
+    """Correct joints q; or un-correct them by the inverses, and correct that to see that it is one.
+
+    Of a clamped correction it must be known first that it is whole. False where it is not plain.
+    """
+    n, k = q.shape[0], largest.shape[0] // 2
+    begin, end = (0 if clamped else k, 3 * k) if is_reading else (0, k)
+    for step in range(begin, end):
+        stage = step % (2 * k)
+        start = q if step in (0, k) else found[(stage - 1) % (2 * k), :n]
+        solution.correct_point(
+            start, models[stage], SETTLED, largest[stage], free_axis, work, found[stage]
+        )
+        if stage == k - 1:
+            taught = q if step < k else found[2 * k - 1, :n]
+            if not is_whole(taught, found[:k], limits, bounds):
+                return False
+    return not is_reading or k == 0 or ends_at(q, found[k - 1])
 
 
 @lean
 def _has_rates(
-    q: Array, corrected: Array, models: Array, free_axis: bool, work: Array, rows: Array
+    q: Array, answer: Array, models: Array, free_axis: bool, work: Array, rows: Array
 ) -> bool:
-    """Speed ``rows[0]`` at q becomes that of the corrected joints; False where singular."""
-    room, speed, zero, out = (
-        solution.room_in(work, q.shape[0], free_axis),
-        rows[0],
-        rows[1],
-        rows[2],
-    )
+    """Speed ``rows[1]`` at q becomes that of the answer; False where singular."""
+    speed, zero, out = rows[1], rows[2], rows[3]
+    room = solution.room_in(work, q.shape[0], free_axis)
     solution.settle(models, SETTLED, room)
     for i in range(q.shape[0]):
         zero[i] = 0.0
-    rates_at(q, speed, zero, corrected, room, out, zero)
+    rates_at(q, speed, zero, answer, room, out, zero)
     finite = True
     for i in range(q.shape[0]):
         speed[i] = out[i]
@@ -104,7 +148,7 @@ def _has_rates(
 
 @lean
 def _note_target(q: Array, corrected: Array, found: Array, memory: Memory, now_s: float) -> None:
-    n, k = q.shape[0], found.shape[0]
+    n, k = q.shape[0], found.shape[0] // 2
     of.note_arrival(memory.times, memory.counts, memory.intervals, memory.arrivals, now_s)
     shift = 0.0
     for i in range(n):
@@ -120,121 +164,12 @@ def _note_target(q: Array, corrected: Array, found: Array, memory: Memory, now_s
 
 
 @lean
-def _is_own(came: Array, layout: Index, memory: Memory, n: int) -> bool:
-    """Whether positions came back that were put out."""
-    position = came[layout[wire.CAME] : layout[wire.CAME] + n]
-    return of.is_echo(memory.echoes, memory.within, position)
-
-
-@lean
-def plain_target(
-    came: Array, form: Array, layout: Index, place: Index, goes: Array, last: Index, now_s: float,
-    block: Array, limits: Array, bounds: Array, models: Array, largest: Array, free_axis: bool,
-    work: Array,
-) -> bool:  # fmt: skip
-    """Correct a target of a settled stream; False, and nothing done, where that is not plain."""
-    n, k = place.shape[0], largest.shape[0] // 2
-    memory, (rows, found) = of.divide(block, n), _divide(work, n, k)
-    follows = _is_next(came, form, layout, last, memory, now_s)
-    if not (follows and of.goes_on(memory.times, bounds[LEAST_GAP_S], now_s)):
-        return False
-    q, speed, first = rows[3], rows[0], layout[wire.CAME + wire.VELOCITY]
-    moves = layout[wire.COUNT + wire.VELOCITY] > 0
-    for j in range(n):
-        q[place[j]] = came[layout[wire.CAME] + j]
-        speed[place[j]] = came[first + j] if moves else 0.0
-    if _is_own(came, layout, memory, n) or not within(q, limits[DOUBTFUL]):
-        return False
-    corrected = q
-    for stage in range(k):
-        solution.correct_point(
-            corrected, models[stage], SETTLED, largest[stage], free_axis, work, found[stage]
-        )
-        corrected = found[stage, :n]
-    if k > 0 and not is_whole(q, found[:k], limits, bounds):
-        return False
-    if k > 0 and moves and not _has_rates(q, corrected, models[2 * k], free_axis, work, rows):
-        return False
-    if not keeps_limits(corrected, speed, memory, now_s, limits, bounds):
-        return False
-    _note_order(came, last, memory, now_s)
-    _note_target(q, corrected, found[:k], memory, now_s)
-    _put_target(came, layout, place, corrected, speed, memory, goes)
-    return True
-
-
-@lean
-def _put_target(
-    came: Array, layout: Index, place: Index, corrected: Array, speed: Array, memory: Memory,
-    goes: Array,
-) -> None:  # fmt: skip
-    """Write what goes out, and remember it in case it comes back."""
-    n, first = place.shape[0], layout[wire.GOES + wire.VELOCITY]
-    wire.pass_through(came, layout, goes)
+def _note_echo(came: Array, layout: Index, goes: Array, memory: Memory) -> None:
+    n = memory.goal.shape[0]
+    taught = came[layout[wire.CAME] : layout[wire.CAME] + n]
     out = goes[layout[wire.GOES] : layout[wire.GOES] + n]
-    for j in range(n):
-        out[j] = corrected[place[j]]
-        if layout[wire.COUNT + wire.VELOCITY] > 0:
-            goes[first + j] = speed[place[j]]
-    position = came[layout[wire.CAME] : layout[wire.CAME] + n]
-    of.remember_echo(memory.echoes, memory.within, memory.counts[of.ECHOED], position, out)
+    of.remember_echo(memory.echoes, memory.within, memory.counts[of.ECHOED], taught, out)
     memory.counts[of.ECHOED] += 1
-
-
-@lean
-def plain_reading(
-    came: Array, form: Array, layout: Index, place: Index, goes: Array, last: Index,
-    now_s: float, now_ns: int, clamped: bool, block: Array, limits: Array, bounds: Array,
-    models: Array, largest: Array, free_axis: bool, work: Array,
-) -> bool:  # fmt: skip
-    """Un-correct readings of all joints; False, and nothing done, where that is not plain.
-
-    ``clamped``: the correction is a `clamping.ClampedCorrection`. ``now_ns``: clock of the stamps.
-    """
-    n, k = place.shape[0], largest.shape[0] // 2
-    memory, (rows, found) = of.divide(block, n), _divide(work, n, k)
-    if not _is_next(came, form, layout, last, memory, now_s):
-        return False
-    measured, speed, first = rows[3], rows[0], layout[wire.CAME + wire.VELOCITY]
-    moves = layout[wire.COUNT + wire.VELOCITY] > 0
-    for i in range(n):
-        measured[i] = came[layout[wire.CAME] + place[i]]
-        speed[i] = came[first + place[i]] if moves else 0.0
-    if not within(measured, limits[DOUBTFUL]):
-        return False
-    taught = measured
-    # the inverse of each stage, then the stages, to see that it is one
-    for step in range(0 if clamped else k, 3 * k):
-        stage = step % (2 * k)
-        start = measured if step in (0, k) else found[(stage - 1) % (2 * k), :n]
-        solution.correct_point(
-            start, models[stage], SETTLED, largest[stage], free_axis, work, found[stage]
-        )
-        if step == k - 1 and not is_whole(measured, found[:k], limits, bounds):
-            return False
-    if k > 0:
-        taught = found[2 * k - 1, :n]
-        if not (is_whole(taught, found[:k], limits, bounds) and ends_at(measured, found[k - 1])):
-            return False
-        if moves and not _has_rates(measured, taught, models[2 * k], free_axis, work, rows):
-            return False
-    _note_order(came, last, memory, now_s)
-    stamp = wire.stamp_of(came)
-    age = (now_ns - stamp) * 1e-9 if stamp != 0 else 0.0
-    _put_reading(came, layout, place, taught, speed, goes)
-    _note_reading(measured, taught, memory, now_s, age)
-    return True
-
-
-@lean
-def _put_reading(
-    came: Array, layout: Index, place: Index, taught: Array, speed: Array, goes: Array
-) -> None:
-    wire.pass_through(came, layout, goes)
-    for i in range(place.shape[0]):
-        goes[layout[wire.GOES] + place[i]] = taught[i]
-        if layout[wire.COUNT + wire.VELOCITY] > 0:
-            goes[layout[wire.GOES + wire.VELOCITY] + place[i]] = speed[i]
 
 
 @lean
@@ -247,23 +182,60 @@ def _note_reading(
     of.note_place(memory.counts, memory.track_s, memory.track, memory.measured, now_s)
 
 
+@lean
+def _goes_on(came: Array, layout: Index, memory: Memory, now_s: float, least_gap_s: float) -> bool:
+    """Whether a target belongs to the stream, and was not put out before."""
+    if not of.goes_on(memory.times, least_gap_s, now_s):
+        return False
+    position = came[layout[wire.CAME] : layout[wire.CAME] + memory.goal.shape[0]]
+    return not of.is_echo(memory.echoes, memory.within, position)
+
+
+@lean
+def pass_plainly(
+    is_reading: bool, came: Array, form: Array, layout: Index, place: Index, goes: Array,
+    last: Index, now_s: float, now_ns: int, block: Array, limits: Array, bounds: Array,
+    models: Array, largest: Array, free_axis: bool, clamped: bool, work: Array,
+) -> bool:  # fmt: skip
+    """Correct a target, or un-correct a reading; False, and nothing done, where it is not plain."""
+    n, k = place.shape[0], largest.shape[0] // 2
+    memory, (rows, found) = of.divide(block, n), _divide(work, n, k)
+    q, speed, moves = rows[0], rows[1], layout[wire.COUNT + wire.VELOCITY] > 0
+    if not _is_next(came, form, layout, last, memory, now_s):
+        return False
+    if not (is_reading or _goes_on(came, layout, memory, now_s, bounds[LEAST_GAP_S])):
+        return False
+    _take_joints(came, layout, place, q, speed)
+    if not within(q, limits[DOUBTFUL]):
+        return False
+    if not _solve(q, is_reading, limits, bounds, models, largest, free_axis, clamped, work, found):
+        return False
+    answer = q
+    if k > 0:
+        answer = found[2 * k - 1, :n] if is_reading else found[k - 1, :n]
+        if moves and not _has_rates(q, answer, models[2 * k], free_axis, work, rows):
+            return False
+    if not (is_reading or keeps_limits(answer, speed, memory, now_s, limits, bounds)):
+        return False
+    _put_joints(came, layout, place, answer, speed, goes)
+    age_s = _note_order(came, last, memory, now_s, now_ns)
+    if is_reading:
+        _note_reading(q, answer, memory, now_s, age_s)
+    else:
+        _note_target(q, answer, found, memory, now_s)
+        _note_echo(came, layout, goes, memory)
+    return True
+
+
 def load_kernels(n: int) -> None:
     """Call the compiled code for n joints once, so that the first message need not wait for it."""
     came, layout, place = np.zeros(n), np.zeros(9, dtype=np.int64), np.zeros(n, dtype=np.int64)
     message = came, np.zeros((2, n)), layout, place, np.zeros(n), np.zeros(1, dtype=np.int64)
     limits, models, largest = np.zeros((6, n)), np.zeros((3, 4, n + 2, 9)), np.ones((2, n))
     block, memory = of.blank(n)
-    rest: tuple[Any, ...] = (
-        block,
-        limits,
-        np.zeros(4),
-        models,
-        largest,
-        False,
-        np.zeros(work_size(n, 1)),
-    )
-    plain_target(*message, 0.0, *rest)
-    plain_reading(*message, 0.0, 0, False, *rest)
+    bounds, work = np.zeros(4), np.zeros(work_size(n, 1))
+    correction = block, limits, bounds, models, largest
+    pass_plainly(True, *message, 0.0, 0, *correction, False, False, work)
     times, counts, position = memory.times, memory.counts, np.zeros(n)
     of.note_arrival(times, counts, memory.intervals, memory.arrivals, 0.0)
     of.mean_period(counts, memory.arrivals)

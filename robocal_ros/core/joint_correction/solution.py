@@ -20,8 +20,7 @@ Array = NDArray[np.float64]
 MOST_ITERATIONS = 10
 # How often a step is repeated with the same matrix, from the second one on.
 REPEATS = 3
-# A second step that is at most this share of the first: steps with the same matrix do as well as a
-# new one.
+# A step that is at most this share of the one before, with the same matrix: what follows is too.
 CALM = 2e-3
 # A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
 SMALL_RESIDUAL = 1e-12
@@ -209,8 +208,8 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
             break
         if iterations == 0:
             share = _first_steps(q, largest, free, room, out)
-            small = CALM * newton.largest_of(room.x)
-            calm = least == 1 and share == 1.0 and newton.largest_of(room.step) <= small
+            size = newton.largest_of(room.step)
+            calm = least == 1 and share == 1.0 and size <= CALM * newton.largest_of(room.x)
         else:
             size = _add_step(free, iterations == 1, room)
         iterations += 1
@@ -218,8 +217,9 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
         repeats = 0
         while (calm or iterations > 1) and repeats < REPEATS and not converged:
             # more steps with the same matrix: each raises the order, for little
-            repeats += 1
+            repeats, before = repeats + 1, size
             size = _add_step(free, False, room)
+            calm = size <= CALM * before
             converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
         if converged or (iterations > 1 and size <= SMALL_STEP):
             _add_step(free, False, room)

@@ -21,7 +21,6 @@ from robocal_ros.sessions.correction.readings import Readings
 from robocal_ros.sessions.correction.wire import JointWire, Lanes
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 class Limits:
@@ -101,11 +100,9 @@ class PlainStream:
         came, goes = np.zeros_like(lanes.form[0]), lanes.goes.copy()
         self._came = came.data.cast("B")[BEGIN : BEGIN + lanes.sizes[0]]
         self._goes = goes.data.cast("B")[BEGIN : BEGIN + lanes.sizes[1]]
-        self._message = came, lanes.form, lanes.layout, self._place(lanes.names), goes
+        place = np.array([lanes.names.index(name) for name in self._limits.names])
+        self._message = came, lanes.form, lanes.layout, place, goes
         self._moves, self._lanes = bool(lanes.layout[COUNT + VELOCITY]), lanes
-
-    def _place(self, names: tuple[str, ...]) -> Index:
-        raise NotImplementedError
 
     def _take_model(self, model: Array) -> None:
         stage, n = self._corrector.stage(model), len(self._limits.names)
@@ -119,7 +116,8 @@ class PlainStream:
         work = np.empty(plain.work_size(n, len(largest) // 2))
         limits = self._limits
         self._correction: tuple[Any, ...] = (
-            self._block, limits.rows, limits.bounds, models, largest, limits.free_axis, work
+            self._block, limits.rows, limits.bounds, models, largest,
+            limits.free_axis, limits.clamped, work
         )  # fmt: skip
 
     def _together(self, models: Array) -> Array:
@@ -140,12 +138,9 @@ class PlainTargets(PlainStream):
         """What to put out for a serialized target; None where the session must look at it."""
         if not self._is_ready(data, self._commands.settled, now_s):
             return None
-        if plain.plain_target(*self._message, self._stamp, now_s, *self._correction):
+        if plain.pass_plainly(False, *self._message, self._stamp, now_s, 0, *self._correction):
             return data if self._passes else bytes(self._goes)
         return None
-
-    def _place(self, names: tuple[str, ...]) -> Index:
-        return np.array([self._limits.names.index(name) for name in names])
 
 
 class PlainReadings(PlainStream):
@@ -164,12 +159,9 @@ class PlainReadings(PlainStream):
         """
         if not self._is_ready(data, self._readings.whole, now_s):
             return None
-        when = now_s, now_ns, self._limits.clamped
-        done = plain.plain_reading(*self._message, self._stamp, *when, *self._correction)
+        when = now_s, now_ns
+        done = plain.pass_plainly(True, *self._message, self._stamp, *when, *self._correction)
         return bytes(self._goes) if done else None
-
-    def _place(self, names: tuple[str, ...]) -> Index:
-        return np.array([names.index(name) for name in self._limits.names])
 
     def _together(self, models: Array) -> Array:
         return models[[2, 3, 0, 1]]
