@@ -11,6 +11,7 @@ tools       which tools are taken over, and when
 starts      where a command may begin
 proposals   what could be put out, on the way to a model
 corrector   which model corrects at every instant
+plain       settled streams, from bytes to bytes
 """
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds
