@@ -102,11 +102,10 @@ class JointCorrectionNode(HouseNode):
         self._statuses = self.add_output(StatusMessage, "~/status", qos.LATCHED)
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
         self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
-        told = partial(self._tell_offset, JointOffset.STREAM)
-        targets = self._session, self._outputs[TARGETS], TARGETS, self._streams, told
+        targets = self._session, self._outputs[TARGETS], TARGETS, self._streams
         streams: dict[str, JointStream] = {
             STATES: ReadingStream(self._session, self._outputs[STATES], self.now_ns),
-            TARGETS: TargetStream(*targets),
+            TARGETS: TargetStream(*targets, partial(self._tell_offset, JointOffset.STREAM)),
         }
         acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None]]] = {
             STATES: (streams[STATES].read, self._on_states),

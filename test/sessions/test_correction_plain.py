@@ -10,7 +10,9 @@ from correction_robot import HOME, NAMES, NOMINAL, bent_tool, drifted, offer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from robocal_ros.core.joint_correction import plain
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     Policy,
@@ -190,9 +192,9 @@ def test_all_of_a_settled_stream_goes_the_shorter_way(
     both.settle()
     both.stream(3, rates=rates)
     before = dict(both.short.plain)
-    both.stream(200, way=0.2, rates=rates)
+    both.stream(100, way=0.2, rates=rates)
     for kind, count in before.items():
-        assert both.short.plain[kind] - count == 200
+        assert both.short.plain[kind] - count == 100
     assert np.abs(both.at - both.q).max() > 1e-5
 
 
@@ -221,6 +223,28 @@ def test_other_joints_and_another_order() -> None:
         assert np.allclose(positions(answer, NAMES), both.q, rtol=0.0, atol=1e-12)
         both.read(("gripper",))  # of another publisher: it takes the place of no layout
     assert both.short.plain["reading"] >= 4
+
+
+def test_with_a_free_axis_positions_alone_go_the_shorter_way() -> None:
+    """Rates are found by differences there."""
+    both = Both(free_axis=True)
+    both.model(3.0)
+    both.enable(True)
+    both.settle()
+    before = both.short.plain["target"]
+    both.stream(20, way=0.2)
+    assert both.short.plain["target"] - before == 20
+    both.stream(20, way=0.2, rates=True)
+    assert both.short.plain["target"] - before == 20
+
+
+def test_one_kernel_is_compiled_for_all_of_it() -> None:
+    """A second one would be compiled in the middle of a stream."""
+    load_kernels(NOMINAL)
+    both = Both()
+    both.stream(5)
+    both.stream(5, rates=True)
+    assert len(plain.pass_plainly.signatures) == 1
 
 
 class Hostile(Both):
