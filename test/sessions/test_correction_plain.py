@@ -16,6 +16,7 @@ from robocal_ros.core.joint_correction.staged import load_kernels
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     Policy,
+    Reason,
     RefusedError,
     TrajectoryCommand,
 )
@@ -238,6 +239,44 @@ def test_with_a_free_axis_positions_alone_go_the_shorter_way() -> None:
     assert both.short.plain["target"] - before == 20
 
 
+@pytest.mark.parametrize(
+    ("what", "reason"),
+    [
+        ("echo", Reason.OWN_OUTPUT),
+        ("gap", Reason.START_MISMATCH),
+        ("stamp", Reason.TIME_BACKWARDS),
+        ("clock", Reason.TIME_BACKWARDS),
+        ("degrees", Reason.DEGREES),
+        ("limit", Reason.JOINT_LIMIT),
+        ("speed", Reason.VELOCITY_LIMIT),
+    ],
+)
+def test_what_is_not_plain_is_refused_as_ever(what: str, reason: Reason) -> None:
+    both = Both(velocity_limits=np.full(6, 2.0) if what == "speed" else None)
+    both.model(3.0)
+    both.enable(True)
+    both.settle()
+    before = both.short.plain["target"]
+    both.stream(5)
+    assert both.short.plain["target"] - before == 5
+    both.now += DT
+    q, stamp = HOME.copy(), both.stamp
+    if what == "echo":
+        q = both.at
+    elif what == "gap":
+        both.now += 0.3
+        both.read()
+        q += 0.1
+    elif what == "stamp":
+        stamp -= 1_000_000
+    elif what == "clock":
+        both.now -= 1.0
+    else:
+        q[1] += {"degrees": 30.0, "limit": NOMINAL.upper[1] + 1e-6 - q[1], "speed": 0.1}[what]
+    assert isinstance(both.target(serialized(NAMES, [q, [], []], stamp)), str)
+    assert both.short.session.status().refused == {reason: 1}
+
+
 def test_one_kernel_is_compiled_for_all_of_it() -> None:
     """A second one would be compiled in the middle of a stream."""
     load_kernels(NOMINAL)
@@ -306,11 +345,13 @@ class Hostile(Both):
         """What went out comes back, as it was or rounded, with its mark or without."""
         if not isinstance(self.sent, bytes):
             return
-        self.now += DT
         back = positions(self.sent, NAMES)
-        self.target(self.sent)
-        self.target(serialized(NAMES, [back, [], []], self.stamp))
-        self.target(serialized(NAMES, [back.astype(np.float32), [], []], self.stamp))
+        ways = [back, back.astype(np.float32)]
+        echoes = [serialized(NAMES, [way, [], []], self.stamp) for way in ways]
+        for echo in (*echoes, self.sent):
+            self.now += DT
+            self.target(echo)
+            self.stream(2)
 
     def on_wrong(self, rng: np.random.Generator, count: int) -> None:
         """A message that is odd in one way."""
@@ -353,7 +394,7 @@ EVENTS = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.sampled_from(Policy), st.booleans(), st.booleans(), EVENTS)
 def test_whatever_comes_both_ways_do_the_same(
     policy: Policy, limited: bool, begun: bool, events: list[tuple[str, int, int]]
