@@ -30,6 +30,12 @@ class CommandSources:
         self._rivals_s = -math.inf
         self._gone = ""
 
+    def go_on(self, topic: str, now_s: float) -> bool:
+        """Whether a command now plainly follows others of one source; it is not noted."""
+        follows = topic == self._topic and now_s - self._heard_s <= self._at_once_s
+        alone = follows and self.inputs[topic].get_publisher_count() <= 1
+        return alone and not self._rivals_at(now_s)
+
     def hear(self, topic: str, now_s: float) -> str:
         """Note a command; why it must not be acted on, empty when it may."""
         last, before_s = self._topic, self._heard_s

@@ -30,6 +30,7 @@ from robocal_ros.nodes.joint_correction_settings import (
 )
 from robocal_ros.nodes.path_messages import PathMessage
 from robocal_ros.nodes.run import run
+from robocal_ros.nodes.settled_streams import JointStream, ReadingStream, TargetStream
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.stream_messages import ArrayMessage, JointMessage
 from robocal_ros.nodes.trajectory_proxy import TrajectoryProxy
@@ -41,7 +42,6 @@ from robocal_ros.sessions.correction import (
     offered_tool,
 )
 from robocal_ros.sessions.correction.periods import LONGEST_GAP_S
-from robocal_ros.sessions.correction.wire import JointWire
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
@@ -96,14 +96,21 @@ class JointCorrectionNode(HouseNode):
         self._statuses = self.add_output(StatusMessage, "~/status", qos.LATCHED)
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
         self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
+        targets = self._session, self._outputs[TARGETS], TARGETS, self._streams
+        streams: dict[str, JointStream] = {
+            STATES: ReadingStream(self._session, self._outputs[STATES], self.now_ns),
+            TARGETS: TargetStream(*targets, partial(self._tell_offset, JointOffset.STREAM)),
+        }
         acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None]]] = {
-            STATES: (partial(JointMessage, JointWire(), is_reading=True), self._on_states),
-            TARGETS: (partial(JointMessage, JointWire()), partial(self._on_target, TARGETS)),
+            STATES: (streams[STATES].read, self._on_states),
+            TARGETS: (streams[TARGETS].read, partial(self._on_target, TARGETS)),
             COMMANDS: (partial(ArrayMessage, self._names), partial(self._on_target, COMMANDS)),
             TRAJECTORY: (PathMessage, self._on_path),
         }
         for topic, (read, act) in acts.items():
             receive, kind = self._guarded(topic, read, act), KINDS[topic]
+            if topic in streams:
+                receive = streams[topic].before(self._sources[topic], receive)
             profile = qos.SENSOR if topic == STATES else qos.RELIABLE
             opened = self.add_input(kind, topic, receive, profile, raw=topic != COMMANDS)
             if topic in self._senders:
@@ -174,21 +181,15 @@ class JointCorrectionNode(HouseNode):
             message = read(came)
             stop = topic == TRAJECTORY and not message.points  # nothing may hold it up
             if guard.fault and not stop:
-                self._bar(Reason.OWN_OUTPUT, guard.fault)
+                self._session.refuse(Reason.OWN_OUTPUT, guard.fault)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
             rivals = senders.hear(topic, time.monotonic()) if senders and not stop else ""
             if rivals:
-                self._bar(Reason.TWO_SOURCES, rivals)
+                self._session.refuse(Reason.TWO_SOURCES, rivals)
             act(message)
 
         return receive
-
-    def _bar(self, reason: Reason, detail: str) -> None:
-        def refuse() -> None:
-            raise RefusedError(reason, detail)
-
-        self._session.counted(refuse)
 
     def _on_target(self, topic: str, message: JointMessage | ArrayMessage) -> None:
         command, now = self._session.counted(message.command), time.monotonic()
@@ -196,10 +197,9 @@ class JointCorrectionNode(HouseNode):
         self._tell_offset(JointOffset.STREAM, now)
 
     def _on_states(self, message: JointMessage) -> None:
-        command = self._session.counted(message.command)
+        command, act = self._session.counted(message.command), self._session.reading
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
-        taught = self._session.reading(command, time.monotonic(), age)
-        self._put_out(STATES, message, command, taught)
+        self._put_out(STATES, message, command, act(command, time.monotonic(), age))
 
     def _on_path(self, message: PathMessage) -> None:
         if message.points:

@@ -55,6 +55,15 @@ class Commanded:
         model = self.at(now_s)
         return Commanded(model, model)
 
+    def settled(self, now_s: float) -> Array | None:
+        """The packed model at an instant and ever after; None while it is still to change."""
+        if self.before is not None and now_s < self.begin_s:
+            return None
+        over = self.start is self.end or (
+            now_s - self.begin_s >= self.times_s[-1] and self.s[-1] >= 1.0
+        )
+        return self.end if over else None
+
     def latest(self, now_s: float) -> "Commanded":
         """What is in the commands at an instant: this, or what was ``before``."""
         if self.before is not None and now_s < self.begin_s:

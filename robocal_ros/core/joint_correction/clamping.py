@@ -18,15 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.bounds import FADES_FROM, CorrectionConfig, Policy
+from robocal_ros.core.joint_correction.plainness import EXACT, FADES_WITHIN
 from robocal_ros.core.joint_correction.refusals import Reason
 from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 
-FADES_WITHIN = 3.0
 TINY = 1e-300
-EXACT = 1e-13  # rad, m
 MOST_STEPS = 60
 
 

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 MOST_ITERATIONS = 10
 # How often a step is repeated with the same matrix, from the second one on.
 REPEATS = 3
+# A step that is at most this share of the one before, with the same matrix: what follows is too.
+CALM = 2e-3
 # A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
 SMALL_RESIDUAL = 1e-12
 # A step below which the next one is under the rounding floor (convergence is quadratic).
@@ -48,7 +50,7 @@ class Room(NamedTuple):
     here : (4, 4) pose of the tool at the joints tried last.
     turns, frames : scratch of `walk`.
     J, L : (n, 6) Jacobian, and the factor for its steps.
-    e, spare : (6,) residual to ``aim``, and scratch.
+    e, spare, spare_twist : (6,) residual to ``aim``, and scratch.
     x, step : (n,) shift of the joints, and its last step.
     """
 
@@ -69,17 +71,18 @@ class Room(NamedTuple):
     L: Array
     e: Array
     spare: Array
+    spare_twist: Array
     x: Array
     step: Array
 
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    return 18 * (n + 2) + 7 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 12 + 2 * n
+    return 18 * (n + 2) + 7 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 18 + 2 * n
 
 
 @lean
-def _room(work: Array, n: int, free: bool) -> Room:
+def room_in(work: Array, n: int, free: bool) -> Room:
     """Divide ``work``."""
     m = 9 * (n + 2)
     taught, actual, at = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9), 2 * m
@@ -89,16 +92,16 @@ def _room(work: Array, n: int, free: bool) -> Room:
     J, at = work[at : at + 6 * n].reshape(n, 6), at + 6 * n
     size = equations.unknowns(n, free)
     L, at = work[at : at + size * size].reshape(size, size), at + size * size
-    twists, at = work[at : at + 12].reshape(2, 6), at + 12
+    twists, at = work[at : at + 18].reshape(3, 6), at + 18
     return Room(
         taught, actual, taught[:n], actual[:n], poses[0], poses[1], poses[2], poses[3], poses[4],
-        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1],
+        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1], twists[2],
         work[at : at + n], work[at + n : at + 2 * n],
     )  # fmt: skip
 
 
 @lean
-def _settle(models: Array, s: float, room: Room) -> None:
+def settle(models: Array, s: float, room: Room) -> None:
     """Models at blend s, and their ends."""
     n = room.links.shape[0]
     k.blend(models[0], models[1], s, room.taught)
@@ -195,7 +198,7 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
     # The shortest of many solutions is sought once, in the second iteration: so what is found does
     # not hang on how many there are.
     least = 2 if equations.wide(n, free) else 1
-    share, iterations = 1.0, 0
+    share, iterations, calm = 1.0, 0, False
     converged = newton.largest_of(room.e) <= SMALL_RESIDUAL
     while not converged and iterations < MOST_ITERATIONS:
         newton.columns(room.links, room.frames, room.here, room.J)
@@ -205,22 +208,26 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
             break
         if iterations == 0:
             share = _first_steps(q, largest, free, room, out)
+            size = newton.largest_of(room.step)
+            calm = least == 1 and share == 1.0 and size <= CALM * newton.largest_of(room.x)
         else:
             size = _add_step(free, iterations == 1, room)
         iterations += 1
         converged = _moved(q, free, room, out) <= SMALL_RESIDUAL and iterations >= least
         repeats = 0
-        while iterations > 1 and repeats < REPEATS and not converged:
+        while (calm or iterations > 1) and repeats < REPEATS and not converged:
             # more steps with the same matrix: each raises the order, for little
-            repeats += 1
+            repeats, before = repeats + 1, size
             size = _add_step(free, False, room)
+            calm = size <= CALM * before
             converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
         if converged or (iterations > 1 and size <= SMALL_STEP):
             _add_step(free, False, room)
-            if repeats > 0:
+            if repeats > 0 and not calm:
                 _moved(q, free, room, out)
                 _add_step(free, False, room)
             converged = True
+        calm = False
     out[n + CONVERGED] = _take(q, room.x, largest, converged, out)
     out[n + ITERATIONS] = iterations
     out[n + SHARE] = share if out[n + CONVERGED] else 0.0
@@ -244,6 +251,16 @@ def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> No
 
 
 @lean
+def correct_point(
+    q: Array, models: Array, s: float, largest: Array, free: bool, work: Array, out: Array
+) -> None:
+    """`correct_batch` for one point (n,)."""
+    room = room_in(work, q.shape[0], free)
+    settle(models, s, room)
+    _correct(q, largest, free, room, out)
+
+
+@lean
 def correct_batch(
     q: Array, models: Array, s: Array, largest: Array, free: bool, work: Array, out: Array
 ) -> None:
@@ -253,8 +270,8 @@ def correct_batch(
     tool's z is free. ``out`` (m, n + 7): joints, then the report. See
     `joint_correction.JointCorrection`.
     """
-    room = _room(work, q.shape[1], free)
+    room = room_in(work, q.shape[1], free)
     for i in range(q.shape[0]):
         if i == 0 or s[i] != s[i - 1]:
-            _settle(models, s[i], room)
+            settle(models, s[i], room)
         _correct(q[i], largest, free, room, out[i])

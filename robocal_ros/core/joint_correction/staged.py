@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.joint_correction import rates
+from robocal_ros.core.joint_correction import rates, solution
 from robocal_ros.core.joint_correction.correction import (
     CorrectionResult,
     JointCorrection,
@@ -19,12 +19,14 @@ from robocal_ros.core.joint_correction.correction import (
     path_rates,
     plain,
 )
+from robocal_ros.core.joint_correction.plain import load_kernels as load_plain_kernels
+from robocal_ros.core.joint_correction.plainness import EXACT
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 
-# The inverse near a singularity is refined until it is exact to this (rad, m), or so often.
-EXACT, ROUNDING = 1e-13, 1e-9
+# The inverse near a singularity is refined until it is exact, or so often.
+ROUNDING = 1e-9
 MOST_REFINEMENTS, MOST_NEWTON_STEPS = 30, 12
 DIFFERENCE, LONGEST_STEP = 1e-6, 0.1
 SHORTER = 0.5 ** np.arange(8)
@@ -54,6 +56,11 @@ class StagedResult:
 class StagedCorrection:
     """Correction from a reference model to one between two others.
 
+    Attributes
+    ----------
+    models : (4, n + 2, 9) of all of it.
+    analytic : whether rates are found by the chain rule.
+
     Parameters
     ----------
     reference, start, end : packed models, see `pack_model`; blend s goes from start to end. The
@@ -77,12 +84,22 @@ class StagedCorrection:
             model[-1] = taught
         self.n = len(reference) - 2
         self._arm = JointCorrection(np.stack([reference, reference, *bare]), arm_largest, free_axis)
-        self._models = np.stack([reference, reference, start, end])
+        self.models = np.stack([reference, reference, start, end])
         # six joints and six equations: rates by the chain rule
-        self._analytic = self.n == 6 and not free_axis
+        self.analytic = self.n == 6 and not free_axis
+        self._work = np.empty(solution.work_size(self.n))
         self._tool: JointCorrection | None = None
         if not (np.array_equal(start[-1], taught) and np.array_equal(end[-1], taught)):
             self._tool = JointCorrection(np.stack([*bare, start, end]), tool_largest, free_axis)
+
+    def stacked(self) -> tuple[Array, Array]:
+        """Models (2 k, 4, n + 2, 9) and largest shifts (2 k, n) of k stages, then of the inverses.
+
+        The inverses are in reverse order.
+        """
+        stages = [self._arm] if self._tool is None else [self._arm, self._tool]
+        stages += [stage.inverse() for stage in reversed(stages)]
+        return np.stack([x.models for x in stages]), np.stack([x.largest for x in stages])
 
     def correct(self, q: Array, s: Array) -> StagedResult:
         """Correct joints (m, n) at blends (m,)."""
@@ -199,9 +216,11 @@ class StagedCorrection:
         out_v, out_a = np.empty(q.shape), np.empty(q.shape)
         points, qd, qdd = plain(q), plain(velocity), plain(acceleration)
         rough = np.ones(len(q), dtype=np.bool_)
-        if self._analytic:
+        if self.analytic:
             blends = plain(s)
-            rates.rates_batch(points, qd, qdd, plain(result.q), self._models, blends, out_v, out_a)
+            rates.rates_batch(
+                points, qd, qdd, plain(result.q), self.models, blends, self._work, out_v, out_a
+            )
             rough = ~(result.whole & (s_rate == 0.0) & np.isfinite(out_v).all(axis=1))
         if np.any(rough):
 
@@ -219,16 +238,17 @@ class StagedCorrection:
         At the end of the blend. Where a singularity is near they are the corrected joints' own.
         """
         out, unused, zero = np.empty_like(q), np.empty_like(q), np.zeros_like(q)
-        models, ones = self._models[[2, 3, 0, 1]], np.ones(len(q))
-        if not self._analytic:
+        models, ones = self.models[[2, 3, 0, 1]], np.ones(len(q))
+        if not self.analytic:
             return path_rates(lambda p, _: self.uncorrect(p, ones), corrected, velocity, zero)[0]
-        rates.rates_batch(corrected, velocity, zero, q, models, ones, out, unused)
+        rates.rates_batch(corrected, velocity, zero, q, models, ones, self._work, out, unused)
         exact = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
         return np.where(exact[:, None], out, velocity)
 
 
 def load_kernels(arm: SerialArm) -> None:
-    """Call the compiled code of a stage once, so that the first command need not wait for it."""
+    """Call the compiled code once, so that the first command need not wait for it."""
+    load_plain_kernels(arm.n)
     packed, largest = pack_model(arm), np.ones(arm.n)
     q, s = np.zeros((2, arm.n)), np.full(2, 0.5)
     stage = StagedCorrection(packed, packed, packed.copy(), largest, largest)

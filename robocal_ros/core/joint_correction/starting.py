@@ -7,13 +7,12 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction.memory import RESPONSE_S
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Within this a robot that was commanded is where the command was.
-RESPONSE_S = 0.2
 INSTANTS = 9
 
 

@@ -12,6 +12,7 @@ starts      where a command may begin
 courses     what becomes of a trajectory that was put out
 proposals   what could be put out, on the way to a model
 corrector   which model corrects at every instant
+plain       settled streams, from bytes to bytes
 """
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy, ShiftBounds

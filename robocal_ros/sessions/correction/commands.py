@@ -8,9 +8,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction import memory as of
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.memory import RESPONSE_S, Memory
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
-from robocal_ros.core.joint_correction.starting import INSTANTS, RESPONSE_S, Sent
+from robocal_ros.core.joint_correction.starting import INSTANTS, Sent
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.sessions.correction.corrector import Corrector
 from robocal_ros.sessions.correction.courses import Courses
@@ -30,7 +32,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Command = TypeVar("Command", JointCommand, TrajectoryCommand)
 
-_AT_ONCE = np.zeros(1)
 # A point of a trajectory is corrected and forwarded within this: one that has a time to begin at
 # is entered so much later, and must not have begun to blend by then.
 FORWARDED_S = 1e-4
@@ -44,6 +45,7 @@ class Commands:
     goal : (n,) taught joints that were commanded last, NaN before the first.
     offset : (n,) what was added to the target corrected last; in shadow mode what would have been.
     courses : which trajectory was put out last.
+    settled : the last target taken here, when the next ones of its stream are corrected alike.
     """
 
     def __init__(
@@ -53,15 +55,15 @@ class Commands:
         guard: CorrectionGuard,
         corrector: Corrector,
         starts: Starts,
+        memory: Memory,
     ) -> None:
         self._config, self._joints, self._guard = config, joints, guard
         self._corrector, self._starts = corrector, starts
-        self._stream = StreamPeriod(config.stream_gap_s)
+        self._stream = StreamPeriod(memory, config.stream_gap_s)
+        self._out, self._times = memory.out, memory.times  # of the last target
         self.courses = Courses(corrector, starts)
-        self._out = np.full(joints.count, np.nan)  # of the last target
-        self._out_s = -np.inf
-        self.goal = np.full(joints.count, np.nan)
-        self.offset = np.zeros(joints.count)
+        self.goal, self.offset = memory.goal, memory.offset
+        self.settled: JointCommand | None = None
 
     def streams(self, now_s: float) -> bool:
         """Whether a stream of targets is under way."""
@@ -69,12 +71,14 @@ class Commands:
 
     def stop(self, now_s: float) -> None:
         """What is under way ends, also by a clock that went back."""
+        self.settled = None
         now_s = self._guard.not_before(now_s)
         self.courses.stop(now_s)
         self._stream.end()
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream; the blend advances with ``now_s``."""
+        self.settled = None
         self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s, command.names)
         self._guard.require_not_own(TARGET, command.names, command.position)
         q, index = self._joints.complete(command.names, command.position[None], now_s)
@@ -82,38 +86,45 @@ class Commands:
         require_finite(command.names, speeds)
         # Messages may come at once after a delay: each has the stream's own period; and a pause
         # does not allow a longer step than two of them.
-        period = self._stream.mean_s or self._config.longest_step_s
-        dt_s = np.array([np.clip(now_s - self._out_s, period, 2.0 * period)])
+        mean = self._stream.mean_s
+        period = mean if mean > 0.0 else self._config.longest_step_s
+        dt_s = np.array([np.clip(now_s - self._times[of.OUT], period, 2.0 * period)])
         motion = self._motion(q, index, dt_s, speeds)
         corrected = self._or_as_it_came(
             command, lambda: self._correct_target(command, motion, index, now_s)
         )
         self._stream.note(now_s)
-        self.goal = q[0]
+        self.goal[:] = q[0]
         self._guard.accept_order(TARGET, command.stamp_ns, now_s, command.names)
         out = corrected.position
         self._guard.note_output(TARGET, command.names, command.position, out)
         self._out[:] = np.nan
-        self._out[index], self._out_s = out, now_s
-        sent = Sent(index, now_s, _AT_ONCE, command.position[None], out[None])
-        self._starts.note_sent(sent, now_s)
+        self._out[index], self._times[of.OUT] = out, now_s
+        self._starts.note_target(index)
         self.courses.current = None
+        self.settled = command if self._is_settled(index) else None
         return corrected
+
+    def _is_settled(self, index: Index) -> bool:
+        """Whether a target just put out shows what the next ones of its stream will meet."""
+        corrector, whole = self._corrector, len(index) == self._joints.count
+        same = corrector.settled and not corrector.waits and not self._config.shadow
+        return whole and same and (corrector.idle or not self._starts.bare)
 
     def _correct_target(
         self, command: JointCommand, motion: Motion, index: Index, now_s: float
     ) -> JointCommand:
         last = self._stream.last_s
-        pause = 0.0 if last is None else now_s - last
+        pause = now_s - last if np.isfinite(last) else 0.0
         if self._starts.must_start(now_s) and not self._stream.goes_on(now_s):
             self._starts.start_at(motion.q, self._joints.where(now_s), now_s)
             pause = 0.0
         if self._corrector.passing(now_s):
             self._corrector.pass_on(motion, now_s)
-            self.offset = np.zeros(self._joints.count)
+            self.offset[:] = 0.0
             return command
         done = self._corrector.point(motion, now_s, pause)
-        self.offset = done.result.q[0] - motion.q[0]
+        self.offset[:] = done.result.q[0] - motion.q[0]
         velocity = None if done.velocity is None else done.velocity[0, index]
         position = done.result.q[0, index]
         return replace(command, position=position, velocity=velocity, mark=CORRECTED)
@@ -151,6 +162,7 @@ class Commands:
         may_be_rejected: bool = False,
     ) -> TrajectoryCommand:
         """Correct a whole trajectory of at least one point."""
+        self.settled = None
         require_few(len(command))
         # The stamp says when it begins, not when it was made: no order follows from it.
         self._guard.require_order(TRAJECTORY, 0, command.mark, now_s)
@@ -179,7 +191,7 @@ class Commands:
         self.courses.take(left, at_once=at_once, may_be_rejected=may_be_rejected)
         self._stream.end()
         self._out[:] = np.nan
-        self.goal = q[-1]
+        self.goal[:] = q[-1]
         return corrected
 
     def _correct_path(

@@ -18,6 +18,7 @@ from robocal_ros.core.joint_correction.bounds import (
     require_within,
 )
 from robocal_ros.core.joint_correction.clamping import ClampedResult
+from robocal_ros.core.joint_correction.memory import Memory
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
 from robocal_ros.core.kinematics import SerialArm
@@ -38,11 +39,10 @@ class Corrector:
     reduced : how many points were corrected in part, near a singularity or by a bound.
     clamped, passed : how many messages were corrected in part, or on the way to not at all, for
         what bound.
-    figures : of the last joints put out: error at the tool without correction, m; largest shift
-        of a joint; error that remains, m.
+    figures : (3,) of the last joints put out, see `Memory`.
     """
 
-    def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
+    def __init__(self, reference: SerialArm, config: CorrectionConfig, memory: Memory) -> None:
         self._arm = reference
         self._config = config
         self.reference = pack_model(reference)
@@ -55,7 +55,7 @@ class Corrector:
         self.reduced = 0
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
-        self.figures = (0.0, 0.0, 0.0)
+        self.figures = memory.figures
 
     def want(self, arm: SerialArm, on: bool) -> None:
         """Head for a model and tool when ``on``, else for no correction."""
@@ -122,7 +122,14 @@ class Corrector:
 
     def commanded(self, now_s: float) -> StagedCorrection | None:
         """The correction in the commands at an instant, at blend 1; None when there is none."""
-        model = self._commanded.at(now_s)
+        return self.stage(self._commanded.at(now_s))
+
+    def settled_on(self, now_s: float) -> Array | None:
+        """The packed model in the commands from an instant on; None while it is to change."""
+        return self._commanded.settled(now_s)
+
+    def stage(self, model: Array) -> StagedCorrection | None:
+        """The correction with a packed model; None for no correction."""
         return None if model is self.reference else self._proposer.stage(model, model)
 
     # ---- corrected joints -----------------------------------------------------------------------
@@ -133,7 +140,7 @@ class Corrector:
         self._require_speeds(motion, motion.q, motion.velocity)
         self.stop(now_s)
         self.waits = ""
-        self.figures = (0.0, 0.0, 0.0)
+        self.figures[:] = 0.0
 
     def point(self, motion: Motion, now_s: float, pause_s: float) -> Proposal:
         """Correct one point of a stream, ``pause_s`` after the one before.
@@ -221,8 +228,8 @@ class Corrector:
 
     def _note(self, q: Array, result: StagedResult) -> None:
         self.reduced += int((~result.whole).sum())
-        self.figures = (
-            float(result.arm.tcp_shift_m.max()),
-            float(np.abs(result.q - q).max()),
-            float(result.remaining_m.max()),
+        self.figures[:] = (
+            result.arm.tcp_shift_m.max(),
+            np.abs(result.q - q).max(),
+            result.remaining_m.max(),
         )

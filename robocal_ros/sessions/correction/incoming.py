@@ -1,14 +1,17 @@
 """What comes in: joints by name, their last known state, order in time, own output."""
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.joint_correction import memory as of
+from robocal_ros.core.joint_correction.correction import plain
+from robocal_ros.core.joint_correction.memory import RESPONSE_S, Memory
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
-from robocal_ros.core.joint_correction.starting import RESPONSE_S, Whereabouts
+from robocal_ros.core.joint_correction.starting import Whereabouts
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction.inputs import JointCommand
@@ -23,15 +26,9 @@ TRAJECTORY = "trajectory"
 
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
-# Own output comes back as it was, or rounded (float32: 2.4e-7 rad): nearer than this, and nearer
-# than a share of what it was shifted by; so a target that is sent again is not taken for it.
-ROUNDED = 1e-6
-OF_SHIFT = 0.25
-SHIFTED = 1e-9
-ECHOES = 64  # a loop brings one of so many outputs back
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 MOST_STAMPS = 64  # of so many drivers, or planners, the order in time is watched
-TRACK_S = 0.01  # between the places that tell how far the robot moved
+NEVER = 2**63 - 1  # a stamp that none follows
 
 
 class JointBook:
@@ -41,21 +38,20 @@ class JointBook:
     ----------
     measured : (n,) last readings, NaN before the first.
     taught : (n,) the same, un-corrected.
+    doubtful : (n,) beyond this joints may be in degrees, or in millimetres.
     """
 
-    def __init__(self, arm: SerialArm, age_limit_s: float) -> None:
+    def __init__(self, arm: SerialArm, age_limit_s: float, memory: Memory) -> None:
         self._names = arm.joint_names
         self._age_limit_s = age_limit_s
-        self._read_s = np.full(arm.n, -np.inf)
-        self._track: deque[tuple[float, Array]] = deque()
+        self._memory = memory
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), MOST_TURNS)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
-        self._doubtful = np.minimum(self._turns, self._tenfold)
-        self.measured = np.full(arm.n, np.nan)
-        self.taught = np.full(arm.n, np.nan)
+        self.doubtful = np.minimum(self._turns, self._tenfold)
+        self.measured, self.taught = memory.measured, memory.taught
 
     @property
     def count(self) -> int:
@@ -64,17 +60,25 @@ class JointBook:
 
     def where(self, now_s: float) -> Whereabouts:
         """Where the robot is, how far it moved lately, and how old this is."""
-        places = np.array([q for t, q in self._track if t >= now_s - RESPONSE_S] or [self.measured])
-        travel = np.max(np.abs(places - self.measured), axis=0)
-        age = now_s - self._read_s
+        times, places = self._track()
+        lately = np.vstack([self.measured, places[times >= now_s - RESPONSE_S]])
+        travel = np.max(np.abs(lately - self.measured), axis=0)
+        age = now_s - self._memory.read_s
         return Whereabouts(self._names, self.measured, travel, age, self._age_limit_s)
 
     def at_rest(self, now_s: float, near: Array) -> bool:
         """Whether the joints were read, and stayed within ``near`` (n,) for the response time."""
-        if not self._track or self._track[0][0] > now_s - RESPONSE_S:
+        times, places = self._track()
+        if not len(times) or times[0] > now_s - RESPONSE_S:
             return False
-        moved = max(float(np.max(np.abs(q - self.measured) / near)) for _, q in self._track)
-        return moved < 1.0 and bool(np.all(now_s - self._read_s <= self._age_limit_s))
+        moved = float(np.max(np.abs(places - self.measured) / near))
+        return moved < 1.0 and bool(np.all(now_s - self._memory.read_s <= self._age_limit_s))
+
+    def _track(self) -> tuple[Array, Array]:
+        """Times (r,) and places (r, n), the oldest first."""
+        first, count = self._memory.counts[[of.OLDEST, of.PLACES]]
+        row = (first + np.arange(count)) % of.TRACK
+        return self._memory.track_s[row], self._memory.track[row]
 
     def complete(
         self, names: tuple[str, ...], position: Array, now_s: float
@@ -110,7 +114,7 @@ class JointBook:
     def _require_radians(self, index: Index, position: Array) -> None:
         """Refuse positions (m, k) that can only be degrees, or millimetres."""
         size = np.abs(position)
-        if not (size > self._doubtful[index]).any():
+        if not (size > self.doubtful[index]).any():
             return
         if np.any(size > self._turns[index]):
             point, column = np.argwhere(size > self._turns[index])[0]
@@ -157,11 +161,9 @@ class JointBook:
         """Take over readings that are ``age_s`` old; returns what `find` does."""
         index, places = self.find(state)
         self.measured[index] = state.position[places]
-        self._read_s[index] = now_s - max(age_s, 0.0)
-        if not self._track or now_s - self._track[-1][0] >= TRACK_S:
-            self._track.append((now_s, self.measured.copy()))
-            while len(self._track) > 1 and self._track[1][0] <= now_s - RESPONSE_S:
-                self._track.popleft()
+        memory = self._memory
+        memory.read_s[index] = now_s - max(age_s, 0.0)
+        of.note_place(memory.counts, memory.track_s, memory.track, memory.measured, now_s)
         return index, places
 
 
@@ -174,10 +176,10 @@ class CorrectionGuard:
     last_refusal : in words.
     """
 
-    def __init__(self) -> None:
-        self._clock_s = -np.inf
-        self._stamps: dict[tuple[str, tuple[str, ...]], int] = {}  # by kind and joints
-        self._echoes = {TARGET: Echoes(ECHOES), TRAJECTORY: Echoes(1)}
+    def __init__(self, memory: Memory) -> None:
+        self._times = memory.times
+        self._stamps: dict[tuple[str, tuple[str, ...]], Index] = {}  # by kind and joints
+        self._echoes = {TARGET: Echoes(memory), TRAJECTORY: Echoes()}
         self.refused: Counter[Reason] = Counter()
         self.last_refusal = ""
 
@@ -186,9 +188,14 @@ class CorrectionGuard:
         try:
             return act()
         except RefusedError as error:
-            self.refused[error.reason] += 1
-            self.last_refusal = str(error)
+            self.count(error)
             raise
+
+    def count(self, refusal: RefusedError) -> RefusedError:
+        """Count a refusal, and return it."""
+        self.refused[refusal.reason] += 1
+        self.last_refusal = str(refusal)
+        return refusal
 
     def require_order(
         self, kind: str, stamp: int, mark: str, now_s: float, names: tuple[str, ...] = ()
@@ -199,9 +206,10 @@ class CorrectionGuard:
         """
         if mark == CORRECTED or (mark == TAUGHT and kind == READING):
             raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
-        if not now_s >= self._clock_s:
-            raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {self._clock_s}")
-        last = self._stamps.get((kind, names), 0)
+        clock_s = float(self._times[of.CLOCK])
+        if not now_s >= clock_s:
+            raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {clock_s}")
+        last = int(self._stamps[kind, names][0]) if (kind, names) in self._stamps else 0
         reset = last - stamp > CLOCK_RESET_NS
         if stamp and stamp < last and not reset:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
@@ -209,22 +217,29 @@ class CorrectionGuard:
 
     def not_before(self, now_s: float) -> float:
         """The clock's time, or the last one where it went back."""
-        return now_s if now_s >= self._clock_s else self._clock_s
+        clock_s = float(self._times[of.CLOCK])
+        return now_s if now_s >= clock_s else clock_s
 
     def accept_order(
         self, kind: str, stamp: int, now_s: float, names: tuple[str, ...] = ()
     ) -> None:
         """Remember the time of what was acted on."""
-        self._clock_s = now_s
+        self._times[of.CLOCK] = now_s
         if stamp:
-            self._stamps.pop((kind, names), None)  # so that the oldest is the first to go
-            self._stamps[kind, names] = stamp
+            last = self.last_stamp(kind, names)
+            last[0] = stamp
+            self._stamps[kind, names] = self._stamps.pop((kind, names))  # the oldest goes first
             if len(self._stamps) > MOST_STAMPS:
-                del self._stamps[next(iter(self._stamps))]
+                self._stamps.pop(next(iter(self._stamps)))[0] = NEVER
+
+    def last_stamp(self, kind: str, names: tuple[str, ...]) -> Index:
+        """Stamp (1,) of the last message of these joints, to go on with; 0: none."""
+        return self._stamps.setdefault((kind, names), np.zeros(1, dtype=np.int64))
 
     def forget_stamps(self) -> None:
         """Start afresh with any source stamp."""
-        self._stamps.clear()
+        for last in self._stamps.values():
+            last[0] = 0
 
     def note_output(self, kind: str, names: tuple[str, ...], taught: Array, out: Array) -> None:
         """Remember what was put out for what came in."""
@@ -237,33 +252,36 @@ class CorrectionGuard:
 
 
 class Echoes:
-    """The last corrected positions, to know them when they come back."""
+    """The last corrected positions, to know them when they come back; without a memory one."""
 
-    def __init__(self, size: int) -> None:
-        self._size = size
+    def __init__(self, memory: Memory | None = None) -> None:
+        self._memory = memory
         self._names: tuple[str, ...] = ()
-        self._positions = np.empty((0, 0))
-        self._within = np.empty(0)
-        self._next = 0
+        self._shape: tuple[int, ...] = ()
+        self._positions = np.zeros((1, 0))
+        self._within = np.full(1, -1.0) if memory is None else memory.within
+        self._kept = np.zeros(1, dtype=np.int64)
+        if memory is not None:
+            self._kept = memory.counts[of.ECHOED : of.ECHOED + 1]
 
     def remember(self, names: tuple[str, ...], taught: Array, corrected: Array) -> None:
         """Keep ``corrected`` for a while; one that equals ``taught`` is no echo."""
-        if names != self._names or corrected.shape != self._positions.shape[1:]:
-            self._names = names
-            self._positions = np.zeros((self._size, *corrected.shape))
-            self._within = np.full(self._size, -1.0)
-        shift = float(np.abs(corrected - taught).max())
-        i = self._next % self._size
-        self._positions[i] = corrected
-        self._within[i] = min(ROUNDED, OF_SHIFT * shift) if shift > SHIFTED else -1.0
-        self._next += 1
+        if names != self._names or corrected.shape != self._shape:
+            self._names, self._shape = names, corrected.shape
+            self._positions = np.zeros((1, corrected.size))
+            if self._memory is not None:
+                room = self._memory.echoes.reshape(-1)[: of.ECHOES * corrected.size]
+                self._positions = room.reshape(of.ECHOES, -1)
+            self._within[:] = -1.0
+        flat = plain(taught.reshape(-1)), plain(corrected.reshape(-1))
+        of.remember_echo(self._positions, self._within, int(self._kept[0]), *flat)
+        self._kept += 1
 
     def holds(self, names: tuple[str, ...], position: Array) -> bool:
         """Whether a position is one of them, up to rounding."""
-        if names != self._names or position.shape != self._positions.shape[1:]:
+        if names != self._names or position.shape != self._shape:
             return False
-        beside = np.abs(self._positions - position).reshape(self._size, -1).max(axis=1)
-        return bool((beside <= self._within).any())
+        return of.is_echo(self._positions, self._within, plain(position.reshape(-1)))
 
 
 def require_finite(names: tuple[str, ...], values: Array | None) -> None:

@@ -15,13 +15,19 @@ Index = NDArray[np.int64]
 
 
 class Readings:
-    """From corrected joints to taught ones."""
+    """From corrected joints to taught ones.
+
+    Attributes
+    ----------
+    whole : the last ones taken here that had all of the arm's joints; None in shadow mode.
+    """
 
     def __init__(
         self, joints: JointBook, guard: CorrectionGuard, corrector: Corrector, shadow: bool
     ) -> None:
         self._joints, self._guard, self._corrector = joints, guard, corrector
         self._shadow = shadow
+        self.whole: JointCommand | None = None
 
     def take(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
         """Remember readings that are ``age_s`` old, and un-correct them."""
@@ -29,7 +35,9 @@ class Readings:
         index, place = self._joints.read(state, now_s, age_s)
         self._guard.accept_order(READING, state.stamp_ns, now_s, state.names)
         taught, position, velocity = self._un_corrected(state, index, place, now_s)
-        self._joints.taught = taught
+        self._joints.taught[:] = taught
+        if len(index) == self._joints.count and not self._shadow:
+            self.whole = state
         return replace(state, position=position, velocity=velocity, mark=TAUGHT)
 
     def taught(

@@ -7,13 +7,14 @@ correct is refused with a reason, counted, and nothing is put out for it: `Refus
 
 import contextlib
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.core.joint_correction.refusals import RefusedError
+from robocal_ros.core.joint_correction.memory import blank
+from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.correction.commands import Commands
 from robocal_ros.sessions.correction.corrector import Corrector
@@ -26,9 +27,11 @@ from robocal_ros.sessions.correction.inputs import (
     TrajectoryCommand,
 )
 from robocal_ros.sessions.correction.offers import CorrectionGate
+from robocal_ros.sessions.correction.plain import Limits, PlainReadings, PlainTargets
 from robocal_ros.sessions.correction.readings import Readings
 from robocal_ros.sessions.correction.starts import Starts
 from robocal_ros.sessions.correction.status import CorrectionStatus, Offset
+from robocal_ros.sessions.correction.wire import JointWire
 
 Array = NDArray[np.float64]
 Answer = TypeVar("Answer")
@@ -57,14 +60,19 @@ class CorrectionSession:
         config = config or CorrectionConfig()
         self._reference = reference
         self._gate = CorrectionGate(nominal, reference, serial, config)
-        self._guard = CorrectionGuard()
+        self._block, memory = blank(reference.n)
+        self._guard = CorrectionGuard(memory)
         self._config = config
-        self._joints = JointBook(reference, config.joint_state_age_s)
-        self._corrector = Corrector(reference, config)
+        self._joints = JointBook(reference, config.joint_state_age_s, memory)
+        self._corrector = Corrector(reference, config, memory)
         self._enabled = False
-        self._starts = Starts(reference, config, self._corrector)
-        self._commands = Commands(config, self._joints, self._guard, self._corrector, self._starts)
+        self._starts = Starts(reference, config, self._corrector, memory)
+        self._commands = Commands(
+            config, self._joints, self._guard, self._corrector, self._starts, memory
+        )
         self._readings = Readings(self._joints, self._guard, self._corrector, config.shadow)
+        limits = Limits(reference, config, self._joints.doubtful)
+        self._plain = limits, self._block, self._guard, self._corrector
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
@@ -123,6 +131,7 @@ class CorrectionSession:
         return np.asarray(places[np.isfinite(places).all(axis=1)])
 
     def _want(self) -> None:
+        self._commands.settled = None
         self._corrector.want(self._gate.actual, self._enabled)
 
     # ---- commands -------------------------------------------------------------------------------
@@ -138,6 +147,14 @@ class CorrectionSession:
     def course(self) -> Course | None:
         """The trajectory that was put out last, to tell what becomes of it; None after others."""
         return self._commands.courses.current
+
+    def plain_targets(self, wire: JointWire) -> PlainTargets:
+        """A shorter way for the settled messages of a topic; each is to be offered there first."""
+        return PlainTargets(self._commands, *self._plain, wire)
+
+    def plain_readings(self, wire: JointWire) -> PlainReadings:
+        """As `plain_targets`, for readings."""
+        return PlainReadings(self._readings, *self._plain, wire)
 
     def trajectory(
         self,
@@ -210,7 +227,7 @@ class CorrectionSession:
         tool = self._gate.tools.in_use if self._enabled else None
         return Offset(
             names=self._reference.joint_names,
-            offset=self._commands.offset if streams else self._readings.offset(now_s),
+            offset=self._commands.offset.copy() if streams else self._readings.offset(now_s),
             revision=self._gate.revision if self._enabled and not self._gate.stale else None,
             tool_revision=None if tool is None else tool.revision,
             s=self._corrector.progress(now_s),
@@ -219,6 +236,10 @@ class CorrectionSession:
     def counted(self, act: Callable[[], Answer]) -> Answer:
         """Do something for this session; a refusal is counted with its own."""
         return self._guard.counted(act)
+
+    def refuse(self, reason: Reason, detail: str) -> NoReturn:
+        """Count a refusal with the session's own, and raise it."""
+        raise self._guard.count(RefusedError(reason, detail))
 
     def status(self) -> CorrectionStatus:
         """What the session does."""
@@ -235,9 +256,9 @@ class CorrectionSession:
             tool_revision=None if tools.in_use is None else tools.in_use.revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
             stale=self._gate.stale,
-            tcp_shift_m=corrector.figures[0],
-            largest_shift=corrector.figures[1],
-            remaining_m=corrector.figures[2],
+            tcp_shift_m=float(corrector.figures[0]),
+            largest_shift=float(corrector.figures[1]),
+            remaining_m=float(corrector.figures[2]),
             held=corrector.held,
             waits=corrector.waits,
             mismatch=self._starts.mismatch,

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.blending import SPLINE_PEAK
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.memory import OUT, RESPONSE_S, Memory
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.starting import (
-    RESPONSE_S,
     Follows,
     Sent,
     Whereabouts,
@@ -22,6 +22,8 @@ from robocal_ros.sessions.correction.proposals import Motion
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+
+_AT_ONCE = np.zeros(1)
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,34 @@ class Starts:
     mismatch : why nothing is put out until `restart`; empty when nothing is wrong.
     """
 
-    def __init__(self, arm: SerialArm, config: CorrectionConfig, corrector: Corrector) -> None:
+    def __init__(
+        self, arm: SerialArm, config: CorrectionConfig, corrector: Corrector, memory: Memory
+    ) -> None:
         self._arm, self._config, self._corrector = arm, config, corrector
-        self._sent: Sent | None = None
+        self._memory = memory
+        self._noted: Sent | None = None
+        self._target: Index | None = None  # joints of the target that was put out last
         self.started = False
         self._bare = False  # the robot was seen without a correction, and none was put out since
         self.mismatch = ""
+
+    @property
+    def bare(self) -> bool:
+        """Whether the robot was seen without a correction, and none was put out since."""
+        return self._bare
+
+    @property
+    def _sent(self) -> Sent | None:
+        """What was put out last; a target lies in the memory, where those after it come too."""
+        index, memory = self._target, self._memory
+        if index is None:
+            return self._noted
+        taught, corrected = memory.goal[None, index], memory.out[None, index]
+        return Sent(index, float(memory.times[OUT]), _AT_ONCE, taught, corrected)
+
+    @_sent.setter
+    def _sent(self, sent: Sent | None) -> None:
+        self._noted, self._target = sent, None
 
     def under_way(self, now_s: float) -> bool:
         """True while the robot may be moving by what was put out last."""
@@ -183,6 +207,12 @@ class Starts:
     def _refuse_start(self, detail: str) -> RefusedError:
         self.mismatch = f"{detail}; call ~/enable when it may begin there"
         return RefusedError(Reason.START_MISMATCH, self.mismatch)
+
+    def note_target(self, index: Index) -> None:
+        """Remember that the target in the memory, of joints (k,), was put out."""
+        self.started, self._target = True, index
+        if not np.array_equal(self._memory.goal[index], self._memory.out[index]):
+            self._bare = False
 
     def note_sent(self, sent: Sent, now_s: float) -> None:
         """Remember what was put out."""

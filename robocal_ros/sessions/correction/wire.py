@@ -9,7 +9,9 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from robocal_ros.core.joint_lanes import BEGIN, lanes
 from robocal_ros.sessions.correction.inputs import JointCommand
 
 HEAD = b"\0\1\0\0"  # plain, little endian
@@ -39,6 +41,27 @@ class _Layout:
         )
 
 
+@dataclass(frozen=True)
+class Lanes:
+    """What compiled code needs to know of messages that are laid out alike.
+
+    Attributes
+    ----------
+    names, frame_id : in them.
+    form : (2, lanes) what all have, and a mask of it.
+    goes : (lanes,) room for what goes out, laid out.
+    layout : of both: see `joint_lanes`.
+    sizes : of both, bytes.
+    """
+
+    names: tuple[str, ...]
+    frame_id: str
+    form: NDArray[np.float64]
+    goes: NDArray[np.float64]
+    layout: NDArray[np.int64]
+    sizes: tuple[int, int]
+
+
 class JointWire:
     """Reads the joint messages of one topic and writes what goes out for them."""
 
@@ -47,6 +70,7 @@ class JointWire:
         self._out = bytearray()
         self._made_for: tuple[_Layout | None, str] = (None, "")
         self._places: list[int] = []
+        self._lanes: Lanes | None = None
 
     def read(self, data: bytes) -> JointCommand | None:
         """The command in a message; None for one that is not regular, finite and whole."""
@@ -72,8 +96,7 @@ class JointWire:
         layout = self._layout
         if layout is None:
             raise ValueError("no message was read")
-        if self._made_for[0] is not layout or self._made_for[1] != command.mark:
-            self._make(data, layout, command.mark)
+        self._make(layout, command.mark)
         out = self._out
         out[STAMP:FRAME] = data[STAMP:FRAME]
         effort = data[layout.places[2] : layout.places[2] + 8 * layout.counts[2][1]]
@@ -84,11 +107,40 @@ class JointWire:
             out[at : at + len(values)] = values
         return bytes(out)
 
-    def _make(self, data: bytes, layout: _Layout, mark: str) -> None:
+    def lanes(self, mark: str) -> Lanes | None:
+        """Room for messages laid out as the one read last; None after an irregular one."""
+        layout = self._layout
+        if layout is None:
+            return None
+        self._make(layout, mark)
+        if self._lanes is None:
+            self._lanes = self._in_lanes(layout)
+        return self._lanes
+
+    def _in_lanes(self, layout: _Layout) -> Lanes:
+        known, mask = bytearray(layout.size), bytearray(layout.size)
+        pieces = [(0, HEAD), (FRAME, layout.head)]
+        pieces += [(at, struct.pack("<I", count)) for at, count in layout.counts]
+        for at, piece in pieces:
+            known[at : at + len(piece)], mask[at : at + len(piece)] = piece, b"\xff" * len(piece)
+        ends = [(BEGIN + at) // 8 for at in (*layout.places, *self._places)]
+        return Lanes(
+            layout.names,
+            layout.frame_id,
+            np.stack([_in_lanes(known), _in_lanes(mask)]),
+            _in_lanes(self._out),
+            np.array([*ends, *(count for _, count in layout.counts)]),
+            (layout.size, len(self._out)),
+        )
+
+    def _make(self, layout: _Layout, mark: str) -> None:
         """Lay the outgoing message out."""
+        if self._made_for[0] is layout and self._made_for[1] == mark:
+            return
+        self._lanes = None
         text = mark.encode() + b"\0"
         out = bytearray(HEAD + bytes(8) + struct.pack("<I", len(text)) + text)
-        out += bytes(-len(out) % 4) + data[layout.names_begin : layout.names_end]
+        out += bytes(-len(out) % 4) + layout.head[layout.names_begin - FRAME :]
         self._places = []
         for _, count in layout.counts:
             out += bytes(-len(out) % 4) + struct.pack("<I", count)
@@ -97,6 +149,12 @@ class JointWire:
             self._places.append(len(out))
             out += bytes(8 * count)
         self._out, self._made_for = out, (layout, mark)
+
+
+def _in_lanes(data: bytearray) -> NDArray[np.float64]:
+    out = np.zeros(lanes(len(data)))
+    out.view(np.uint8)[BEGIN : BEGIN + len(data)] = data
+    return out
 
 
 def _number(data: bytes, at: int) -> int:
