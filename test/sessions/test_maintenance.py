@@ -26,6 +26,7 @@ from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 LONG_S = 120.0
+SMALL = ToolError(1e-4, 1.5e-4)
 
 
 @pytest.fixture
@@ -35,8 +36,8 @@ def history(tmp_path):
 
 
 @pytest.fixture
-def cell(tmp_path, history) -> Cell:
-    made = Cell(tmp_path, history)
+def cell(history) -> Cell:
+    made = Cell(history)
     made.open_gap()
     return made
 
@@ -110,8 +111,8 @@ def test_what_did_not_fit_is_resumed_in_the_next_gap(cell):
     assert thermal.count("Move") == len(POSES) - visited + 1
 
 
-def test_a_thermal_cycle_that_is_too_old_begins_anew(tmp_path, history):
-    cell = Cell(tmp_path, history, config_of(resume_within_s=5.0))
+def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
+    cell = Cell(history, config_of(resume_within_s=5.0))
     cell.open_gap()
     cell.run("c1", 15.0)
     cell.finish()
@@ -294,7 +295,7 @@ def test_worst_cases_hold(cell):
     assert cell.config.times.check_s < took < worst["tool measurement (quick)"]
 
 
-def accuracy(cell: Cell, level=AccuracyLevel.OK, error=ToolError(1e-4, 1.5e-4)):
+def accuracy(cell: Cell, level=AccuracyLevel.OK, error=SMALL):
     cell.session.drift(Drift(level, "95 % below", error, 600.0), cell.now_s)
     return cell.session.accuracy(cell.now_s, cell.wall_ns)
 
@@ -327,8 +328,8 @@ def test_a_bent_tool_degrades(cell):
     assert accuracy(cell).level is AccuracyLevel.DEGRADED
 
 
-def test_without_a_station_only_the_drift_is_measured(tmp_path, history):
-    cell = Cell(tmp_path, history, config_of(T_base_laser=None))
+def test_without_a_station_only_the_drift_is_measured(history):
+    cell = Cell(history, config_of(T_base_laser=None))
     cell.open_gap()
     cell.run("c1", LONG_S)
     assert cell.finish().complete
@@ -336,8 +337,8 @@ def test_without_a_station_only_the_drift_is_measured(tmp_path, history):
     assert accuracy(cell).level is AccuracyLevel.OK
 
 
-def test_without_poses_only_the_tool_is_measured(tmp_path, history):
-    cell = Cell(tmp_path, history, config_of(poses=np.zeros((0, CELL.arm.n))))
+def test_without_poses_only_the_tool_is_measured(history):
+    cell = Cell(history, config_of(poses=np.zeros((0, CELL.arm.n))))
     cell.open_gap()
     cell.run("c1", LONG_S)
     assert cell.finish().complete

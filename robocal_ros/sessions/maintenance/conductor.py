@@ -87,6 +87,8 @@ class Conductor:
     def _script_ended(self, run: Run) -> None:
         if away := self._hands.robot.beside_home():
             self.fault(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
+        elif self._hands.engaged:
+            self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)
         else:

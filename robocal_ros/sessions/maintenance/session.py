@@ -201,20 +201,24 @@ class MaintenanceSession:
         """How a cycle ended, or how far it is; None where it is not known."""
         return self._known(cycle_id)
 
+    @property
+    def state(self) -> State:
+        """What it is at."""
+        if self._memory.fault:
+            return State.FAULT
+        if self._conductor.run is None:
+            return State.IDLE
+        return State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
+
     def status(self, now_s: float) -> Status:
         """Everything at once."""
         memory, hands, run = self._memory, self._hands, self._conductor.run
-        state = State.IDLE
-        if memory.fault:
-            state = State.FAULT
-        elif run is not None:
-            state = State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
         last = next(reversed(memory.cycles.values()), None)
         named = last.cycle_id if last is not None else ""
         pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
         thermal, tool = (found[0].id if found else 0 for found in pending)
         return Status(
-            state=state,
+            state=self.state,
             cycle_id=named if run is None else run.result.cycle_id,
             doing=hands.doing,
             left_s=0.0 if run is None else max(hands.gap.left_s(now_s), 0.0),
