@@ -287,7 +287,7 @@ class Cell:
             raise NeverError("a step whose worst case does not fit the gap")
 
     def at_home(self) -> bool:
-        return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near_rad)
+        return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near)
 
 
 def passed() -> Answer:

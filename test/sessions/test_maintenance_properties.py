@@ -64,7 +64,7 @@ class Watched:
         cell, before = self.cell, self.cell.state
         cell.step()
         if before in BUSY and cell.state is State.IDLE:
-            near = cell.config.home_near_rad + np.max(np.abs(cell.offset))
+            near = cell.config.home_near + np.max(np.abs(cell.offset))
             assert np.max(np.abs(cell.q - HOME)) <= near, "handed over away from home"
             assert not cell.tool.armed, "handed over armed"
         fresh = cell.heard and cell.now_s - cell.beat_s <= STALE_S

@@ -70,6 +70,11 @@ class Hands:
         """Whether something that lasts so long at the most, way home included, fits the gap."""
         return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
 
+    def handed_out(self) -> list[Request]:
+        """The requests that wait; they are somebody else's now."""
+        found, self.out = self.out, []
+        return found
+
     # ---- requests -------------------------------------------------------------------------------
 
     def request(self, kind: Callable[..., Request], *given: Any) -> int:

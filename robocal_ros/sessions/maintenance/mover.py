@@ -65,14 +65,15 @@ class Mover:
         if self._q is None or self.silent:
             return "joint states are missing"
         away = np.abs(self._q - self._config.home)
-        joint = int(np.argmax(away))
-        if away[joint] <= self._config.home_near_rad:
+        near = np.broadcast_to(self._config.home_near, away.shape)
+        joint = int(np.argmax(away / near))
+        if away[joint] <= near[joint]:
             return ""
-        near, name = self._config.home_near_rad, self._arm.joint_names[joint]
-        if self._arm.prismatic[joint]:
-            return f"{name} is {away[joint] * 1e3:.1f} mm off (allowed {near * 1e3:.1f} mm)"
-        degrees = np.degrees([away[joint], near])
-        return f"{name} is {degrees[0]:.2f} deg off (allowed {degrees[1]:.2f} deg)"
+        prismatic = self._arm.prismatic[joint]
+        unit, scale = ("mm", 1e3) if prismatic else ("deg", np.degrees(1.0))
+        found, allowed = scale * away[joint], scale * near[joint]
+        name = self._arm.joint_names[joint]
+        return f"{name} is {found:.2f} {unit} off (allowed {allowed:.2f} {unit})"
 
     def resting(self, span_s: float) -> Array | None:
         """The joints where the robot has rested for so long; None while it moves, or is silent."""

@@ -183,8 +183,13 @@ class MaintenanceSession:
         hands.now_s = now_s
         hands.robot.look(now_s)
         self._conductor.tick(wall_ns)
-        found, hands.out = hands.out, []
-        return found
+        return hands.handed_out()
+
+    def give_up(self, reason: str, now_s: float) -> list[Request]:
+        """The driver goes: stop and disarm, to be carried out at once; a fault unless at home."""
+        self._hands.now_s = now_s
+        self._conductor.give_up(reason)
+        return self._hands.handed_out()
 
     # ---- what is said ---------------------------------------------------------------------------
 
@@ -200,6 +205,12 @@ class MaintenanceSession:
     def result(self, cycle_id: str) -> CycleResult | None:
         """How a cycle ended, or how far it is; None where it is not known."""
         return self._known(cycle_id)
+
+    @property
+    def running(self) -> CycleResult | None:
+        """The cycle that runs, as far as it has come."""
+        run = self._conductor.run
+        return None if run is None else run.result
 
     @property
     def state(self) -> State:
