@@ -58,7 +58,7 @@ class MaintenanceNode(HouseNode):
         super().__init__(**options)
         self._session: MaintenanceSession | None = None
         self._history: CalibrationHistory | None = None
-        self._services: MaintenanceServices | None = None
+        self._calls: MaintenanceServices | None = None
         self._driver: MaintenanceDriver | None = None
 
     def configure(self) -> None:
@@ -73,7 +73,7 @@ class MaintenanceNode(HouseNode):
             self.add_output, self._nominal.name, self._serial_in_use, settings["base_frame"]
         )
         self._driver = MaintenanceDriver(self, self._nominal.joint_names, self._answered)
-        self._services = MaintenanceServices(
+        self._calls = MaintenanceServices(
             self, self._running, self._clocks, self._outputs, settings["default_gap_s"]
         )
         self._guard = SourceGuard(self, JOINTS)
@@ -102,17 +102,17 @@ class MaintenanceNode(HouseNode):
         """Stop what moves, disarm, and end the session."""
         if self._session is not None:
             self._carry_out(self._session.give_up("the node was deactivated", time.monotonic()))
-        if self._services is not None:
-            self._services.break_off("the node was deactivated")
+        if self._calls is not None:
+            self._calls.break_off("the node was deactivated")
         self._session = None
 
     def cleanup(self) -> None:
         """Take action and clients down, close the history."""
         self._session = None
-        for part in (self._services, self._driver, self._history):
+        for part in (self._calls, self._driver, self._history):
             if part is not None:
                 part.close()
-        self._services = self._driver = self._history = None
+        self._calls = self._driver = self._history = None
 
     def _running(self) -> MaintenanceSession:
         if self._session is None:
@@ -185,7 +185,7 @@ class MaintenanceNode(HouseNode):
         """Say what changed; tell the callers of the action."""
         self._guard.look()
         session = self._session
-        if session is None or self._services is None:
+        if session is None or self._calls is None:
             return
         try:
             status = session.status(time.monotonic())
@@ -193,7 +193,7 @@ class MaintenanceNode(HouseNode):
             if shown != self._shown:
                 self._shown = shown
                 self._outputs.status(status, self.now_ns())
-            self._services.look(status)
+            self._calls.look(status)
         except RobocalError as error:  # the history cannot be read: tried again
             self.get_logger().error(str(error), throttle_duration_sec=5.0)
 

@@ -73,6 +73,7 @@ SETTINGS = (
     *MOTION,
     _time("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 86400.0),
     _time("gap_stale_s", 0.5, "gap_open may pause for so long", 0.5, 0.05),
+    _time("late_s", 0.3, "The robot lags at most so far behind its trajectory", 1.0),
     _time("reserve_s", 1.0, "Kept free before the end of a gap", 60.0),
     Setting("measurements", 1, "So many measurements make a pose measured", low=1, high=1000),
     _time("settle_s", 0.3, "A measurement counts so long after the robot stands", 10.0),

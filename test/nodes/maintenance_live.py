@@ -17,6 +17,7 @@ from shift import BALL, NOISE_M, T_SENSOR_BASE, warmed
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.core.kinematics.inverse import inverse
 from robocal_ros.core.motion.cell import MotionCell
 from robocal_ros.core.motion.housing import Housing, ToolBody
 from robocal_ros.core.motion.limits import MotionLimits
@@ -27,7 +28,19 @@ from robocal_ros.nodes.motion_settings import trajectory_message
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.storage.robots import load_robot
 
-HOME_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]
+START_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]  # of cell_sim_node, over its station
+RAISED_M = 0.08
+
+
+def raised_home() -> list[float]:
+    """Higher than the start, so that the ways from there are clear of the housing."""
+    arm, q = load_robot("ur10"), np.radians(START_DEG)
+    way = np.tile(arm.fk(q), (11, 1, 1))
+    way[:, 2, 3] += np.linspace(0.0, RAISED_M, 11)
+    return np.degrees(inverse(arm, way, q)[-1]).tolist()
+
+
+HOME_DEG = raised_home()
 OFFSETS_DEG = [
     [25.0, 10, 0, 0, 0, 0],
     [35.0, 10, 15, -10, 20, 15],
@@ -69,7 +82,7 @@ class LiveCell:
         graph.probe.create_timer(BEAT_S, self._beat)
         graph.probe.create_timer(SENSE_S, self._sense)
         csv, laser = folder / "beams.csv", folder / "laser.yaml"
-        simulated = {"laser_csv": str(csv), "seed": 7} | faults
+        simulated = {"laser_csv": str(csv), "seed": 7, "q_start_deg": yaml_list(HOME_DEG)} | faults
         graph.start("cell_sim_node", simulated, {"joint_trajectory": ROBOT})
         graph.spin_until(lambda: self.joints and csv.exists(), "the cell")
         robocal_json(
@@ -90,12 +103,13 @@ class LiveCell:
         self.states.clear()
         poses = ", ".join(f"'{' '.join(f'{x:.4f}' for x in pose)}'" for pose in POSES_DEG)
         settings = self.tool | {
+            "late_s": 1.0,  # beside other work on the machine
             "home_deg": yaml_list(HOME_DEG),
             "measuring_poses_deg": f"[{poses}]",
         }
         out = {"~/joint_trajectory": ROBOT}
         self.node = self.graph.start("maintenance_node", settings | changes, out)
-        self.graph.spin_until(lambda: self.statuses and self.states, "the maintenance node")
+        self.graph.spin_until(lambda: self.statuses and self.states, "the maintenance node", 30.0)
         self.graph.spin_for(1.0)
 
     # ---- sensor and PLC -------------------------------------------------------------------------

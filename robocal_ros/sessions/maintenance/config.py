@@ -42,6 +42,7 @@ class Times:
     check_s, full_s : a quick check and a full measurement of the tool, from home to its end.
     tool_home_s : kept free for the way home from the beams.
     reserve_s : kept free before the end of a gap.
+    late_s : the robot lags at most so far behind its plan.
     stale_s : ``gap_open`` may pause for so long.
     """
 
@@ -54,6 +55,7 @@ class Times:
     full_s: float = 60.0
     tool_home_s: float = 20.0
     reserve_s: float = 1.0
+    late_s: float = 0.3
     stale_s: float = 0.5
 
     def __post_init__(self) -> None:
