@@ -13,7 +13,7 @@ from robocal_msgs.action import RunMaintenance
 from robocal_msgs.msg import AccuracyState, MaintenanceStatus, SessionEvent
 from robocal_msgs.srv import CaptureReference
 from sensor_msgs.msg import JointState
-from shift import BALL, NOISE_M, T_SENSOR_BASE, warmed
+from shift import BALL, NOISE_M, T_SENSOR_BASE
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
@@ -67,7 +67,6 @@ class LiveCell:
     def __init__(self, graph: Any, folder: Path, **faults: Any) -> None:
         self.graph = graph
         self.arm = load_robot("ur10")
-        self.true = self.arm  # of the moment; the sphere sensor sees it
         self.rng = np.random.default_rng(2)
         self.is_open = self.beating = self.sensing = True
         self.joints: list[JointState] = []
@@ -129,16 +128,12 @@ class LiveCell:
         q = np.array([message.position for message in recent])
         if np.max(np.ptp(q, axis=0)) > 1e-5:
             return
-        ball = (T_SENSOR_BASE @ self.true.fk(q[-1]) @ BALL)[:3]
+        ball = (T_SENSOR_BASE @ self.arm.fk(q[-1]) @ BALL)[:3]
         message = PointStamped()
         message.header.stamp, message.header.frame_id = recent[-5].header.stamp, "sensor/ball"
         place = ball + NOISE_M * self.rng.normal(size=3)
         message.point.x, message.point.y, message.point.z = place.tolist()
         self.sphere.publish(message)
-
-    def warm_up(self, kelvin: float) -> None:
-        """The robot's links grow."""
-        self.true = warmed(self.arm, kelvin)
 
     @property
     def q(self) -> np.ndarray:
