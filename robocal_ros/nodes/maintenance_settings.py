@@ -1,7 +1,7 @@
 """Parameters of the maintenance node."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +73,19 @@ SETTINGS = (
     *MOTION,
     _time("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 86400.0),
     _time("gap_stale_s", 0.5, "gap_open may pause for so long", 0.5, 0.05),
+    _time("joint_silence_s", 0.1, "Joint states may pause so long in a motion", 0.5, 0.02),
+    _time("rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 10.0, 0.1),
     _time("late_s", 0.3, "The robot lags at most so far behind its trajectory", 1.0),
     _time("reserve_s", 1.0, "Kept free before the end of a gap", 60.0),
     Setting("measurements", 1, "So many measurements make a pose measured", low=1, high=1000),
     _time("settle_s", 0.3, "A measurement counts so long after the robot stands", 10.0),
     _time("stay_s", 0.2, "The robot stays so long after the last measurement of a pose", 10.0),
     _time("measure_s", 3.0, "The longest time at a pose", 600.0),
-    _time("answer_s", 2.0, "Another node answers within", 60.0, 0.1),
+    _time("answer_s", 1.0, "Another node answers within", 60.0, 0.1),
     _time("solve_s", 6.0, "thermal_node ends a cycle within", 600.0, 0.1),
-    _time("check_s", 30.0, "A quick check takes at the most", 600.0, 1.0),
-    _time("full_s", 60.0, "A full tool measurement takes at the most", 3600.0, 1.0),
-    _time("tool_home_s", 20.0, "Kept free for the way home from the beams", 600.0, 0.1),
+    _time("check_s", 15.0, "A quick check takes at the most", 600.0, 1.0),
+    _time("full_s", 30.0, "A full tool measurement takes at the most", 3600.0, 1.0),
+    _time("tool_home_s", 10.0, "Kept free for the way home from the beams", 600.0, 0.1),
     _time(
         "resume_within_s",
         240.0,
@@ -156,7 +158,7 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
     InputError
         When a value makes no sense, or the laser file cannot be read.
     """
-    driving = driving_config(settings)
+    driving = replace(driving_config(settings), silence_s=settings["joint_silence_s"])
     require_limits(arm, driving)
     poses = [_pose(arm, text, i) for i, text in enumerate(settings["measuring_poses_deg"], start=1)]
     laser = settings["laser"]

@@ -64,7 +64,6 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Pat
     graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
     graph.spin_for(0.5)
     cell.is_open = False
-    cell._beat()
     graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=1.0)
     assert not any(cell.sent[-1].points[-1].velocities)
     graph.spin_for(0.5)

@@ -49,6 +49,7 @@ TIMES = Times(
     full_s=8.0,
     tool_home_s=3.5,
     reserve_s=0.3,
+    rest_s=2.0,
     stale_s=STALE_S,
 )
 

@@ -42,19 +42,21 @@ class Times:
     check_s, full_s : a quick check and a full measurement of the tool, from home to its end.
     tool_home_s : kept free for the way home from the beams.
     reserve_s : kept free before the end of a gap.
+    rest_s : after a motion's end, until the robot rests where it ends.
     late_s : the robot lags at most so far behind its plan.
     stale_s : ``gap_open`` may pause for so long.
     """
 
-    answer_s: float = 2.0
+    answer_s: float = 1.0
     solve_s: float = 6.0
     settle_s: float = 0.3
     stay_s: float = 0.2
     measure_s: float = 3.0
-    check_s: float = 30.0
-    full_s: float = 60.0
-    tool_home_s: float = 20.0
+    check_s: float = 15.0
+    full_s: float = 30.0
+    tool_home_s: float = 10.0
     reserve_s: float = 1.0
+    rest_s: float = 1.0
     late_s: float = 0.3
     stale_s: float = 0.5
 

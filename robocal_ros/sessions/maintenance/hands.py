@@ -25,7 +25,7 @@ from robocal_ros.sessions.maintenance.requests import (
     Stop,
 )
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
-from robocal_ros.sessions.tool_driving import REST_WITHIN_S, SETTLED_S, STANDS_S
+from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
 
 Array = NDArray[np.float64]
 R = TypeVar("R")
@@ -185,7 +185,7 @@ class Hands:
         FaultError
             When it does not come to rest.
         """
-        until_s = self.now_s + REST_WITHIN_S
+        until_s = self.now_s + self.config.times.rest_s
         while (q := self.robot.resting(span_s)) is None:
             if self.now_s >= until_s:
                 words = "the robot does not come to rest, or its joint states are missing"

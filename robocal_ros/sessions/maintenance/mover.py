@@ -10,7 +10,6 @@ from robocal_ros.core.motion.stopping import stop
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Line, Route, Ways
 from robocal_ros.sessions.robot_watch import RobotWatch
-from robocal_ros.sessions.tool_driving import REST_WITHIN_S
 
 Array = NDArray[np.float64]
 
@@ -116,8 +115,9 @@ class Mover:
                 f"its plan (allowed {driving.deviation_m * 1e3:.1f} mm, "
                 f"{np.degrees(driving.deviation_rad):.2f} deg)",
             )
-        if self._watch.overdue_s(now_s) > REST_WITHIN_S:
-            words = f"the motion ended {REST_WITHIN_S:g} s ago, but the robot is not where it ends"
+        rest_s = self._config.times.rest_s
+        if self._watch.overdue_s(now_s) > rest_s:
+            words = f"the motion ended {rest_s:g} s ago, but the robot is not where it ends"
             raise FaultError(Code.LIMIT_EXCEEDED, words)
 
     def stop(self, now_s: float) -> JointPlan | None:
