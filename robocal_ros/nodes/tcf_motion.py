@@ -4,10 +4,11 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import ConflictError, InputError
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
@@ -20,19 +21,32 @@ from robocal_ros.nodes.motion_settings import (
     require_limits,
     trajectory_message,
 )
-from robocal_ros.nodes.parameters import length
+from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.maintenance.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import ToolDriver
+from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 
 TICK_S = 0.01
 
 
-SETTINGS = (*MOTION, length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0))
+SETTINGS = (
+    *MOTION,
+    length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
+    Setting(
+        "gap_stale_s",
+        0.0,
+        "Nothing moves unless gap_open is true and no older; 0: it is not listened to",
+        unit="s",
+        low=0.0,
+        high=0.5,
+    ),
+)
+GAP_OPEN = "gap_open"
 
 
 class TcfMotion:
-    """``~/arm`` and ``~/joint_trajectory``.
+    """``~/arm`` and ``~/joint_trajectory``, and ``gap_open`` where it is listened to.
 
     Parameters
     ----------
@@ -51,6 +65,10 @@ class TcfMotion:
         self._names: tuple[str, ...] = ()
         self.driver: ToolDriver | None = None
         self._output = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
+        stale_s = settings["gap_stale_s"]
+        self._gap = Gap(stale_s) if stale_s > 0.0 else None
+        if self._gap is not None:
+            node.add_input(Bool, GAP_OPEN, self._take_gap, qos.RELIABLE)
         node.add_service(SetBool, "~/arm", self._arm)
         node.add_timer(TICK_S, self._tick, steady=True)
 
@@ -103,17 +121,35 @@ class TcfMotion:
         if self.driver is not None and outcome.document is None:
             self.driver.run_failed(outcome.message, time.monotonic())
 
+    def _take_gap(self, message: Any) -> None:
+        if self._gap is not None:
+            self._gap.heard(message.data, time.monotonic())
+            self._tick()
+
+    def _closed(self, now_s: float) -> str:
+        """Why nothing may move, where somebody says so."""
+        return "" if self._gap is None else self._gap.closed(now_s)
+
     def _tick(self) -> None:
-        if self.driver is not None:
-            self.driver.tick(time.monotonic())
+        if self.driver is None:
+            return
+        now_s = time.monotonic()
+        if (self.driver.armed or self.driver.phase is not Phase.IDLE) and (
+            why := self._closed(now_s)
+        ):
+            self.driver.disarm(why, now_s)
+        self.driver.tick(now_s)
 
     def _arm(self, request: Any, response: Any) -> Any:
         if self.driver is None:
             raise NotActiveError("no session: activate the node")
+        now_s = time.monotonic()
+        if request.data and (why := self._closed(now_s)):
+            raise ConflictError(f"{why}: nothing may move")
         if request.data:
-            self.driver.arm(time.monotonic())
+            self.driver.arm(now_s)
         else:
-            self.driver.disarm("disarmed by a call", time.monotonic())
+            self.driver.disarm("disarmed by a call", now_s)
         response.success = True
         seconds = f"{self._config.armed_s:g} s"
         response.message = (

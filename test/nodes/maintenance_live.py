@@ -92,7 +92,9 @@ class LiveCell:
         )  # fmt: skip
         self.tool = {"laser": str(laser), "taught_xyz_mm": "[0.0, 0.0, 150.0]", "serial": SERIAL}
         out = {"~/joint_trajectory": ROBOT}
-        self.tcf = graph.start("tcf_node", self.tool | {"motion": "trajectory"}, out)
+        self.tcf = graph.start(
+            "tcf_node", self.tool | {"motion": "trajectory", "gap_stale_s": 0.5}, out
+        )
         self.thermal = graph.start(
             "thermal_node", {"robot": "ur10", "serial": SERIAL, "sphere_radius_mm": 19.05}
         )

@@ -110,7 +110,7 @@ def test_calls_are_answered_at_once_while_the_robot_moves(graph: Any, tmp_path: 
         assert took_s < 0.25, name
     for name, words in {
         "run_trigger": "0 ACCEPT cycle 'c1' runs already",
-        "status_trigger": "0 NONE tool measurement",
+        "status_trigger": "0 NONE ",
         "accept_trigger": "0 CONFLICT one candidate must wait",
         "rollback_trigger": "0 BAD_INPUT nothing was accepted",
         "acknowledge_trigger": "0 ACCEPT there is no fault",
@@ -127,3 +127,19 @@ def test_calls_are_answered_at_once_while_the_robot_moves(graph: Any, tmp_path: 
     assert cell.statuses[-1].last.code == Code.CONFLICT
     assert cell.at_home()
     assert np.max(np.abs(cell.sent[-1].points[-1].velocities)) == 0.0
+
+
+def test_the_tool_node_stops_at_the_gaps_end_without_this_node(graph: Any, tmp_path: Path) -> None:
+    cell = LiveCell(graph, tmp_path)
+    cell.begin("c1", GAP_S)
+    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
+    cell.node.kill()
+    graph.spin_for(0.3)
+    cell.is_open = False
+    graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=1.5)
+    graph.spin_for(0.5)
+    assert cell.stands(1.0)
+    cell.start_maintenance()
+    assert cell.statuses[-1].state == MaintenanceStatus.FAULT
+    assert "see where the robot is" in cell.statuses[-1].fault
+    graph.spin_until(lambda: cell.statuses[-1].disarmed, "it is disarmed")
