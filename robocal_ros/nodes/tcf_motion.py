@@ -23,7 +23,7 @@ from robocal_ros.nodes.motion_settings import (
 )
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.maintenance.gap import Gap
+from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 

@@ -259,6 +259,17 @@ def test_a_restart_in_the_middle_of_a_run_is_a_fault(cell):
     assert cell.state is State.FAULT
 
 
+def test_after_a_restart_the_tool_node_is_disarmed_before_anything_else(cell):
+    until_moving(cell, "tool")
+    cell.restart()
+    assert not cell.session.status(cell.now_s).disarmed
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
+    cell.pass_time(0.5)
+    assert cell.session.status(cell.now_s).disarmed
+    assert not cell.tool.armed
+
+
 def test_calls_that_make_no_sense_are_refused(cell):
     for gap_s in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(InputError, match="gap of"):

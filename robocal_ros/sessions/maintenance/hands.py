@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, LimitError
+from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
-from robocal_ros.sessions.maintenance.gap import Gap
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
 from robocal_ros.sessions.maintenance.requests import (
     Answer,
