@@ -123,8 +123,10 @@ class MaintenanceNode(HouseNode):
 
     def _take_joints(self, message: Any) -> None:
         session = self._session
-        if session is None or self._guard.fault_at(self.inputs[JOINTS].received - 1):
+        if session is None:
             return
+        if fault := self._guard.fault_at(self.inputs[JOINTS].received - 1):
+            raise InputError(fault)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
         session.reading(sample.stamp_ns / NS, q, time.monotonic())

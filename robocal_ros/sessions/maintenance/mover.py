@@ -107,7 +107,7 @@ class Mover:
             words = f"joint states are silent for {self._watch.silent_s:.2f} s"
             raise FaultError(Code.TOO_FEW_SAMPLES, f"{words} while the robot moves")
         tip_m, joint_rad = self._watch.away()
-        if not self._kept():
+        if not self._kept(tip_m, joint_rad):
             driving = self._config.driving
             raise FaultError(
                 Code.LIMIT_EXCEEDED,
@@ -124,7 +124,7 @@ class Mover:
         """The stop of what moves, None where nothing does."""
         if self._route is None or not self._watch.heard:
             return None
-        state = self._watch.state(now_s, keeps=self._kept())
+        state = self._watch.state(now_s, keeps=self._kept(*self._watch.away()))
         self.place = self._route.line_at(now_s - self._sent_s)
         if self.place == (STATION[0], HOME):
             self.place = STATION
@@ -132,7 +132,6 @@ class Mover:
         self._watch.forget()
         return stop(self._arm, self._config.driving.limits, *state)
 
-    def _kept(self) -> bool:
-        tip_m, joint_rad = self._watch.away()
+    def _kept(self, tip_m: float, joint_rad: float) -> bool:
         driving = self._config.driving
         return tip_m <= driving.deviation_m and joint_rad <= driving.deviation_rad
