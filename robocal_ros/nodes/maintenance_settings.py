@@ -1,7 +1,7 @@
 """Parameters of the maintenance node."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +73,7 @@ SETTINGS = (
     *MOTION,
     _time("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 86400.0),
     _time("gap_stale_s", 0.5, "gap_open may pause for so long", 0.5, 0.05),
-    _time("joint_silence_s", 0.1, "Joint states may pause so long in a motion", 0.5, 0.02),
     _time("rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 10.0, 0.1),
-    _time("late_s", 0.3, "The robot lags at most so far behind its trajectory", 1.0),
     _time("reserve_s", 1.0, "Kept free before the end of a gap", 60.0),
     Setting("measurements", 1, "So many measurements make a pose measured", low=1, high=1000),
     _time("settle_s", 0.3, "A measurement counts so long after the robot stands", 10.0),
@@ -158,7 +156,7 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
     InputError
         When a value makes no sense, or the laser file cannot be read.
     """
-    driving = replace(driving_config(settings), silence_s=settings["joint_silence_s"])
+    driving = driving_config(settings)
     require_limits(arm, driving)
     poses = [_pose(arm, text, i) for i, text in enumerate(settings["measuring_poses_deg"], start=1)]
     laser = settings["laser"]

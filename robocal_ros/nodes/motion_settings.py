@@ -52,6 +52,22 @@ MOTION = (
         low=0.01,
         high=10.0,
     ),
+    Setting(
+        "motion_silence_s",
+        0.1,
+        "Joint states may pause for so long while the robot moves",
+        unit="s",
+        low=0.02,
+        high=0.5,
+    ),
+    Setting(
+        "motion_late_s",
+        0.15,
+        "The robot lags at most so far behind its trajectory",
+        unit="s",
+        low=0.01,
+        high=1.0,
+    ),
 )
 
 
@@ -83,6 +99,8 @@ def driving_config(settings: Mapping[str, Any], **plunge: float) -> DrivingConfi
         ),
         deviation_m=settings["deviation_mm"] * 1e-3,
         deviation_rad=float(np.radians(settings["deviation_deg"])),
+        silence_s=settings["motion_silence_s"],
+        late_s=settings["motion_late_s"],
     )
 
 

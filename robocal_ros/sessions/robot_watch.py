@@ -16,8 +16,7 @@ Array = NDArray[np.float64]
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 REST_RAD = 1e-4  # a robot that rests moves less
 BACK_S = 1.0  # stamps that go back by more began anew
-LATE_S = 0.15  # a controller lags at most so far behind its trajectory
-APART_S = LATE_S / 40  # instants of the plan that a reading is compared with
+APART_S = 0.00375  # instants of the plan that a reading is compared with
 
 
 class RobotWatch:
@@ -32,7 +31,7 @@ class RobotWatch:
     silence : how long no new reading came.
     """
 
-    def __init__(self, arm: SerialArm, late_s: float = LATE_S) -> None:
+    def __init__(self, arm: SerialArm, late_s: float) -> None:
         self._arm, self._late_s = arm, late_s
         self.silence = Silence()
         self._heard_s = self._sent_s = 0.0

@@ -57,6 +57,7 @@ BEAT_S = 0.1
 SENSE_S = 0.1
 RESTS_S = 0.35
 SERIAL = "K7"
+BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6}  # a machine that has other work too
 
 
 def yaml_list(numbers: list[float]) -> str:
@@ -90,7 +91,11 @@ class LiveCell:
             "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
             "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
         )  # fmt: skip
-        self.tool = {"laser": str(laser), "taught_xyz_mm": "[0.0, 0.0, 150.0]", "serial": SERIAL}
+        self.tool = {
+            "laser": str(laser),
+            "taught_xyz_mm": "[0.0, 0.0, 150.0]",
+            "serial": SERIAL,
+        } | BUSY
         out = {"~/joint_trajectory": ROBOT}
         self.tcf = graph.start(
             "tcf_node", self.tool | {"motion": "trajectory", "gap_stale_s": 0.5}, out
@@ -106,8 +111,6 @@ class LiveCell:
         self.states.clear()
         poses = ", ".join(f"'{' '.join(f'{x:.4f}' for x in pose)}'" for pose in POSES_DEG)
         settings = self.tool | {
-            "late_s": 1.0,  # beside other work on the machine
-            "joint_silence_s": 0.5,
             "answer_s": 3.0,
             "rest_s": 2.0,
             "check_s": 30.0,

@@ -43,7 +43,6 @@ class Times:
     tool_home_s : kept free for the way home from the beams.
     reserve_s : kept free before the end of a gap.
     rest_s : after a motion's end, until the robot rests where it ends.
-    late_s : the robot lags at most so far behind its plan.
     stale_s : ``gap_open`` may pause for so long.
     """
 
@@ -57,7 +56,6 @@ class Times:
     tool_home_s: float = 10.0
     reserve_s: float = 1.0
     rest_s: float = 1.0
-    late_s: float = 0.3
     stale_s: float = 0.5
 
     def __post_init__(self) -> None:

@@ -33,7 +33,7 @@ class Mover:
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
         self._config, self._ways = config, ways
         self._arm = ways.cell.arm
-        self._watch = RobotWatch(self._arm, config.times.late_s)
+        self._watch = RobotWatch(self._arm, config.driving.late_s)
         self._q: Array | None = None
         self._route: Route | None = None
         self._sent_s = 0.0
