@@ -1,5 +1,7 @@
 """A maintenance run in gaps of all lengths, with everything that may go wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from maintenance_cell import (
@@ -11,6 +13,7 @@ from maintenance_cell import (
     SILENT,
     SLOW,
     STALE_S,
+    TIMES,
     Cell,
     bent,
     config_of,
@@ -337,6 +340,12 @@ def test_a_bent_tool_degrades(cell):
     cell.run("c1", 33.0)
     cell.finish()
     assert accuracy(cell).level is AccuracyLevel.DEGRADED
+
+
+def test_a_time_that_is_too_short_for_the_way_home_is_refused(history):
+    """From 100 mm above at 50 mm/s it takes more than two seconds."""
+    with pytest.raises(InputError, match="tool_home_s = 2 s"):
+        Cell(history, config_of(times=replace(TIMES, tool_home_s=2.0)))
 
 
 def test_without_a_station_only_the_drift_is_measured(history):
