@@ -24,8 +24,9 @@ def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
     assert first.success, first.message
     result = first.result
     assert result.complete, first.message
-    # In seconds nothing has drifted: what was found says so.
-    assert result.thermal_code == Code.NO_SIGNIFICANT_GAIN, first.message
+    # In seconds nothing has drifted: the model in force stays, whatever the noise says.
+    stays = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
+    assert result.thermal_code in stays, first.message
     assert (result.thermal_id > 0, result.tool_code) == (True, Code.ACCEPT), first.message
     assert result.tool_answer == MeasureTool.Result.RECALIBRATE
     assert cell.at_home()
@@ -38,7 +39,7 @@ def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
     assert status.state.tool_pending == result.tool_id
     assert status.result == result
     refused = graph.call(Decide, "/maintenance_node/accept", id=result.thermal_id, by="plc")
-    assert (refused.success, refused.status) == (False, Code.NO_SIGNIFICANT_GAIN)
+    assert (refused.success, refused.status) == (False, result.thermal_code)
     for _ in range(2):
         answer = graph.call(Decide, "/maintenance_node/accept", id=result.tool_id, by="plc")
         assert (answer.success, answer.revision) == (True, 1), answer.message
