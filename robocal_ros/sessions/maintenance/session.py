@@ -261,7 +261,8 @@ class MaintenanceSession:
         return self._memory.cycles.get(cycle_id)
 
     def _decided(self, outcome: Outcome) -> None:
-        self._record(outcome.command, outcome)
+        if not outcome.repeated:
+            self._record(outcome.command, outcome)
 
     def _tell(self, name: str, arguments: dict[str, object], code: Code, words: str) -> None:
         command = Command(name, arguments)
