@@ -1,5 +1,6 @@
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
+import time
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,12 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
@@ -145,6 +149,38 @@ def test_twins_of_a_plc_without_arguments(plc, graph):
     for name in ("accept", "reject", "rollback"):
         for number in (0, 99):
             assert plc.call(Decide, name, id=number).status == Code.BAD_INPUT
+
+
+def candidates(graph: Any, count: int) -> list[int]:
+    """Thermal candidates that other nodes proposed, all against the nominal model."""
+    arm = load_robot("ur10")
+    with CalibrationHistory.open("K7", model_hash=arm.model_hash, state_dir=graph.state) as history:
+        return [
+            history.propose(
+                Proposal(
+                    model_hash=arm.model_hash, based_on=0, cycle_id=f"c{i}", stamp_ns=i,
+                    created_ns=i, software="test", method="map", code=Code.ACCEPT, reason="better",
+                    document={}, model=model_document(arm),
+                )
+            )
+            for i in range(count)
+        ]  # fmt: skip
+
+
+def test_decisions_by_id_are_quick_and_stale_ones_are_told(plc, graph):
+    first, second, third = candidates(graph, 3)
+    took_s = []
+    for number, status in ((second, Code.ACCEPT), (second, Code.ACCEPT), (first, Code.STALE)):
+        begin = time.monotonic()
+        answer = plc.call(Decide, "accept", id=number, by="plc")
+        took_s.append(time.monotonic() - begin)
+        assert answer.status == status, answer.message
+        assert answer.revision == (1 if answer.success else 0)
+    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait, found none")
+    assert plc.call(Decide, "reject", id=third, by="plc").success
+    assert plc.trigger("rollback").startswith("0 ACCEPT revision 2: the nominal model in force")
+    print("accept:", [f"{1e3 * took:.1f} ms" for took in took_s[1:]])
+    assert max(took_s[1:]) < 0.5  # the first one has to find the service
 
 
 @pytest.mark.parametrize(
