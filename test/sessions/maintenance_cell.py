@@ -1,6 +1,7 @@
 """A simulated robot with a thermal and a tool node that may fail in any way, under one session."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -214,6 +215,7 @@ class Cell:
             self._require_allowed(request)
         if isinstance(request, ask.Move):
             self._require_fit(request)
+            self._require_taught(request.plan)
         match request:
             case ask.Move() | ask.Stop():
                 self.coming.append((self.now_s + LAG_S, request.plan))
@@ -286,6 +288,19 @@ class Cell:
             raise NeverError("a motion that does not fit the gap with the way home")
         if request.worst_s < plan.duration_s or self.now_s + request.worst_s > self.ends_s:
             raise NeverError("a step whose worst case does not fit the gap")
+
+    def _require_taught(self, plan: JointPlan) -> None:
+        """A way to a pose follows the taught lines, all of it."""
+        if np.max(np.abs(plan.q[-1] - HOME)) < 1e-9:
+            return
+        points = np.vstack([HOME, self.config.poses, HOME])
+        beside = np.full(len(plan.q), np.inf)
+        for start, end in pairwise(points):
+            share = np.clip((plan.q - start) @ (end - start) / np.sum((end - start) ** 2), 0.0, 1.0)
+            away = np.max(np.abs(start + share[:, None] * (end - start) - plan.q), axis=1)
+            beside = np.minimum(beside, away)
+        if np.max(beside) > self.config.home_near + 1e-6:
+            raise NeverError("a way that nobody taught")
 
     def at_home(self) -> bool:
         return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near)

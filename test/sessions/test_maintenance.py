@@ -26,6 +26,7 @@ from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 LONG_S = 120.0
@@ -185,8 +186,26 @@ def test_a_cancelled_run_goes_home(cell, which):
     over(cell)
 
 
-@pytest.mark.parametrize("which", ["thermal", "tool"])
-def test_a_tool_node_that_never_confirms_is_a_fault(cell, which):
+def test_after_a_fault_the_ways_begin_at_home_again(cell):
+    """Stopped between the first and the second pose, and brought home by hand."""
+    cell.run("c1", LONG_S)
+    while kinds(cell).count("Move") < 2:
+        cell.step()
+    cell.pass_time(0.4)
+    cell.is_open = False
+    cell.pass_time(1.5)
+    assert cell.state is State.FAULT
+    cell.motion = JointMotion(HOME)
+    cell.open_gap()
+    cell.pass_time(0.5)
+    cell.session.acknowledge("me")
+    assert cell.session.status(cell.now_s).doing == ""
+    cell.run("c2", LONG_S)
+    assert cell.finish().complete
+    over(cell)
+
+
+def test_a_tool_node_that_never_confirms_is_a_fault(cell):
     cell.services["disarm"] = SILENT
     cell.run("c1", LONG_S)
     result = cell.finish()

@@ -118,7 +118,7 @@ class Watched:
         assert cell.state not in BUSY
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(services, st.booleans(), st.floats(5.0, 70.0), st.lists(st.tuples(waits, happenings)))
 def test_nothing_that_must_not_be(broken, right, gap_s, happening):
     with (

@@ -27,7 +27,7 @@ from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
-from robocal_ros.sessions.maintenance.ways import Ways
+from robocal_ros.sessions.maintenance.ways import HOME, Ways
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 Array = NDArray[np.float64]
@@ -120,6 +120,7 @@ class MaintenanceSession:
             words = f"robot is not at home: {away}"
             self._conductor.fault(Code.LIMIT_EXCEEDED, words)
             raise LimitError(f"{words}: bring it home, then acknowledge")
+        hands.robot.place = (HOME, HOME)
         memory.begin(cycle_id)
         run = Run(cycle_id, hands, self._book, self._decider, memory, self._decided)
         run.at(wall_ns)
@@ -176,6 +177,7 @@ class MaintenanceSession:
             raise ConflictError("the tool node has not confirmed that it is disarmed: wait for it")
         words = f"acknowledged: {self._memory.fault}"
         self._memory.set_fault(Code.NONE, "")
+        self._hands.doing = ""
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words
 
