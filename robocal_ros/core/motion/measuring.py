@@ -44,16 +44,28 @@ def approach(
         Where the way passes a joint limit, the reach, a singularity, or the housing.
     """
     q = _joints(cell, q_now)
+    corners = _corners(cell, cell.T_base_tip(q), step, after_circle)
+    return along(cell, q, corners, f"way to step {step.name}")
+
+
+def along(cell: MotionCell, q: Array, corners: list[Array], name: str) -> JointPlan:
+    """Straight from pose to pose of the tip (4, 4), from joints (n,), at rest at each.
+
+    Raises
+    ------
+    LimitError
+        Where the way passes a joint limit, the reach, a singularity, or the housing.
+    """
     plans: list[JointPlan] = []
     here = cell.T_base_tip(q)
-    for number, there in enumerate(_corners(cell, here, step, after_circle), start=1):
+    for number, there in enumerate(corners, start=1):
         ride = Ride.within(
             _way(cell, here, there), cell.limits.tcp_speed_m_s, cell.limits.tcp_acceleration_m_s2
         )
         plan = cell.joints(tip_path.line(here, there, ride), q)
         share, _ = cell.demand(plan, cell.limits.tcp_speed_m_s)
         plan = plan.slower(max(share, 1.0))
-        cell.require_clear(plan, f"way to step {step.name}, part {number}")
+        cell.require_clear(plan, f"{name}, part {number}")
         plans.append(plan)
         q, here = plan.q[-1], there
     return joined(plans)
@@ -107,7 +119,16 @@ def _corners(cell: MotionCell, here: Array, step: PlannedStep, after_circle: boo
     inside = cell.housing.opening_holds(first) and cell.housing.opening_holds(last)
     if inside and after_circle and step.kind == "circle":  # both begin in one quadrant
         return [there]
-    height = max(first[2], last[2], -np.inf if inside else cell.housing.retract_m)
+    return raised_way(cell, here, there, -np.inf if inside else cell.housing.retract_m)
+
+
+def raised_way(cell: MotionCell, here: Array, there: Array, above_m: float) -> list[Array]:
+    """Poses of the tip (4, 4): up along the laser's z to ``above_m`` or the higher end, over, down.
+
+    Parts that are no way are left out; the last pose is ``there``.
+    """
+    first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
+    height = max(first[2], last[2], above_m)
     way = [_raised(cell, here, height - first[2]), _raised(cell, there, height - last[2])]
     moves = [
         a for a, b in zip(way, [here, *way], strict=False) if _way(cell, a, b) > SHORTEST_WAY_M

@@ -1,0 +1,95 @@
+"""How accurate the cell is believed to be: drift, tool and own faults in one state."""
+
+from dataclasses import dataclass
+
+from robocal_ros.core.combined_error import both_errors, offset_error
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.sessions.accuracy import Accuracy
+from robocal_ros.sessions.maintenance.config import MaintenanceConfig
+from robocal_ros.sessions.maintenance.memory import Memory, ToolRecord
+
+__all__ = ["Accuracy", "Drift", "accuracy_of"]
+
+NS = 1_000_000_000
+MM = 1e-3
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What the thermal node says of itself; ``error`` None where it is not known."""
+
+    level: AccuracyLevel
+    reason: str
+    error: ToolError | None
+    due_in_s: float
+
+
+@dataclass(frozen=True)
+class _Finding:
+    level: AccuracyLevel
+    words: str
+    error: ToolError | None
+    due_in_s: float
+
+
+def accuracy_of(
+    config: MaintenanceConfig, drift: Drift | None, memory: Memory, revision: int, wall_ns: int
+) -> Accuracy:
+    """Judge everything at once; ``drift`` None: the thermal node is silent.
+
+    ``revision``: of the tool in force. The worst part gives the level.
+    """
+    parts = []
+    if len(config.poses):
+        parts.append(_thermal(drift))
+    if config.T_base_laser is not None:
+        parts.append(_tool(config, memory.tool, revision, wall_ns))
+    error = _error([part.error for part in parts])
+    if memory.fault:
+        return Accuracy(AccuracyLevel.FAULT, f"maintenance: {memory.fault}", error)
+    if not parts:
+        return Accuracy(AccuracyLevel.FAULT, "neither measuring poses nor a laser are configured")
+    due_in_s = min(part.due_in_s for part in parts)
+    worst = max(part.level for part in parts)
+    words = "; ".join(part.words for part in parts if part.level >= worst)
+    if error is not None:
+        bound = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
+        bound += f", of {config.tolerance_m * 1e3:.2f} mm allowed"
+        if error.bound_m > config.tolerance_m and worst < AccuracyLevel.DEGRADED:
+            return Accuracy(AccuracyLevel.DEGRADED, f"drift and tool: {bound}", error, due_in_s)
+        words = f"{bound}; {words}"
+    return Accuracy(worst, words, error, due_in_s)
+
+
+def _error(errors: list[ToolError | None]) -> ToolError | None:
+    known = [error for error in errors if error is not None]
+    if not known or len(known) < len(errors):
+        return None
+    return known[0] if len(known) == 1 else both_errors(*known)
+
+
+def _thermal(drift: Drift | None) -> _Finding:
+    if drift is None:
+        return _Finding(AccuracyLevel.FAULT, "drift: the thermal node is silent", None, 0.0)
+    return _Finding(drift.level, f"drift: {drift.reason}", drift.error, drift.due_in_s)
+
+
+def _tool(config: MaintenanceConfig, record: ToolRecord, revision: int, wall_ns: int) -> _Finding:
+    age_s = (wall_ns - record.wall_ns) / NS
+    due_in_s = config.tool_due_s - age_s
+    if not record.answer:
+        return _Finding(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
+    error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM)
+    when = f"checked {age_s / 60.0:.0f} min ago"
+    if record.revision != revision:
+        words = "tool: another one is in force than was checked: check it"
+        return _Finding(AccuracyLevel.DUE, words, None, 0.0)
+    if record.answer == "recalibrate":
+        words = f"tool: {record.words}: measure and accept it"
+        return _Finding(AccuracyLevel.DEGRADED, words, error, min(due_in_s, 0.0))
+    if age_s > config.tool_expires_s:
+        return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
+    if record.answer == "cannot tell" or due_in_s <= 0.0:
+        words = f"tool: {when}, {record.words}"
+        return _Finding(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))
+    return _Finding(AccuracyLevel.OK, f"tool: {when}, {record.words}", error, due_in_s)

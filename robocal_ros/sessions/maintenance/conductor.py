@@ -1,0 +1,124 @@
+"""Plays the script of a run from tick to tick, and stops everything where something is odd."""
+
+from collections.abc import Callable
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.sessions.maintenance.hands import Hands, Script
+from robocal_ros.sessions.maintenance.memory import Memory
+from robocal_ros.sessions.maintenance.mover import FaultError
+from robocal_ros.sessions.maintenance.run import Run
+
+ENDED, FAULT = "maintenance_ended", "fault"
+Tell = Callable[[str, dict[str, object], Code, str], None]
+
+
+class Conductor:
+    """The run that is open.
+
+    Parameters
+    ----------
+    tell : takes name, arguments, code and words of what happens.
+
+    Attributes
+    ----------
+    run : None while nothing runs.
+    broken : why the run is broken off; None while it goes on.
+    """
+
+    def __init__(self, hands: Hands, memory: Memory, tell: Tell) -> None:
+        self._hands, self._memory, self._tell = hands, memory, tell
+        self.run: Run | None = None
+        self.broken: tuple[Code, str] | None = None
+        self._script: Script[None] | None = None
+
+    def begin(self, run: Run) -> None:
+        """A run begins at the next tick."""
+        self.run, self._script, self.broken = run, run.script(), None
+        self._hands.doing = "begins"
+
+    def tick(self, wall_ns: int) -> None:
+        """Look after gap and robot, then go on."""
+        run, hands = self.run, self._hands
+        if run is None:
+            hands.keep_disarming()
+            return
+        run.at(wall_ns)
+        try:
+            if why := hands.gap.over(hands.now_s):
+                self._gap_over(why)
+                return
+            hands.robot.require_sane(hands.now_s)
+            if self._script is not None:
+                next(self._script)
+        except StopIteration:
+            self._script_ended(run)
+        except FaultError as error:
+            self.fault(error.code, str(error))
+        except RobocalError as error:
+            self._failed(error)
+
+    def break_off(self, code: Code, reason: str) -> None:
+        """Stop the robot, and bring it home; the run ends with this code."""
+        self._close_script()
+        self.broken = code, reason
+        self._hands.doing = "is broken off"
+        self._script = self._hands.after_break()
+
+    def fault(self, code: Code, reason: str) -> None:
+        """Stop the robot where it moves, disarm, end the run; nothing more until acknowledged."""
+        self._close_script()
+        hands, run = self._hands, self.run
+        hands.halt()
+        if hands.engaged:
+            hands.disengage()
+        self.run, hands.doing = None, "fault"
+        self._tell(FAULT, {}, code, reason)
+        self._keep(run, code, reason, fault=reason)
+
+    def _gap_over(self, why: str) -> None:
+        """At home and disarmed the run just ends; anywhere else it is a fault."""
+        hands = self._hands
+        if hands.engaged or hands.robot.moving or hands.robot.beside_home():
+            self.fault(Code.CONFLICT, f"{why}, and the robot is not handed over at home")
+        else:
+            self._end(Code.CONFLICT, why)
+
+    def _script_ended(self, run: Run) -> None:
+        if away := self._hands.robot.beside_home():
+            self.fault(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
+        elif self.broken is not None:
+            self._end(*self.broken)
+        else:
+            self._end(run.result.code, run.result.message)
+
+    def _failed(self, error: RobocalError) -> None:
+        """Something was refused in the middle of it: home, and end with its code."""
+        if self.broken is None:
+            self.break_off(error.code, str(error))
+        else:
+            self.fault(error.code, str(error))
+
+    def _end(self, code: Code, message: str) -> None:
+        self._close_script()
+        run, self.run = self.run, None
+        self._hands.doing = ""
+        self._keep(run, code, message)
+
+    def _keep(self, run: Run | None, code: Code, message: str, fault: str = "") -> None:
+        try:
+            if run is not None:
+                result = run.ended(code, message)
+                self._tell(ENDED, result.document(), code, message)
+                self._memory.end(result, code if fault else Code.NONE, fault)
+            else:
+                self._memory.set_fault(code, fault)
+        except RobocalError as error:  # what is in memory holds; it is a fault all the same
+            self._memory.fault_code = error.code
+            self._memory.fault = f"{fault}; {error}" if fault else str(error)
+
+    def _close_script(self) -> None:
+        if self._script is not None:
+            self._script.close()
+        self._script = None
+        self._hands.forget_answers()

@@ -1,0 +1,234 @@
+"""What the script of a run does with robot and nodes. Each thing waits from tick to tick.
+
+A script is a generator: it yields whenever it has to wait, and is resumed at the next tick.
+"""
+
+from collections.abc import Callable, Generator
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, LimitError
+from robocal_ros.sessions.maintenance.config import MaintenanceConfig
+from robocal_ros.sessions.maintenance.gap import Gap
+from robocal_ros.sessions.maintenance.mover import FaultError, Mover
+from robocal_ros.sessions.maintenance.requests import (
+    Answer,
+    Arm,
+    CancelMeasure,
+    Disarm,
+    Measure,
+    Move,
+    Request,
+    Stop,
+)
+from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
+from robocal_ros.sessions.tool_driving import REST_WITHIN_S, SETTLED_S, STANDS_S
+
+Array = NDArray[np.float64]
+R = TypeVar("R")
+Script = Generator[None, None, R]
+
+DISARM_AGAIN_S = 0.5
+
+
+class SilentError(ConflictError):
+    """A node did not answer in time."""
+
+
+class Hands:
+    """Robot, gap and the requests to other nodes; times of a steady clock.
+
+    Attributes
+    ----------
+    now_s : of the tick.
+    out : requests that wait to be carried out.
+    engaged : the tool's driver may be armed; only a confirmed disarm ends that.
+    measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
+    doing : what goes on, in words.
+    """
+
+    def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
+        self.config, self.ways = config, ways
+        self.robot = Mover(config, ways)
+        self.gap = Gap(config.times.stale_s)
+        self.now_s = 0.0
+        self.out: list[Request] = []
+        self.engaged = False
+        self.measured: list[float] = []
+        self.doing = ""
+        self._numbers = 0
+        self._waiting: dict[int, Answer | None] = {}
+        self._disarm_asked_s = -np.inf
+        self._disarms: set[int] = set()
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def fits(self, worst_s: float) -> bool:
+        """Whether something that lasts so long at the most, way home included, fits the gap."""
+        return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
+
+    # ---- requests -------------------------------------------------------------------------------
+
+    def request(self, kind: Callable[..., Request], *given: Any) -> int:
+        """Ask, without waiting; its number."""
+        self._numbers += 1
+        self.out.append(kind(self._numbers, *given))
+        return self._numbers
+
+    def answered(self, number: int, answer: Answer) -> None:
+        """An answer came; one that nobody waits for is none."""
+        if number in self._disarms:
+            self._disarms.discard(number)
+            self.engaged = self.engaged and not answer.done
+        if number in self._waiting:
+            self._waiting[number] = answer
+
+    def expect(self, kind: Callable[..., Request], *given: Any) -> int:
+        """Ask; `waited_for` gives the answer."""
+        number = self.request(kind, *given)
+        self._waiting[number] = None
+        return number
+
+    def waited_for(self, number: int, within_s: float, what: str) -> Script[Answer]:
+        """Wait for an answer.
+
+        Raises
+        ------
+        SilentError
+            When it does not come in time.
+        """
+        until_s = self.now_s + within_s
+        while (answer := self._waiting[number]) is None:
+            if self.now_s >= until_s:
+                del self._waiting[number]
+                raise SilentError(f"{what}: no answer within {within_s:g} s")
+            yield
+        del self._waiting[number]
+        return answer
+
+    def ask(self, within_s: float, what: str, kind: Any, *given: Any) -> Script[Answer]:
+        """Ask and wait, as `waited_for`."""
+        return (yield from self.waited_for(self.expect(kind, *given), within_s, what))
+
+    def forget_answers(self) -> None:
+        """Nobody waits any more."""
+        self._waiting.clear()
+
+    # ---- the tool's driver ----------------------------------------------------------------------
+
+    def arm(self) -> Script[Answer]:
+        """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
+        self.engaged, self.robot.place = True, STATION
+        self._disarms.clear()  # what is still to come of them was carried out before this
+        return (yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm))
+
+    def disengage(self) -> None:
+        """Break its run off and disarm it, at once; again and again until it is confirmed."""
+        self.request(CancelMeasure)
+        self._ask_disarm()
+
+    def keep_disarming(self) -> None:
+        """Ask again where nobody confirmed."""
+        if self.engaged and self.now_s >= self._disarm_asked_s + DISARM_AGAIN_S:
+            self._ask_disarm()
+
+    def disarmed(self) -> Script[None]:
+        """Wait until it is confirmed.
+
+        Raises
+        ------
+        FaultError
+            When it is not: then the robot must not be moved from here.
+        """
+        self._ask_disarm()
+        until_s = self.now_s + self.config.times.answer_s
+        while self.engaged:
+            if self.now_s >= until_s:
+                raise FaultError(Code.CONFLICT, "the tool node does not confirm that it disarmed")
+            yield
+
+    def _ask_disarm(self) -> None:
+        self._disarms.add(self.request(Disarm))
+        self._disarm_asked_s = self.now_s
+
+    def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[Answer]:
+        """Let the armed driver measure, for a limited time; a longer run is broken off.
+
+        Raises
+        ------
+        SilentError
+            When it did not end in time, and not after it was broken off either.
+        """
+        number = self.expect(Measure, mode, cycle_id)
+        until_s = self.now_s + limit_s
+        while self._waiting[number] is None and self.now_s < until_s:
+            yield
+        if self._waiting[number] is None:
+            self.disengage()
+        return (yield from self.waited_for(number, self.config.times.answer_s, f"tool, {mode}"))
+
+    # ---- motions --------------------------------------------------------------------------------
+
+    def stand(self, span_s: float = SETTLED_S) -> Script[Array]:
+        """Wait until the robot rests; its joints (n,).
+
+        Raises
+        ------
+        FaultError
+            When it does not come to rest.
+        """
+        until_s = self.now_s + REST_WITHIN_S
+        while (q := self.robot.resting(span_s)) is None:
+            if self.now_s >= until_s:
+                words = "the robot does not come to rest, or its joint states are missing"
+                raise FaultError(Code.CONFLICT, words)
+            yield
+        return q
+
+    def drive(self, route: Route, worst_s: float) -> Script[None]:
+        """Send a route and wait until it is over; supervised by the session."""
+        self.robot.start(route, self.now_s)
+        self.request(Move, route.plan, worst_s)
+        while not self.robot.arrived(self.now_s):
+            yield
+
+    def halt(self) -> None:
+        """Stop what this node moves."""
+        plan = self.robot.stop(self.now_s)
+        if plan is not None:
+            self.request(Stop, plan)
+
+    def go_home(self) -> Script[None]:
+        """Bring the robot home, from wherever this run may have left it.
+
+        Raises
+        ------
+        FaultError
+            When there is no way, or it does not fit any more.
+        """
+        if not self.robot.beside_home():
+            self.robot.place = (HOME, HOME)
+            return
+        self.doing = "on its way home"
+        q = yield from self.stand()
+        try:
+            route = self.ways.home(self.robot.place, q)
+        except LimitError as error:
+            raise FaultError(error.code, f"no way home: {error}") from error
+        duration_s, left_s = route.plan.duration_s, self.gap.left_s(self.now_s)
+        if duration_s >= left_s:
+            words = f"the way home takes {duration_s:.1f} s, {max(left_s, 0.0):.1f} s are left"
+            raise FaultError(Code.LIMIT_EXCEEDED, words)
+        yield from self.drive(route, duration_s)
+
+    def after_break(self) -> Script[None]:
+        """Stop everything, wait until it stands and is disarmed, then bring the robot home."""
+        self.halt()
+        if self.engaged:
+            self.disengage()
+            yield from self.disarmed()
+        yield from self.stand(STANDS_S)
+        yield from self.go_home()

@@ -1,0 +1,166 @@
+"""What outlives a restart: ended cycles, the last check of the tool, a fault."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Protocol
+
+from robocal_ros.core.codes import Code
+
+REMEMBERED = 200  # ended cycles
+
+
+class Keeper(Protocol):
+    """Keeps one document; whole or not at all."""
+
+    def load(self) -> Mapping[str, Any] | None:
+        """What was kept last; None before anything was."""
+
+    def save(self, document: Mapping[str, Any]) -> None:
+        """Keep it; raises a `RobocalError` when that fails."""
+
+
+@dataclass(frozen=True)
+class CycleResult:
+    """How a maintenance cycle ended, or how far it has come.
+
+    Attributes
+    ----------
+    code : ACCEPT when it ran as planned, with the robot at home; NONE while it runs.
+    complete : nothing that was due is left for the next gap; ``left`` names what is.
+    thermal_code, thermal_id : of the end of the thermal cycle; NONE where it did not end.
+    tool_code, tool_id : of the last tool measurement, and its candidate.
+    tool_answer : of the last quick check.
+    accepted : calibrations that were accepted without a person.
+    """
+
+    cycle_id: str
+    code: Code = Code.NONE
+    message: str = ""
+    complete: bool = False
+    left: tuple[str, ...] = ()
+    thermal_code: Code = Code.NONE
+    thermal_id: int = 0
+    tool_code: Code = Code.NONE
+    tool_id: int = 0
+    tool_answer: str = ""
+    accepted: tuple[int, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """Plain values; `of_document` reads them back."""
+        return asdict(self)
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "CycleResult":
+        """Read what `document` gave, also after JSON."""
+        values = dict(document)
+        for name in ("code", "thermal_code", "tool_code"):
+            values[name] = Code(values[name])
+        for name in ("left", "accepted"):
+            values[name] = tuple(values[name])
+        return cls(**values)
+
+
+@dataclass(frozen=True)
+class ToolRecord:
+    """What is known of the tool in force from its last measurement.
+
+    Attributes
+    ----------
+    answer : "pass", "recalibrate" or "cannot tell"; empty: never measured.
+    revision : of the tool that was in force then.
+    wall_ns, full_ns : when, and when it was last measured in full.
+    """
+
+    answer: str = ""
+    words: str = "the tool was never checked"
+    deviation_mm: float = 0.0
+    sigma_mm: float = 0.0
+    revision: int = 0
+    wall_ns: int = 0
+    full_ns: int = 0
+
+
+@dataclass
+class Memory:
+    """The kept state.
+
+    Attributes
+    ----------
+    fault_code, fault : what stopped the maintenance until it is acknowledged; empty: nothing.
+    running : the cycle that was open when it was kept.
+    """
+
+    keeper: Keeper
+    cycles: dict[str, CycleResult] = field(default_factory=dict)
+    tool: ToolRecord = field(default_factory=ToolRecord)
+    fault_code: Code = Code.NONE
+    fault: str = ""
+    running: str = ""
+
+    @classmethod
+    def load(cls, keeper: Keeper) -> "Memory":
+        """Read what is kept; a cycle that was open is a fault: nobody knows where the robot is.
+
+        Raises
+        ------
+        RobocalError
+            When it cannot be read.
+        """
+        document = keeper.load()
+        if document is None:
+            return cls(keeper)
+        results = [CycleResult.of_document(each) for each in document["cycles"]]
+        memory = cls(
+            keeper,
+            {result.cycle_id: result for result in results},
+            ToolRecord(**document["tool"]),
+            Code(document["fault_code"]),
+            str(document["fault"]),
+            str(document["running"]),
+        )
+        if memory.running:
+            words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
+            result = CycleResult(memory.running, Code.CONFLICT, words)
+            memory.end(result, Code.CONFLICT, words)
+        return memory
+
+    def begin(self, cycle_id: str) -> None:
+        """A cycle runs from now on."""
+        self.running = cycle_id
+        try:
+            self.save()
+        except Exception:
+            self.running = ""
+            raise
+
+    def end(self, result: CycleResult, fault_code: Code = Code.NONE, fault: str = "") -> None:
+        """It has ended, for good."""
+        self.running = ""
+        self.cycles[result.cycle_id] = result
+        while len(self.cycles) > REMEMBERED:
+            del self.cycles[next(iter(self.cycles))]
+        if fault:
+            self.fault_code, self.fault = fault_code, fault
+        self.save()
+
+    def note_tool(self, **known: Any) -> None:
+        """The tool was measured."""
+        self.tool = replace(self.tool, **known)
+        self.save()
+
+    def set_fault(self, code: Code, words: str) -> None:
+        """A fault, or with NONE and no words its end."""
+        self.fault_code, self.fault = code, words
+        self.save()
+
+    def save(self) -> None:
+        """Keep all of it."""
+        self.keeper.save(
+            {
+                "cycles": [result.document() for result in self.cycles.values()],
+                "tool": asdict(self.tool),
+                "fault_code": int(self.fault_code),
+                "fault": self.fault,
+                "running": self.running,
+            }
+        )

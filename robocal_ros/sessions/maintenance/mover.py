@@ -1,0 +1,137 @@
+"""One motion of the robot at a time, supervised; whatever is odd is a reason to stop."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.motion.stopping import stop
+from robocal_ros.sessions.maintenance.config import MaintenanceConfig
+from robocal_ros.sessions.maintenance.ways import HOME, STATION, Line, Route, Ways
+from robocal_ros.sessions.robot_watch import RobotWatch
+from robocal_ros.sessions.tool_driving import REST_WITHIN_S
+
+Array = NDArray[np.float64]
+
+
+class FaultError(RobocalError):
+    """Something at which the robot must stop, and a person must look."""
+
+    def __init__(self, code: Code, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class Mover:
+    """Where the robot is, and the route that it drives; times of a steady clock.
+
+    Attributes
+    ----------
+    place : point, line or station at which it was last known to be.
+    """
+
+    def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
+        self._config, self._ways = config, ways
+        self._arm = ways.cell.arm
+        self._watch = RobotWatch(self._arm)
+        self._q: Array | None = None
+        self._route: Route | None = None
+        self._sent_s = 0.0
+        self.place: Line = (HOME, HOME)
+        self.newest_s = -np.inf  # stamp of the newest reading
+
+    def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
+        """Take joints (n,); ``stamp_s`` on their own clock."""
+        self._watch.reading(stamp_s, q, now_s)
+        self._q, self.newest_s = q, stamp_s
+
+    def look(self, now_s: float) -> None:
+        """Count silence; call it often."""
+        self._watch.silence.look(now_s)
+
+    @property
+    def moving(self) -> bool:
+        """Whether a route is under way."""
+        return self._route is not None
+
+    @property
+    def silent(self) -> bool:
+        """Whether joint states are missing."""
+        return self._watch.silent_s > self._config.driving.silence_s
+
+    def beside_home(self) -> str:
+        """Which joint is how far from home, in words; empty when the robot is there."""
+        if self._q is None or self.silent:
+            return "joint states are missing"
+        away = np.abs(self._q - self._config.home)
+        joint = int(np.argmax(away))
+        if away[joint] <= self._config.home_near_rad:
+            return ""
+        near, name = self._config.home_near_rad, self._arm.joint_names[joint]
+        if self._arm.prismatic[joint]:
+            return f"{name} is {away[joint] * 1e3:.1f} mm off (allowed {near * 1e3:.1f} mm)"
+        degrees = np.degrees([away[joint], near])
+        return f"{name} is {degrees[0]:.2f} deg off (allowed {degrees[1]:.2f} deg)"
+
+    def resting(self, span_s: float) -> Array | None:
+        """The joints where the robot has rested for so long; None while it moves, or is silent."""
+        return None if self.silent else self._watch.resting(span_s)
+
+    # ---- motions --------------------------------------------------------------------------------
+
+    def start(self, route: Route, now_s: float) -> None:
+        """A route was sent."""
+        self._route, self._sent_s = route, now_s
+        self._watch.follow(route.plan, self._ways.cell, now_s)
+
+    def arrived(self, now_s: float) -> bool:
+        """Whether the route is over, with the robot at its end."""
+        if self._route is None or not self._watch.at_end(now_s):
+            return False
+        self.place, self._route = self._route.goal, None
+        self._watch.forget()
+        return True
+
+    def require_sane(self, now_s: float) -> None:
+        """Look after a motion.
+
+        Raises
+        ------
+        FaultError
+            When joint states are silent, or the robot is not where its plan has it.
+        """
+        if self._route is None:
+            return
+        if self.silent:
+            words = f"joint states are silent for {self._watch.silent_s:.2f} s"
+            raise FaultError(Code.TOO_FEW_SAMPLES, f"{words} while the robot moves")
+        tip_m, joint_rad = self._watch.away()
+        if not self._kept():
+            driving = self._config.driving
+            raise FaultError(
+                Code.LIMIT_EXCEEDED,
+                f"the robot is {tip_m * 1e3:.1f} mm and {np.degrees(joint_rad):.2f} deg away from "
+                f"its plan (allowed {driving.deviation_m * 1e3:.1f} mm, "
+                f"{np.degrees(driving.deviation_rad):.2f} deg)",
+            )
+        if self._watch.overdue_s(now_s) > REST_WITHIN_S:
+            words = f"the motion ended {REST_WITHIN_S:g} s ago, but the robot is not where it ends"
+            raise FaultError(Code.LIMIT_EXCEEDED, words)
+
+    def stop(self, now_s: float) -> JointPlan | None:
+        """The stop of what moves, None where nothing does."""
+        if self._route is None or not self._watch.heard:
+            return None
+        state = self._watch.state(now_s, keeps=self._kept())
+        self.place = self._route.line_at(now_s - self._sent_s)
+        if self.place == (STATION[0], HOME):
+            self.place = STATION
+        self._route = None
+        self._watch.forget()
+        return stop(self._arm, self._config.driving.limits, *state)
+
+    def _kept(self) -> bool:
+        tip_m, joint_rad = self._watch.away()
+        driving = self._config.driving
+        return tip_m <= driving.deviation_m and joint_rad <= driving.deviation_rad

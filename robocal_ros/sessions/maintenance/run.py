@@ -1,0 +1,111 @@
+"""One maintenance run: thermal measurement, tool, and what became of both."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from robocal_ros.core.codes import Code
+from robocal_ros.sessions.events import ACCEPT, Outcome
+from robocal_ros.sessions.maintenance.deciding import BY, Decider
+from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
+from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
+from robocal_ros.sessions.maintenance.tool_part import ToolPart
+
+
+class Run:
+    """The script of a cycle, and its result as it grows.
+
+    Attributes
+    ----------
+    result : code NONE until it has ended.
+    wall_ns : of the tick.
+    """
+
+    def __init__(
+        self,
+        cycle_id: str,
+        hands: Hands,
+        book: CycleBook,
+        decider: Decider,
+        memory: Memory,
+        decided: Callable[[Outcome], None],
+    ) -> None:
+        self.result = CycleResult(cycle_id)
+        self._hands, self._decider, self._decided = hands, decider, decided
+        self._thermal = ThermalPart(hands, book)
+        self._tool = ToolPart(hands, decider, memory, decided)
+        self.wall_ns = 0
+        self._words: list[str] = []
+
+    def at(self, wall_ns: int) -> None:
+        """Tell the time, for what is kept."""
+        self.wall_ns = self._tool.wall_ns = wall_ns
+
+    def ended(self, code: Code, message: str) -> CycleResult:
+        """The result, at its end."""
+        self.result = replace(self.result, code=code, message=message)
+        return self.result
+
+    def script(self) -> Script[None]:
+        """Everything that fits, in its order; ends at home."""
+        if self._hands.ways.count:
+            yield from self._measure_thermal()
+        yield from self._measure_tool()
+        words = "; ".join(self._words) or "nothing was due"
+        left = self.result.left
+        self.result = replace(
+            self.result,
+            code=Code.ACCEPT,
+            complete=not left,
+            message=words + (f"; left for the next gap: {', '.join(left)}" if left else ""),
+        )
+
+    def _measure_thermal(self) -> Script[None]:
+        try:
+            answer, left = yield from self._thermal.script(self.result.cycle_id)
+        except SilentError as error:
+            answer, left = Answer(Code.CONFLICT, str(error)), ""
+            yield from self._hands.go_home()
+        if left:
+            self._left(left)
+        if answer is None:
+            return
+        self._tell(f"thermal: {answer.message}")
+        self.result = replace(self.result, thermal_code=answer.code, thermal_id=answer.candidate_id)
+        if not (answer.done and answer.candidate_id):
+            return
+        if why := self._decider.withheld(answer.candidate_id):
+            self._tell(f"thermal candidate {answer.candidate_id} waits for a decision: {why}")
+            return
+        within = "within the configured bounds"
+        done = self._decider.decide(ACCEPT, answer.candidate_id, BY, within, self.wall_ns)
+        self._decided(done)
+        self._tell(done.message)
+        if done.done:
+            self._accepted(answer.candidate_id)
+
+    def _measure_tool(self) -> Script[None]:
+        found = yield from self._tool.script(self.result.cycle_id)
+        if found.left:
+            self._left(found.left)
+        for words in (found.last.message if found.last else "", found.told):
+            if words:
+                self._tell(f"tool: {words}")
+        self.result = replace(
+            self.result,
+            tool_code=found.last.code if found.last else Code.NONE,
+            tool_id=found.candidate_id,
+            tool_answer=found.checked,
+        )
+        if found.accepted:
+            self._accepted(found.candidate_id)
+
+    def _accepted(self, calibration_id: int) -> None:
+        self.result = replace(self.result, accepted=(*self.result.accepted, calibration_id))
+
+    def _left(self, what: str) -> None:
+        self.result = replace(self.result, left=(*self.result.left, what))
+
+    def _tell(self, words: str) -> None:
+        self._words.append(words)

@@ -1,0 +1,251 @@
+"""The maintenance of a cell, without clock and ROS: what the PLC asks in, requests to others out.
+
+Whoever drives it gives what happens (`gap`, `reading`, `measured`, `answered`, `drift`) and calls
+`tick` often, at least every 20 ms; `tick` gives the requests that are to be carried out at once, in
+their order. Times ``now_s`` are of one steady clock; ``wall_ns`` is the wall clock, for records.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, InputError, LimitError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.proposals import THERMAL, TOOL
+from robocal_ros.sessions.events import ROLLBACK, Command, Outcome
+from robocal_ros.sessions.history import History
+from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift, accuracy_of
+from robocal_ros.sessions.maintenance.conductor import Conductor
+from robocal_ros.sessions.maintenance.config import MaintenanceConfig
+from robocal_ros.sessions.maintenance.deciding import Decider
+from robocal_ros.sessions.maintenance.hands import Hands
+from robocal_ros.sessions.maintenance.memory import CycleResult, Keeper, Memory
+from robocal_ros.sessions.maintenance.requests import Answer, Request
+from robocal_ros.sessions.maintenance.run import Run
+from robocal_ros.sessions.maintenance.status import State, Status
+from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
+from robocal_ros.sessions.maintenance.tool_part import ToolPart
+from robocal_ros.sessions.maintenance.ways import Ways
+from robocal_ros.sessions.tool_results import FULL, QUICK
+
+Array = NDArray[np.float64]
+
+RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
+MOST_ID = 100  # characters of a cycle's name
+
+
+class MaintenanceSession:
+    """Keeps one robot accurate in the gaps that the PLC gives.
+
+    Parameters
+    ----------
+    record : takes each command with what came of it.
+
+    Attributes
+    ----------
+    ways : the ways that the robot may take.
+    """
+
+    def __init__(
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: MaintenanceConfig,
+        keeper: Keeper,
+        record: Callable[[Command, Outcome], None] = lambda command, outcome: None,
+    ) -> None:
+        self.config, self.ways = config, Ways(nominal, config)
+        self._memory = Memory.load(keeper)
+        self._decider = Decider(nominal, history, config)
+        self._hands = Hands(config, self.ways)
+        self._book = CycleBook()
+        self._record = record
+        self._conductor = Conductor(self._hands, self._memory, self._tell)
+        self._drift: tuple[Drift, float] | None = None
+
+    # ---- what happens ---------------------------------------------------------------------------
+
+    def gap(self, is_open: bool, now_s: float) -> None:
+        """Take a heartbeat of ``gap_open``."""
+        self._hands.gap.heard(is_open, now_s)
+
+    def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
+        """Take joints (n,), in the arm's order; ``stamp_s`` on their own clock."""
+        self._hands.robot.reading(stamp_s, q, now_s)
+
+    def measured(self, stamp_s: float) -> None:
+        """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
+        self._hands.measured.append(stamp_s)
+        del self._hands.measured[:-1000]
+
+    def drift(self, drift: Drift, now_s: float) -> None:
+        """What the thermal part believes of the accuracy."""
+        self._drift = drift, now_s
+
+    def answered(self, number: int, answer: Answer) -> None:
+        """What came of a request."""
+        self._hands.answered(number, answer)
+
+    # ---- what is asked --------------------------------------------------------------------------
+
+    def run(self, cycle_id: str, gap_s: float, now_s: float, wall_ns: int) -> CycleResult:
+        """Begin a cycle; one that runs or has ended gives what it has, and nothing runs twice.
+
+        Raises
+        ------
+        RobocalError
+            When it cannot begin: CONFLICT in a fault, while another one runs, or while the gap is
+            not open; LIMIT_EXCEEDED, and a fault, where the robot is not at home; STORAGE_FAILED.
+        """
+        if not 0 < len(cycle_id) <= MOST_ID:
+            raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
+        if (known := self._known(cycle_id)) is not None:
+            return known
+        hands, memory = self._hands, self._memory
+        hands.now_s = now_s
+        if memory.fault:
+            raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
+        if (open_run := self._conductor.run) is not None:
+            raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
+        if hands.engaged:
+            raise ConflictError("the tool node has not confirmed that it is disarmed")
+        if why := hands.gap.closed(now_s):
+            raise ConflictError(f"{why}: the robot is not moved")
+        hands.gap.begin(gap_s, now_s)
+        if away := hands.robot.beside_home():
+            words = f"robot is not at home: {away}"
+            self._conductor.fault(Code.LIMIT_EXCEEDED, words)
+            raise LimitError(f"{words}: bring it home, then acknowledge")
+        memory.begin(cycle_id)
+        run = Run(cycle_id, hands, self._book, self._decider, memory, self._decided)
+        run.at(wall_ns)
+        self._conductor.begin(run)
+        words = f"cycle '{cycle_id}' begins"
+        self._tell(RUN, {"cycle_id": cycle_id, "gap_s": gap_s}, Code.ACCEPT, words)
+        return run.result
+
+    def cancel(self, reason: str) -> bool:
+        """Break the cycle off: the robot stops and is brought home; whether one ran."""
+        if self._conductor.run is None:
+            return False
+        if self._conductor.broken is None:
+            self._conductor.break_off(Code.CONFLICT, reason)
+        return True
+
+    def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
+        """Accept, reject or roll back a calibration.
+
+        Raises
+        ------
+        RobocalError
+            When it is refused; `StaleError` where another revision is in force by now.
+        """
+        outcome = self._decider.decide(name, calibration_id, by, why, wall_ns)
+        self._decided(outcome)
+        return outcome
+
+    def decide_only(self, name: str, by: str, wall_ns: int) -> Outcome:
+        """The same about the one candidate that waits; a rollback takes the last acceptance back.
+
+        Raises
+        ------
+        RobocalError
+            When there is not one; as `decide`.
+        """
+        if name != ROLLBACK:
+            return self.decide(name, self._decider.only_pending().id, by, "", wall_ns)
+        outcome = self._decider.roll_back(self._decider.last_accepted(), by, "", wall_ns)
+        self._decided(outcome)
+        return outcome
+
+    def acknowledge(self, by: str) -> str:
+        """End a fault, in words; without one nothing happens.
+
+        Raises
+        ------
+        ConflictError
+            While the tool node has not confirmed that it is disarmed.
+        """
+        if not self._memory.fault:
+            return "there is no fault"
+        if self._hands.engaged:
+            raise ConflictError("the tool node has not confirmed that it is disarmed: wait for it")
+        words = f"acknowledged: {self._memory.fault}"
+        self._memory.set_fault(Code.NONE, "")
+        self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
+        return words
+
+    def tick(self, now_s: float, wall_ns: int) -> list[Request]:
+        """Look at everything, and go on; what is to be carried out now, in this order."""
+        hands = self._hands
+        hands.now_s = now_s
+        hands.robot.look(now_s)
+        self._conductor.tick(wall_ns)
+        found, hands.out = hands.out, []
+        return found
+
+    # ---- what is said ---------------------------------------------------------------------------
+
+    def worst_cases(self) -> dict[str, float]:
+        """How long each step may take at the most, its way home included, s."""
+        thermal = ThermalPart(self._hands, self._book)
+        tool = ToolPart(self._hands, self._decider, self._memory, self._decided)
+        found = {"one measuring pose": thermal.worst_s()} if self.ways.count else {}
+        if self.config.T_base_laser is not None:
+            found |= {f"tool measurement ({mode})": tool.worst_s(mode) for mode in (QUICK, FULL)}
+        return found
+
+    def result(self, cycle_id: str) -> CycleResult | None:
+        """How a cycle ended, or how far it is; None where it is not known."""
+        return self._known(cycle_id)
+
+    def status(self, now_s: float) -> Status:
+        """Everything at once."""
+        memory, hands, run = self._memory, self._hands, self._conductor.run
+        state = State.IDLE
+        if memory.fault:
+            state = State.FAULT
+        elif run is not None:
+            state = State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
+        last = next(reversed(memory.cycles.values()), None)
+        named = last.cycle_id if last is not None else ""
+        pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
+        thermal, tool = (found[0].id if found else 0 for found in pending)
+        return Status(
+            state=state,
+            cycle_id=named if run is None else run.result.cycle_id,
+            doing=hands.doing,
+            left_s=0.0 if run is None else max(hands.gap.left_s(now_s), 0.0),
+            at_home=not hands.robot.beside_home(),
+            disarmed=not hands.engaged,
+            last=last,
+            thermal_pending=thermal,
+            tool_pending=tool,
+            fault_code=memory.fault_code,
+            fault=memory.fault,
+        )
+
+    def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
+        """How accurate the robot is believed to be with model and tool in force."""
+        drift = self._drift
+        if drift is not None and now_s - drift[1] > self.config.silent_s:
+            drift = None
+        revision = self._decider.revision(TOOL)
+        return accuracy_of(
+            self.config, None if drift is None else drift[0], self._memory, revision, wall_ns
+        )
+
+    def _known(self, cycle_id: str) -> CycleResult | None:
+        run = self._conductor.run
+        if run is not None and run.result.cycle_id == cycle_id:
+            return run.result
+        return self._memory.cycles.get(cycle_id)
+
+    def _decided(self, outcome: Outcome) -> None:
+        self._record(outcome.command, outcome)
+
+    def _tell(self, name: str, arguments: dict[str, object], code: Code, words: str) -> None:
+        command = Command(name, arguments)
+        self._record(command, Outcome(command, code, words))

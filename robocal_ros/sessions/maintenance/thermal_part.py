@@ -1,0 +1,121 @@
+"""The thermal part of a run: visit the measuring poses, end the cycle."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from robocal_ros.core.codes import Code
+from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
+from robocal_ros.sessions.maintenance.requests import Answer, BeginCycle, EndCycle
+from robocal_ros.sessions.maintenance.ways import HOME
+from robocal_ros.sessions.tool_driving import REST_WITHIN_S, STANDS_S
+
+NODE = "thermal node"
+
+
+@dataclass
+class CycleBook:
+    """The thermal cycle that is open; over several gaps where one is too short.
+
+    Attributes
+    ----------
+    id : empty: none.
+    visited : poses that are done, from 1; measured or not.
+    last_s : when the last one was.
+    """
+
+    id: str = ""
+    visited: set[int] = field(default_factory=set)
+    last_s: float = -np.inf
+
+
+class ThermalPart:
+    """Measures the drift; what does not fit is done in the next gap."""
+
+    def __init__(self, hands: Hands, book: CycleBook) -> None:
+        self._hands, self._book = hands, book
+        self._times = hands.config.times
+
+    def worst_s(self) -> float:
+        """The longest step with its way home, before it is planned: one pose."""
+        ways = self._hands.ways
+        homes = max((ways.home_s(i) for i in range(1, ways.count + 1)), default=0.0)
+        return self._step_s(ways.longest_line_s(), homes)
+
+    def script(self, cycle_id: str) -> Script[tuple[Answer | None, str]]:
+        """The answer of the cycle's end, None where it is not reached, and what is left."""
+        hands, book = self._hands, self._book
+        if hands.now_s - book.last_s > hands.config.resume_within_s:
+            book.id, book.visited = "", set()
+        todo = [i for i in range(1, hands.ways.count + 1) if i not in book.visited]
+        if todo:
+            if not hands.fits(2.0 * self._times.answer_s + self._first_s(todo[0])):
+                return None, f"thermal measurement, {len(todo)} poses"
+            begun = yield from self._begin(cycle_id)
+            if not begun.done:
+                return begun, ""
+            left = yield from self._visit(todo)
+            yield from hands.go_home()
+            if left:
+                return None, f"thermal measurement, {left} poses"
+        if not hands.fits(self._times.solve_s):
+            return None, "end of the thermal cycle"
+        return (yield from self._end()), ""
+
+    def _begin(self, cycle_id: str) -> Script[Answer]:
+        book, hands = self._book, self._hands
+        hands.doing = "thermal cycle begins"
+        name = book.id or cycle_id
+        answer = yield from hands.ask(self._times.answer_s, NODE, BeginCycle, name)
+        if answer.done:
+            book.id, book.last_s = name, hands.now_s
+        return answer
+
+    def _visit(self, todo: list[int]) -> Script[int]:
+        """How many poses did not fit."""
+        hands = self._hands
+        q = yield from hands.stand(STANDS_S)
+        for done, pose in enumerate(todo):
+            route = hands.ways.to(hands.robot.place, q, pose)
+            worst_s = self._step_s(route.plan.duration_s, hands.ways.home_s(pose))
+            if not hands.fits(worst_s):
+                return len(todo) - done
+            hands.doing = f"on its way to measuring pose {pose} of {hands.ways.count}"
+            yield from hands.drive(route, worst_s)
+            q = yield from hands.stand()
+            hands.doing = f"measuring pose {pose} of {hands.ways.count}"
+            yield from self._measured()
+            self._book.visited.add(pose)
+            self._book.last_s = hands.now_s
+        return 0
+
+    def _measured(self) -> Script[None]:
+        """Stand until the measurements are there, or their time is over."""
+        hands, times = self._hands, self._times
+        from_s = hands.robot.newest_s + times.settle_s
+        until_s = hands.now_s + times.measure_s
+        hands.measured.clear()
+        while hands.now_s < until_s:
+            fresh = [stamp for stamp in hands.measured if stamp >= from_s]
+            enough = len(fresh) >= hands.config.measurements
+            if enough and hands.robot.newest_s >= max(fresh) + times.stay_s:
+                return
+            yield
+
+    def _end(self) -> Script[Answer]:
+        book, hands = self._book, self._hands
+        hands.doing = "thermal cycle ends"
+        name, book.id, book.visited, book.last_s = book.id, "", set(), -np.inf
+        try:
+            return (yield from hands.ask(self._times.solve_s, NODE, EndCycle, name))
+        except SilentError as error:
+            return Answer(Code.CONFLICT, str(error))
+
+    def _first_s(self, pose: int) -> float:
+        ways, near = self._hands.ways, self._hands.config.home
+        route = ways.to((HOME, HOME), near, pose)
+        return STANDS_S + self._step_s(route.plan.duration_s, ways.home_s(pose))
+
+    def _step_s(self, way_s: float, home_s: float) -> float:
+        """Way, rest, measurement, way home, rest: at the most."""
+        return way_s + home_s + 4.0 * REST_WITHIN_S + self._times.measure_s

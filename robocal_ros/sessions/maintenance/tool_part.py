@@ -1,0 +1,184 @@
+"""The tool part of a run: quick check, full measurement where it is needed, verification."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.proposals import TOOL
+from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.maintenance.deciding import BY, Decider
+from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
+from robocal_ros.sessions.maintenance.memory import Memory
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.tool_driving import REST_WITHIN_S, STANDS_S
+from robocal_ros.sessions.tool_results import FULL, QUICK
+
+NS = 1_000_000_000
+
+
+@dataclass
+class ToolOutcome:
+    """What came of it.
+
+    Attributes
+    ----------
+    last : of the last measurement; None before any.
+    checked : the last quick check's answer.
+    candidate_id : of the full measurement; 0 without.
+    accepted : whether it was accepted without a person, and stayed.
+    told : why not, or what a person must know.
+    left : what did not fit.
+    """
+
+    last: Answer | None = None
+    checked: str = ""
+    candidate_id: int = 0
+    accepted: bool = False
+    told: str = ""
+    left: str = ""
+
+
+class ToolPart:
+    """Keeps the tool right; what does not fit is done in the next gap.
+
+    Parameters
+    ----------
+    decided : told of each decision that was made without a person.
+    """
+
+    def __init__(
+        self, hands: Hands, decider: Decider, memory: Memory, decided: Callable[[Outcome], None]
+    ) -> None:
+        self._hands, self._decider, self._memory = hands, decider, memory
+        self._decided = decided
+        self._times = hands.config.times
+        self.wall_ns = 0
+
+    def worst_s(self, mode: str) -> float:
+        """From home and back, with everything that may go wrong."""
+        times = self._times
+        limit_s = times.check_s if mode == QUICK else times.full_s
+        # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
+        return limit_s + 3.0 * times.answer_s + 4.0 * REST_WITHIN_S + times.tool_home_s
+
+    def wants(self) -> str:
+        """The measurement that is due: FULL or QUICK; empty: none."""
+        record, config = self._memory.tool, self._hands.config
+        if config.T_base_laser is None or self._decider.pending(TOOL):
+            return ""
+        known = record.wall_ns > 0 and record.revision == self._decider.revision(TOOL)
+        if known and record.answer in ("recalibrate", "cannot tell"):
+            return FULL
+        due = not known or self._age_s(record.wall_ns) >= config.check_every_s
+        return QUICK if due else ""
+
+    def script(self, cycle_id: str) -> Script[ToolOutcome]:
+        """Everything that is due and fits."""
+        outcome = ToolOutcome()
+        wanted = self.wants()
+        if not wanted:
+            if waiting := self._decider.pending(TOOL):
+                outcome.told = f"tool candidate {waiting[0].id} waits for a decision"
+            return outcome
+        if wanted == QUICK:
+            if not (yield from self._check(cycle_id, "check", outcome)):
+                return outcome
+            passed = self._memory.tool.answer == "pass"
+            if passed and not self._full_is_due():
+                return outcome
+            optional = passed
+        else:
+            optional = False
+        if optional and not self._hands.fits(self.worst_s(FULL)):
+            return outcome  # only when time allows
+        yield from self._full(cycle_id, outcome)
+        return outcome
+
+    def _full_is_due(self) -> bool:
+        every_s = self._hands.config.full_every_s
+        return every_s > 0.0 and self._age_s(self._memory.tool.full_ns) >= every_s
+
+    def _check(self, cycle_id: str, name: str, outcome: ToolOutcome) -> Script[bool]:
+        """A quick check; whether it gave an answer."""
+        answer = yield from self._measured(QUICK, f"{cycle_id}/{name}", outcome)
+        if answer is None or not answer.has_result:
+            return False
+        outcome.checked = answer.answer
+        self._note(answer, answer.answer)
+        return True
+
+    def _full(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
+        answer = yield from self._measured(FULL, f"{cycle_id}/full", outcome)
+        if answer is None or not answer.has_result:
+            return
+        self._memory.note_tool(full_ns=self.wall_ns)
+        outcome.candidate_id = answer.candidate_id
+        if answer.code is Code.NO_SIGNIFICANT_GAIN:
+            self._note(answer, "pass")
+            return
+        self._note(answer, "recalibrate")
+        if not answer.done:
+            outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
+            return
+        if why := self._decider.withheld(answer.candidate_id):
+            outcome.told = f"tool candidate {answer.candidate_id} waits for a decision: {why}"
+            return
+        done = self._decider.decide(
+            "accept", answer.candidate_id, BY, "within the configured bounds", self.wall_ns
+        )
+        self._decided(done)
+        if not done.done:
+            outcome.told = done.message
+            return
+        outcome.accepted = True
+        yield from self._verify(cycle_id, outcome)
+
+    def _verify(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
+        """Check the tool that was just accepted; one that is not right is taken back."""
+        if not (yield from self._check(cycle_id, "verify", outcome)):
+            outcome.left = outcome.left or "verification of the accepted tool"
+            return
+        if outcome.checked != "recalibrate":
+            return
+        back = self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
+        self._decided(back)
+        outcome.accepted = False
+        outcome.told = "the accepted tool failed its check and was taken back: look at it"
+        self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
+
+    def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
+        """From home and back home; None where it did not fit or did not begin."""
+        hands = self._hands
+        worst_s = self.worst_s(mode)
+        if not hands.fits(worst_s):
+            outcome.left = f"tool measurement ({mode})"
+            return None
+        hands.doing = f"tool measurement ({mode})"
+        yield from hands.stand(STANDS_S)
+        try:
+            answer = yield from hands.arm()
+            if answer.done:
+                limit_s = self._times.check_s if mode == QUICK else self._times.full_s
+                answer = yield from hands.measure(mode, cycle_id, limit_s)
+        except SilentError as error:
+            answer = Answer(Code.CONFLICT, str(error))
+        outcome.last = answer
+        yield from hands.disarmed()
+        yield from hands.stand(STANDS_S)
+        yield from hands.go_home()
+        if not answer.has_result:
+            outcome.told = f"tool measurement ({mode}): {answer.message}"
+        return answer
+
+    def _note(self, answer: Answer, verdict: str) -> None:
+        self._memory.note_tool(
+            answer=verdict,
+            words=answer.message,
+            deviation_mm=answer.deviation_mm,
+            sigma_mm=answer.sigma_mm,
+            revision=self._decider.revision(TOOL),
+            wall_ns=self.wall_ns,
+        )
+
+    def _age_s(self, wall_ns: int) -> float:
+        return (self.wall_ns - wall_ns) / NS

@@ -1,0 +1,304 @@
+"""A simulated robot with a thermal and a tool node that may fail in any way, under one session."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tool_driver import TAUGHT, noisy_cell
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
+from robocal_ros.sessions.maintenance import requests as ask
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.ways import STATION, Ways
+from robocal_ros.sim.joint_motion import JointMotion
+from robocal_ros.sim.tool_cell import joints_at
+
+TICK_S = 0.02
+LAG_S = 0.02  # of the controller
+BEAT_S = 0.2
+STALE_S = 0.5
+WALL_NS = 1_700_000_000_000_000_000
+OK, REFUSED, SILENT, SLOW = "ok", "refused", "silent", "slow"
+
+CELL = noisy_cell()
+ARM = CELL.arm
+HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.05)
+DRIVING = DrivingConfig(HOUSING, 0.1, 0.008, 0.05)
+
+
+def _above(height_m: float) -> np.ndarray:
+    pose = CELL.pose(TAUGHT, 0.0)
+    pose[:3, 3] += height_m * CELL.up
+    return joints_at(ARM, pose[None], CELL.q_near)[0]
+
+
+HOME, AT_BEAMS = _above(0.10), _above(0.004)
+POSES = HOME + np.radians([[20.0, 5, 0, 0, 0, 0], [25.0, 0, 10, 0, 5, 0], [10.0, 0, 10, 0, 0, 8]])
+TIMES = Times(
+    answer_s=0.5,
+    solve_s=0.5,
+    settle_s=0.1,
+    stay_s=0.1,
+    measure_s=0.5,
+    check_s=6.0,
+    full_s=8.0,
+    tool_home_s=3.5,
+    reserve_s=0.3,
+    stale_s=STALE_S,
+)
+
+
+def config_of(**changes: Any) -> MaintenanceConfig:
+    settings = {
+        "home": HOME,
+        "poses": POSES,
+        "T_flange_tool": TAUGHT,
+        "driving": DRIVING,
+        "T_base_laser": CELL.laser.T_base_laser,
+        "times": TIMES,
+    }
+    return MaintenanceConfig(**(settings | changes))
+
+
+def backwards(plan: JointPlan) -> JointPlan:
+    return JointPlan(
+        plan.time_s[-1] - plan.time_s[::-1], plan.q[::-1], -plan.qd[::-1], plan.qdd[::-1]
+    )
+
+
+DOWN = backwards(Ways(ARM, config_of()).home(STATION, AT_BEAMS).plan)  # as the tool node goes
+
+
+class Shelf:
+    """Keeps a document; may be full."""
+
+    def __init__(self) -> None:
+        self.document: dict[str, Any] | None = None
+
+    def load(self) -> dict[str, Any] | None:
+        return self.document
+
+    def save(self, document: Any) -> None:
+        self.document = dict(document)
+
+
+@dataclass
+class Broken(Exception):
+    """The session did what it must never do."""
+
+    words: str
+
+
+@dataclass
+class ToolNode:
+    """Moves the robot by itself, once armed."""
+
+    armed: bool = False
+    measuring: int = 0  # number of the request
+    until_s: float = 0.0
+
+
+@dataclass
+class Cell:
+    """Robot, nodes and PLC around one session, in steps of `TICK_S`."""
+
+    folder: Path
+    history: Any
+    config: MaintenanceConfig = field(default_factory=config_of)
+    shelf: Shelf = field(default_factory=Shelf)
+    services: dict[str, str] = field(default_factory=dict)
+    check: Answer = field(default_factory=lambda: passed())
+    full: Answer = field(default_factory=lambda: same_tool())
+
+    def __post_init__(self) -> None:
+        self.now_s = 10.0
+        self.motion = JointMotion(HOME)
+        self.coming: list[tuple[float, JointPlan]] = []
+        self.due: list[tuple[float, int, Answer]] = []
+        self.tool = ToolNode()
+        self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
+        self.silent, self.offset = False, np.zeros(ARM.n)
+        self.log: list[ask.Request] = []
+        self.events: list[tuple[str, Any]] = []
+        self.begun: list[str] = []
+        self.ends_s = -np.inf
+        self.q = HOME.copy()
+        self.moved_s = -np.inf  # when the true robot last moved
+        self.restart()
+
+    def restart(self) -> None:
+        """Another session on the same shelf."""
+        self.session = MaintenanceSession(ARM, self.history, self.config, self.shelf, self._event)
+
+    def _event(self, command: Any, outcome: Any) -> None:
+        self.events.append((command.name, outcome))
+
+    # ---- the PLC --------------------------------------------------------------------------------
+
+    def open_gap(self) -> None:
+        self.is_open = self.beating = True
+        self.pass_time(0.3)
+
+    def run(self, cycle_id: str, gap_s: float) -> Code:
+        """Call; a run that truly begins is noted."""
+        known = self.session.result(cycle_id) is not None
+        try:
+            self.session.run(cycle_id, gap_s, self.now_s, self.wall_ns)
+        except RobocalError as error:
+            return error.code
+        if not known:
+            if cycle_id in self.begun:
+                raise Broken(f"cycle {cycle_id} ran twice")
+            self.begun.append(cycle_id)
+            self.ends_s = self.now_s + gap_s
+        return Code.ACCEPT
+
+    def finish(self, within_s: float = 200.0) -> Any:
+        """Until the run has ended; its result."""
+        end_s = self.now_s + within_s
+        while self.state in (State.RUNNING, State.BREAKING_OFF):
+            self.step()
+            assert self.now_s < end_s, self.session.status(self.now_s)
+        return self.session.status(self.now_s).last
+
+    @property
+    def state(self) -> State:
+        return self.session.status(self.now_s).state
+
+    @property
+    def wall_ns(self) -> int:
+        return WALL_NS + round(self.now_s * 1e9)
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def pass_time(self, seconds: float) -> None:
+        for _ in range(round(seconds / TICK_S)):
+            self.step()
+
+    def step(self) -> None:
+        self.now_s += TICK_S
+        self._beat()
+        while self.coming and self.coming[0][0] <= self.now_s:
+            at_s, plan = self.coming.pop(0)
+            self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
+        q = self.motion.at([self.now_s])[0][0]
+        if np.max(np.abs(q - self.q)) > 1e-7:
+            self.moved_s = self.now_s
+        self.q = q
+        self._tool_goes_on()
+        if not self.silent:
+            self.session.reading(self.now_s, self.q + self.offset, self.now_s)
+        if round(self.now_s / TICK_S) % 5 == 0 and self.services.get("sensor") != SILENT:
+            self.session.measured(self.now_s)
+        for item in [item for item in self.due if item[0] <= self.now_s]:
+            self.due.remove(item)
+            self.session.answered(item[1], item[2])
+        for request in self.session.tick(self.now_s, self.wall_ns):
+            self._carry_out(request)
+
+    def _beat(self) -> None:
+        if self.beating and self.now_s >= self.beat_s + BEAT_S:
+            self.beat_s, self.heard = self.now_s, self.is_open
+            self.session.gap(self.is_open, self.now_s)
+
+    # ---- the nodes ------------------------------------------------------------------------------
+
+    def _carry_out(self, request: ask.Request) -> None:
+        self.log.append(request)
+        if isinstance(request, ask.Move | ask.Arm | ask.Measure):
+            self._require_allowed(request)
+        if isinstance(request, ask.Move):
+            self._require_fit(request)
+        match request:
+            case ask.Move() | ask.Stop():
+                self.coming.append((self.now_s + LAG_S, request.plan))
+            case ask.BeginCycle() | ask.EndCycle():
+                self._answer("thermal", request.number, Answer(Code.NO_SIGNIFICANT_GAIN, "warm"))
+                if isinstance(request, ask.BeginCycle):
+                    self._answer("thermal", request.number, Answer(Code.ACCEPT))
+            case ask.Arm():
+                if self.services.get("arm", OK) in (OK, SLOW):
+                    self.tool.armed = True
+                self._answer("arm", request.number, Answer(Code.ACCEPT))
+            case ask.Disarm():
+                if self.services.get("disarm", OK) != SILENT:
+                    self._halt_tool("disarmed")
+                    self.tool.armed = False
+                    self._answer("disarm", request.number, Answer(Code.ACCEPT))
+            case ask.CancelMeasure():
+                if self.services.get("cancel", OK) == OK:
+                    self._halt_tool("cancelled")
+            case ask.Measure():
+                self._measure(request)
+
+    def _answer(self, service: str, number: int, answer: Answer) -> None:
+        how = self.services.get(service, OK)
+        if how == SILENT or any(item[1] == number for item in self.due):
+            self.due = [i if i[1] != number else (i[0], number, answer) for i in self.due]
+            return
+        if how == REFUSED:
+            answer = Answer(Code.CONFLICT, f"{service} refuses")
+        self.due.append((self.now_s + (0.4 if how == SLOW else 0.03), number, answer))
+
+    def _measure(self, request: ask.Measure) -> None:
+        how = self.services.get("measure", OK)
+        if not self.tool.armed or how == REFUSED:
+            self.due.append((self.now_s + 0.03, request.number, Answer(Code.CONFLICT, "not armed")))
+            return
+        self.tool.measuring = request.number
+        long = {SLOW: 60.0, SILENT: np.inf}.get(how, 1.0)
+        self.tool.until_s = self.now_s + DOWN.duration_s + long
+        self.mode = request.mode
+        if np.max(np.abs(self.q - HOME)) < 0.01:
+            self.motion.follow(self.now_s, DOWN.time_s + self.now_s, DOWN.q, DOWN.qd)
+
+    def _tool_goes_on(self) -> None:
+        if self.tool.measuring and self.now_s >= self.tool.until_s:
+            found = self.check if self.mode == "quick" else self.full
+            self.due.append((self.now_s, self.tool.measuring, found))
+            self.tool.measuring, self.tool.armed = 0, False
+
+    def _halt_tool(self, why: str) -> None:
+        if self.tool.measuring:
+            self.motion.hold(self.now_s)
+            self.due.append((self.now_s + 0.03, self.tool.measuring, Answer(Code.CONFLICT, why)))
+            self.tool.measuring, self.tool.armed = 0, False
+
+    # ---- what must never be ---------------------------------------------------------------------
+
+    def _require_allowed(self, request: ask.Request) -> None:
+        if not self.heard or self.now_s - self.beat_s > STALE_S:
+            raise Broken(f"{type(request).__name__} while the gap is closed or stale")
+        if isinstance(request, ask.Move) and self.tool.armed:
+            raise Broken("a motion while the tool node is armed")
+
+    def _require_fit(self, request: ask.Move) -> None:
+        """The plan, and the straight way home from its end at full speed, within what is left."""
+        plan = request.plan
+        velocity = np.max(np.asarray(DRIVING.limits.joint_velocity))
+        shortest_s = float(np.max(np.abs(plan.q[-1] - HOME)) / velocity)
+        if self.now_s + plan.duration_s + shortest_s > self.ends_s:
+            raise Broken("a motion that does not fit the gap with the way home")
+        if request.worst_s < plan.duration_s or self.now_s + request.worst_s > self.ends_s:
+            raise Broken("a step whose worst case does not fit the gap")
+
+    def at_home(self) -> bool:
+        return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near_rad)
+
+
+def passed() -> Answer:
+    return Answer(Code.ACCEPT, "pass: 0.05 mm", 0, (), True, "pass", 0.05, 0.03)
+
+
+def bent() -> Answer:
+    return Answer(Code.LIMIT_EXCEEDED, "recalibrate", 0, (), True, "recalibrate", 1.5, 0.03)
+
+
+def same_tool() -> Answer:
+    return Answer(Code.NO_SIGNIFICANT_GAIN, "same tool", 1, (), True, "", 0.02, 0.03)

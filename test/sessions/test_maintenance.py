@@ -1,0 +1,344 @@
+"""A maintenance run in gaps of all lengths, with everything that may go wrong."""
+
+import numpy as np
+import pytest
+from maintenance_cell import (
+    ARM,
+    CELL,
+    HOME,
+    POSES,
+    REFUSED,
+    SILENT,
+    SLOW,
+    STALE_S,
+    Cell,
+    bent,
+    config_of,
+)
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError, InputError, LimitError, StorageError
+from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.sessions.maintenance import State
+from robocal_ros.sessions.maintenance import requests as ask
+from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+LONG_S = 120.0
+
+
+@pytest.fixture
+def history(tmp_path):
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
+        yield opened
+
+
+@pytest.fixture
+def cell(tmp_path, history) -> Cell:
+    made = Cell(tmp_path, history)
+    made.open_gap()
+    return made
+
+
+def kinds(cell: Cell) -> list[str]:
+    return [type(request).__name__ for request in cell.log]
+
+
+def over(cell: Cell, *, fault: bool = False) -> None:
+    """The robot stands and is disarmed; at home where there is no fault."""
+    cell.pass_time(1.5)
+    assert not cell.tool.armed
+    assert cell.now_s - cell.moved_s > 1.0
+    assert (cell.state is State.FAULT) == fault
+    assert fault or cell.at_home()
+
+
+def test_a_long_gap_takes_everything_in_its_order(cell):
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    result = cell.finish()
+    assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
+    assert (result.thermal_code, result.tool_answer) == (Code.NO_SIGNIFICANT_GAIN, "pass")
+    assert kinds(cell) == [
+        "BeginCycle",
+        *(["Move"] * 4),
+        "EndCycle",
+        "Arm",
+        "Measure",
+        "Disarm",
+        "Move",
+    ]
+    ends = [r.plan.q[-1] for r in cell.log if isinstance(r, ask.Move)]
+    np.testing.assert_allclose(ends[:4], [*POSES, HOME], atol=1e-9)
+    np.testing.assert_allclose(cell.q, HOME, atol=1e-6)
+    over(cell)
+
+
+def test_a_bent_tool_is_measured_in_full(cell):
+    cell.check = bent()
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert [r.mode for r in cell.log if isinstance(r, ask.Measure)] == ["quick", "full"]
+    over(cell)
+
+
+@pytest.mark.parametrize("gap_s", np.arange(2.0, 60.0, 4.0))
+def test_no_gap_is_overrun(cell, gap_s):
+    """What does not fit is left, whatever the length."""
+    cell.check = bent()
+    cell.services["measure"] = SLOW
+    cell.run("c1", gap_s)
+    result = cell.finish()
+    assert cell.now_s <= cell.ends_s
+    assert result.code is Code.ACCEPT, result.message
+    assert result.complete == (not result.left)
+    over(cell)
+
+
+def test_what_did_not_fit_is_resumed_in_the_next_gap(cell):
+    cell.run("c1", 15.0)
+    first = cell.finish()
+    assert "thermal measurement" in first.left[0]
+    visited = sum(isinstance(r, ask.Move) for r in cell.log) - 1
+    assert 0 < visited < len(POSES)
+    cell.pass_time(20.0)
+    cell.log.clear()
+    cell.run("c2", LONG_S)
+    assert cell.finish().complete
+    assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c1"]
+    thermal = kinds(cell)[: kinds(cell).index("EndCycle")]
+    assert thermal.count("Move") == len(POSES) - visited + 1
+
+
+def test_a_thermal_cycle_that_is_too_old_begins_anew(tmp_path, history):
+    cell = Cell(tmp_path, history, config_of(resume_within_s=5.0))
+    cell.open_gap()
+    cell.run("c1", 15.0)
+    cell.finish()
+    cell.pass_time(6.0)
+    cell.log.clear()
+    cell.run("c2", LONG_S)
+    cell.finish()
+    assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c2"]
+    assert kinds(cell)[: kinds(cell).index("EndCycle")].count("Move") == len(POSES) + 1
+
+
+def test_a_full_measurement_that_did_not_fit_comes_next(cell):
+    cell.check = bent()
+    cell.run("c1", 33.0)
+    assert cell.finish().left == ("tool measurement (full)",)
+    cell.log.clear()
+    cell.run("c2", LONG_S)
+    cell.finish()
+    assert [r.mode for r in cell.log if isinstance(r, ask.Measure)] == ["full"]
+
+
+def until_moving(cell: Cell, which: str) -> None:
+    cell.run("c1", LONG_S)
+    if which == "tool":
+        while not cell.tool.measuring:
+            cell.step()
+        cell.pass_time(1.0)
+    else:
+        while cell.motion.at([cell.now_s])[1].max() < 0.1:
+            cell.step()
+
+
+@pytest.mark.parametrize("which", ["thermal", "tool"])
+@pytest.mark.parametrize("how", ["closed", "stale"])
+def test_a_gap_that_closes_stops_everything_at_once(cell, which, how):
+    until_moving(cell, which)
+    if how == "closed":
+        cell.is_open = False
+        limit_s = 0.2 + SHORTEST_STOP_S + 0.1
+    else:
+        cell.beating = False
+        limit_s = STALE_S + SHORTEST_STOP_S + 0.1
+    closed_s = cell.now_s
+    cell.pass_time(3.0)
+    assert cell.moved_s <= closed_s + limit_s
+    over(cell, fault=True)
+    assert "not handed over at home" in cell.session.status(cell.now_s).fault
+
+
+def test_a_gap_that_closes_while_the_robot_is_at_home_is_no_fault(cell):
+    cell.services["thermal"] = SILENT
+    cell.run("c1", LONG_S)
+    cell.pass_time(0.1)
+    cell.is_open = False
+    result = cell.finish()
+    assert (result.code, result.message) == (Code.CONFLICT, "gap_open is false")
+    over(cell)
+
+
+@pytest.mark.parametrize("which", ["thermal", "tool"])
+def test_a_cancelled_run_goes_home(cell, which):
+    until_moving(cell, which)
+    assert cell.session.cancel("by the PLC")
+    assert cell.state is State.BREAKING_OFF
+    result = cell.finish()
+    assert (result.code, result.message) == (Code.CONFLICT, "by the PLC")
+    over(cell)
+
+
+@pytest.mark.parametrize("which", ["thermal", "tool"])
+def test_a_tool_node_that_never_confirms_is_a_fault(cell, which):
+    cell.services["disarm"] = SILENT
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert "does not confirm" in result.message
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
+    cell.services["disarm"] = "ok"
+    cell.pass_time(1.0)
+    cell.session.acknowledge("me")
+    assert cell.state is State.IDLE
+
+
+@pytest.mark.parametrize("service", ["thermal", "arm", "measure", "sensor"])
+@pytest.mark.parametrize("how", [REFUSED, SILENT])
+def test_nodes_that_fail_leave_the_robot_at_home(cell, service, how):
+    cell.services[service] = how
+    cell.run("c1", LONG_S)
+    assert cell.finish().code is Code.ACCEPT
+    over(cell)
+
+
+def test_silent_joint_states_stop_the_robot(cell):
+    until_moving(cell, "thermal")
+    cell.silent = True
+    cell.pass_time(1.0)
+    cell.silent = False
+    over(cell, fault=True)
+    assert "joint states are silent" in cell.session.status(cell.now_s).fault
+
+
+def test_a_robot_off_its_plan_is_stopped(cell):
+    until_moving(cell, "thermal")
+    cell.offset[1] = np.radians(2.0)
+    cell.pass_time(1.0)
+    over(cell, fault=True)
+    assert "away from its plan" in cell.session.status(cell.now_s).fault
+
+
+def test_a_robot_that_is_not_at_home_is_not_moved(cell):
+    cell.offset[2] = np.radians(5.3)
+    cell.pass_time(0.5)
+    with pytest.raises(LimitError, match=f"not at home: {ARM.joint_names[2]} is 5.30 deg off"):
+        cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns)
+    assert cell.state is State.FAULT
+    cell.offset[2] = 0.0
+    cell.pass_time(0.5)
+    assert cell.run("c1", LONG_S) is Code.CONFLICT  # until it is acknowledged
+    cell.session.acknowledge("me")
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    assert cell.log == []
+
+
+def test_nothing_runs_twice_not_after_a_restart_either(cell):
+    cell.run("c1", LONG_S)
+    first = cell.finish()
+    count = len(cell.log)
+    assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
+    cell.restart()
+    cell.pass_time(0.3)
+    assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
+    cell.pass_time(1.0)
+    assert len(cell.log) == count
+
+
+def test_a_restart_in_the_middle_of_a_run_is_a_fault(cell):
+    until_moving(cell, "thermal")
+    cell.restart()
+    status = cell.session.status(cell.now_s)
+    assert status.state is State.FAULT
+    assert "see where the robot is" in status.fault
+    assert status.last.code is Code.CONFLICT
+    cell.restart()
+    assert cell.state is State.FAULT
+
+
+def test_calls_that_make_no_sense_are_refused(cell):
+    for gap_s in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="gap of"):
+            cell.session.run("c1", gap_s, cell.now_s, cell.wall_ns)
+    with pytest.raises(InputError, match="cycle id"):
+        cell.session.run("", 10.0, cell.now_s, cell.wall_ns)
+    assert not cell.session.cancel("nothing runs")
+    cell.run("c1", LONG_S)
+    assert cell.run("c2", LONG_S) is Code.CONFLICT
+
+
+def test_a_run_that_cannot_be_kept_does_not_begin(cell, monkeypatch):
+    def full(document):
+        raise StorageError("disk full")
+
+    monkeypatch.setattr(cell.shelf, "save", full)
+    assert cell.run("c1", LONG_S) is Code.STORAGE_FAILED
+    assert cell.state is State.IDLE
+    cell.pass_time(1.0)
+    assert cell.log == []
+
+
+def test_worst_cases_hold(cell):
+    """The tool node takes all the time that it may, and its end is slow."""
+    cell.services |= {"measure": SLOW, "arm": SLOW, "disarm": SLOW}
+    worst = cell.session.worst_cases()
+    cell.run("c1", LONG_S)
+    begun = {}
+    while cell.state is State.RUNNING:
+        count = len(cell.log)
+        cell.step()
+        begun |= {type(r).__name__: cell.now_s for r in cell.log[count:]}
+    took = cell.now_s - begun["Arm"]
+    assert cell.config.times.check_s < took < worst["tool measurement (quick)"]
+
+
+def accuracy(cell: Cell, level=AccuracyLevel.OK, error=ToolError(1e-4, 1.5e-4)):
+    cell.session.drift(Drift(level, "95 % below", error, 600.0), cell.now_s)
+    return cell.session.accuracy(cell.now_s, cell.wall_ns)
+
+
+def test_the_line_reads_one_state(cell):
+    assert accuracy(cell).level is AccuracyLevel.EXPIRED  # the tool was never checked
+    cell.run("c1", LONG_S)
+    cell.finish()
+    found = accuracy(cell)
+    assert found.level is AccuracyLevel.OK, found.reason
+    assert 1e-4 < found.error.rms_m < found.error.bound_m <= cell.config.tolerance_m
+    assert accuracy(cell, AccuracyLevel.DUE).level is AccuracyLevel.DUE
+    large = accuracy(cell, error=ToolError(2e-4, 2.5e-4))
+    assert large.level is AccuracyLevel.DEGRADED
+    assert "drift and tool" in large.reason
+    cell.pass_time(6.0)
+    silent = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert (silent.level, silent.error) == (AccuracyLevel.FAULT, None)
+    later_ns = cell.wall_ns + 3 * 3600 * 10**9
+    cell.session.drift(Drift(AccuracyLevel.OK, "", ToolError(1e-5, 2e-5), 600.0), cell.now_s)
+    assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.DUE
+    later_ns += 6 * 3600 * 10**9
+    assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.EXPIRED
+
+
+def test_a_bent_tool_degrades(cell):
+    cell.check = bent()
+    cell.run("c1", 33.0)
+    cell.finish()
+    assert accuracy(cell).level is AccuracyLevel.DEGRADED
+
+
+def test_without_a_station_only_the_drift_is_measured(tmp_path, history):
+    cell = Cell(tmp_path, history, config_of(T_base_laser=None))
+    cell.open_gap()
+    cell.run("c1", LONG_S)
+    assert cell.finish().complete
+    assert "Arm" not in kinds(cell)
+    assert accuracy(cell).level is AccuracyLevel.OK
+
+
+def test_without_poses_only_the_tool_is_measured(tmp_path, history):
+    cell = Cell(tmp_path, history, config_of(poses=np.zeros((0, CELL.arm.n))))
+    cell.open_gap()
+    cell.run("c1", LONG_S)
+    assert cell.finish().complete
+    assert kinds(cell) == ["Arm", "Measure", "Disarm", "Move"]
