@@ -18,10 +18,10 @@ from robocal_ros.nodes.conversions import header, transform_message
 from robocal_ros.sim.beams import RoundTool
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_outputs import Happened
+from robocal_ros.sim.cell_samples import station_name
 
 Array = NDArray[np.float64]
 
-OTHER_STATION = "_other"
 TRUTH_S = 1.0  # between two states of the truth
 CENTRE = "sphere_center"
 
@@ -62,11 +62,11 @@ class CellOutputs:
 
     def tell(self, came: Happened, stamp_ns: Callable[[float], int]) -> None:
         """Publish what came; ``stamp_ns`` of a time of the cell."""
-        settings, faults = self._settings, self._cell.faults
+        settings = self._settings
         names = list(self._cell.plan.arm.joint_names)
         for t, q, qd in zip(came.time_s.tolist(), came.q, came.qd, strict=True):
             self._send("joint_states", joint_state(names, stamp_ns(t), q, qd))
-        station = settings["station"] + OTHER_STATION * ("wrong_station" in faults)
+        station = station_name(settings["station"], self._cell.faults)
         for edge in came.edges:
             self._send("beam_events", beam_event(edge, stamp_ns(edge.time_s), station))
         ball, floor = f"{settings['sensor_frame']}/ball", f"{settings['sensor_frame']}/floor"

@@ -75,6 +75,9 @@ class SimulatedCell:
         self._ticks = self._motions = 0
         self._way = np.zeros((BEAT, plan.arm.n))
         self._out = Outbox()
+        self._see_edges(
+            np.arange(2), TICK_S * np.arange(2)
+        )  # what it loads shall not stop a motion
 
     @property
     def now_s(self) -> float:
