@@ -72,15 +72,18 @@ def rigid_robot(nominal: SerialArm, error_m: float, rng: np.random.Generator) ->
     )
 
 
-def known_laser(plan: CellPlan, T_base_laser: Array, rng: np.random.Generator) -> dict[str, Array]:
+def known_laser(
+    plan: CellPlan, T_base_laser: Array, q_there: Array, rng: np.random.Generator
+) -> dict[str, Array]:
     """Flange positions (3,) A1 ... D4 with which this robot places the station's beams, base, m.
 
-    They bear its scatter, the input's errors, and its geometric error as it is at ``q_start``.
+    They bear its scatter, the input's errors, and its geometric error as it is at joints
+    ``q_there`` (n,), at the station: what it takes for upright is not.
     """
-    arm, q = plan.arm, plan.q_start
-    true = plan.robot.flange(q, Warmth.cold(arm.n))[0]
-    T_known_true = arm.fk(q) @ frames.invert(true)
-    points = laser_points(plan.station, T_base_laser, rng)
-    return {
-        name: T_known_true[:3, :3] @ place + T_known_true[:3, 3] for name, place in points.items()
-    }
+    true = plan.robot.flange(q_there, Warmth.cold(plan.arm.n))[0]
+    T_known_true = plan.arm.fk(q_there) @ frames.invert(true)
+    R, p = T_known_true[:3, :3], T_known_true[:3, 3]
+    x, y = (
+        replace(beam, start=R @ beam.start + p, end=R @ beam.end + p) for beam in plan.station.beams
+    )
+    return laser_points(replace(plan.station, beams=(x, y)), T_known_true @ T_base_laser, rng)

@@ -101,7 +101,7 @@ def test_a_run_without_noise_gives_the_tool_back():
 def test_a_noisy_run_gives_the_tool_back_within_its_covariance():
     plan = plan_of(source=SAMPLED, noise=NOISE, ripple=0.02)
     laser = calibrate_laser(
-        known_laser(plan, T_BASE_LASER, rng()), point_sigma(plan.station), CYLINDER_M
+        known_laser(plan, T_BASE_LASER, Q_START, rng()), point_sigma(plan.station), CYLINDER_M
     )
     found, _ = measured(SimulatedCell(plan), laser, RobotNoise(NOISE.step_m, NOISE.edge_m))
     off = found.tip - TRUTH[:3, 3]
@@ -114,7 +114,7 @@ def test_the_arms_own_error_is_in_the_flange_and_in_the_known_laser():
     cell = SimulatedCell(plan)
     wrong = ARM.fk(Q_START)[:3, 3] - cell.flange(np.zeros(1))[0, :3, 3]
     assert 1e-4 < np.linalg.norm(wrong) < 2e-3
-    laser = calibrate_laser(known_laser(plan, T_BASE_LASER, rng()))
+    laser = calibrate_laser(known_laser(plan, T_BASE_LASER, Q_START, rng()))
     moved = laser.T_base_laser[:3, 3] - LASER.T_base_laser[:3, 3]
     # The robot sees its station where its own error puts it, up to the turn over the tool.
     assert np.linalg.norm(moved - wrong) < 0.5 * np.linalg.norm(wrong)
