@@ -3,6 +3,7 @@
 import numpy as np
 
 from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.limits import MotionLimits
 from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.maintenance import AcceptBounds, MaintenanceConfig, Times
@@ -19,7 +20,9 @@ TOLERANCE_M = 3e-4
 
 THERMAL = ThermalConfig(measuring_frame=FRAME, target=TARGET, tolerance_m=TOLERANCE_M)
 HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.10, reach_m=0.3)
-DRIVING = DrivingConfig(HOUSING, tool_length_m=0.1, tool_radius_m=0.01, flange_radius_m=0.06)
+LIMITS = MotionLimits(tcp_speed_m_s=0.25)
+DRIVING = DrivingConfig(HOUSING, 0.1, 0.01, 0.06, LIMITS)  # pin, its radius with a bend, flange
+TRAVEL_M_S = 1.0
 TIMES = Times(check_s=25.0, full_s=45.0, tool_home_s=8.0)
 BOUNDS = AcceptBounds(automatic=True)
 HOME_NEAR_RAD = float(np.radians(2.0))  # the corrected home of a bent tool is as far from home
@@ -27,7 +30,8 @@ HOME_NEAR_RAD = float(np.radians(2.0))  # the corrected home of a bent tool is a
 
 def laser_of(plan: CellPlan) -> LaserFrame:
     """The beams as this robot places them while it is cold."""
-    points = known_laser(plan, T_BASE_LASER, np.random.default_rng([plan.seed, 1]))
+    rng = np.random.default_rng([plan.seed, 1])
+    points = known_laser(plan, T_BASE_LASER, poses("tool")[0], rng)
     return calibrate_laser(points, point_sigma(plan.station), CYLINDER_M)
 
 
@@ -50,6 +54,7 @@ def maintenance_config(laser: LaserFrame) -> MaintenanceConfig:
         T_flange_tool=TAUGHT,
         driving=DRIVING,
         T_base_laser=laser.T_base_laser,
+        travel_speed_m_s=TRAVEL_M_S,
         home_near_rad=HOME_NEAR_RAD,
         tolerance_m=TOLERANCE_M,
         times=TIMES,
