@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from bench.closed_loop import setting
 from bench.closed_loop.suite import Clock, Record, Suite
+from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.joint_correction.refusals import RefusedError
 from robocal_ros.core.motion.plan import JointPlan
@@ -17,7 +18,7 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions import events
 from robocal_ros.sessions.correction import TrajectoryCommand
 from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.maintenance import CycleResult, State
+from robocal_ros.sessions.maintenance import CycleResult
 from robocal_ros.sessions.tool_results import REFERENCE
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_outputs import Happened
@@ -183,10 +184,11 @@ class Plant:
         self._is_open = True
         self.listen(self.now_s + LISTEN_S)
         try:
-            maintenance.run(cycle_id, end_s - self.now_s, self.now_s, self.clock.now_ns)
-            while maintenance.status(self.now_s).state in (State.RUNNING, State.BREAKING_OFF):
+            gap_s = end_s - self.now_s
+            result = maintenance.run(cycle_id, gap_s, self.now_s, self.clock.now_ns)
+            while result is not None and result.code is Code.NONE:
                 self.step()
-            result = maintenance.result(cycle_id)
+                result = maintenance.result(cycle_id)
         except RobocalError as error:
             self.refused.append((self.now_s, f"{cycle_id}: {error}"))
         self._is_open = False

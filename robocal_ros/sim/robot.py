@@ -153,12 +153,13 @@ class TrueRobot:
             for T, centre in zip(frames[1:], self.body.centre, strict=True)
         ]
         load = np.zeros((len(frames[0]), self.nominal.n))
-        for i in range(self.nominal.n):
+        mass, moment = 0.0, np.zeros((len(frames[0]), 3))  # of all that the joint carries
+        for i in reversed(range(self.nominal.n)):
             axis, origin = frames[i][:, :3, 2], frames[i][:, :3, 3]
-            for mass, centre in zip(self.body.mass[i:], centres[i:], strict=True):
-                weight = mass * GRAVITY
-                pull = weight if self.nominal.prismatic[i] else np.cross(centre - origin, weight)
-                load[:, i] += np.sum(axis * pull, axis=1)
+            mass, moment = mass + self.body.mass[i], moment + self.body.mass[i] * centres[i]
+            slides = self.nominal.prismatic[i]
+            pull = mass * GRAVITY if slides else np.cross(moment - mass * origin, GRAVITY)
+            load[:, i] = np.sum(axis * pull, axis=1)
         return load
 
 
