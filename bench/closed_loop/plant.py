@@ -2,30 +2,28 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.closed_loop import setting
-from bench.closed_loop.suite import Clock, Record, Suite
+from bench.closed_loop.suite import Clock, Suite
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.joint_correction.refusals import RefusedError
 from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.core.motion.travel import joint_way
 from robocal_ros.sessions import events
 from robocal_ros.sessions.correction import TrajectoryCommand
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.maintenance import CycleResult
+from robocal_ros.sessions.maintenance.ways import STATION
 from robocal_ros.sessions.tool_results import REFERENCE
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_outputs import Happened
 from robocal_ros.sim.cell_samples import CellSamples
 from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.production import programme
-from robocal_ros.storage.calibrations import CalibrationHistory
 
 Array = NDArray[np.float64]
 
@@ -34,6 +32,7 @@ BEAT_S = 0.2  # of gap_open
 LISTEN_S = 0.5  # readings before a gap and before a programme
 ROUNDS = 3  # of the cold robot
 DWELL_S = 1.0  # at each of its poses
+REST_S = 0.2  # after a pass
 WITHIN_S = 120.0  # a commissioning step
 WORK, HOME, CYCLE = poses("work"), poses("home")[0], poses("cycle")
 PROGRAMME = programme(HOME, [*WORK, HOME])
@@ -44,11 +43,20 @@ Heard = Callable[[Happened], None]
 
 
 @dataclass(frozen=True)
-class Pass:
-    """One pass of the programme: when it ended, joints (k, n) at the working poses."""
+class GapReport:
+    """How a gap ended.
 
-    end_s: float
-    q: Array
+    Attributes
+    ----------
+    result : of its maintenance; None without a suite, or where it was refused.
+    fault : what the maintenance says is wrong; NONE and empty without.
+    over_s : by how much the robot was moved, or the maintenance ran, beyond its end.
+    """
+
+    result: CycleResult | None = None
+    fault_code: Code = Code.NONE
+    fault: str = ""
+    over_s: float = 0.0
 
 
 @dataclass
@@ -82,6 +90,10 @@ class Plant:
     def now_s(self) -> float:
         """Of the cell."""
         return self.cell.now_s
+
+    @property
+    def _q(self) -> Array:
+        return np.asarray(self.cell.motion.at([self.now_s])[0][0])
 
     @property
     def clock(self) -> Clock:
@@ -147,15 +159,12 @@ class Plant:
         if suite.last_tool is None or not suite.last_tool.done:
             raise RobocalError(f"commissioning of the tool: {suite.last_tool}")
         self.listen(self.now_s + 1.0)
-        home = suite.maintenance.ways.home((-1, -1), self.cell.motion.at([self.now_s])[0][0])
-        self.send(home.plan)
+        self.send(suite.maintenance.ways.home(STATION, self._q).plan)
         self.listen(self.cell.motion.end_s + 1.0)
         suite.enable()
 
     def _go(self, suite: Suite, pose: Array) -> None:
-        from robocal_ros.core.motion.travel import joint_way
-
-        self.send(joint_way(suite.maintenance.ways.cell, self.cell.motion.at([self.now_s])[0][0], pose))
+        self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))
         self.listen(self.cell.motion.end_s)
 
     def _thermal(self, suite: Suite, command: Command) -> None:
@@ -171,34 +180,37 @@ class Plant:
 
     # ---- the PLC --------------------------------------------------------------------------------
 
-    def gap(self, cycle_id: str, gap_s: float) -> CycleResult | None:
-        """Open a gap of a length, run the maintenance in it, close it at its end.
-
-        None without a suite, and where the maintenance refused.
-        """
+    def gap(self, cycle_id: str, gap_s: float) -> GapReport:
+        """Open a gap of a length, run the maintenance in it, close it at its end."""
         end_s = self.now_s + gap_s
         if self.suite is None:
             self.work(end_s)
-            return None
+            return GapReport()
         maintenance, result = self.suite.maintenance, None
         self._is_open = True
         self.listen(self.now_s + LISTEN_S)
         try:
-            gap_s = end_s - self.now_s
-            result = maintenance.run(cycle_id, gap_s, self.now_s, self.clock.now_ns)
+            left_s = end_s - self.now_s
+            result = maintenance.run(cycle_id, left_s, self.now_s, self.clock.now_ns)
             while result is not None and result.code is Code.NONE:
                 self.step()
                 result = maintenance.result(cycle_id)
         except RobocalError as error:
             self.refused.append((self.now_s, f"{cycle_id}: {error}"))
+        over_s = max(self.now_s, self.cell.motion.end_s) - end_s
         self._is_open = False
         self.work(max(end_s, self.now_s))
-        return result
+        said = maintenance.status(self.now_s)
+        return GapReport(result, said.fault_code, said.fault, max(over_s, 0.0))
 
-    def produce(self) -> Pass:
-        """One pass of the programme, corrected where there is a suite."""
+    def produce(self) -> Array | None:
+        """One pass of the programme, corrected where there is a suite.
+
+        Joints (k, n) at the working poses; None where the correction refuses: the robot stands.
+        """
         time_s, q, qd, qdd = PROGRAMME
         begin_s = self.now_s
+        end_s = begin_s + PASS_S + REST_S
         if self.suite is not None and self.suite.correction is not None:
             names = self.cell.plan.arm.joint_names
             taught = TrajectoryCommand(names, q, time_s, qd, qdd)
@@ -206,9 +218,11 @@ class Plant:
                 sent = self.suite.correction.trajectory(taught, begin_s)
             except RefusedError as error:
                 self.refused.append((begin_s, str(error)))
-                self.work(begin_s + PASS_S + 0.2)
-                return Pass(self.now_s, np.full_like(WORK, np.nan))
-            q, qd, qdd = sent.position, sent.velocity, sent.acceleration
-        self.cell.follow(begin_s + time_s, q, qd, qdd)
-        self.work(begin_s + PASS_S + 0.2)
-        return Pass(self.now_s, q[AT_WORK])
+                self.work(end_s)
+                return None
+            self.cell.follow(begin_s + time_s, sent.position, sent.velocity, sent.acceleration)
+            q = sent.position
+        else:
+            self.cell.follow(begin_s + time_s, q, qd, qdd)
+        self.work(end_s)
+        return np.asarray(q[AT_WORK])

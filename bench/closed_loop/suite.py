@@ -17,8 +17,12 @@ from robocal_ros.core.samples import MEASURED_POINT, SPHERE_CLOUD, JointSample, 
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions import events
-from robocal_ros.sessions.correction import CorrectionSession, JointCommand
-from robocal_ros.sessions.correction import OfferedModel, OfferedTool
+from robocal_ros.sessions.correction import (
+    CorrectionSession,
+    JointCommand,
+    OfferedModel,
+    OfferedTool,
+)
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession
