@@ -15,8 +15,7 @@ DAMPINGS = (0.0, *(10.0**power for power in range(-4, 7)))
 SOUND_FIT = 0.999  # residuals beyond this quantile say that given sigmas are too small
 CLEAR_STRETCH = 1.6  # beyond the scatter of a median of six samples
 STEP_TOLERANCE = 1e-4  # of a standard deviation
-FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers, and for residuals
-# that are rough over shorter steps, as between noisy readings
+FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
 SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
 
 
@@ -92,8 +91,7 @@ class Descent(Generic[S]):
             scale = self._scale(residual, keep, huber)
             normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
             step = _damped_step(normal, gradient, 0.0)
-            length = float(step @ normal @ step)
-            if length < tolerance**2 * k:
+            if float(step @ normal @ step) < tolerance**2 * k:
                 near = residual + jacobian @ step  # exact enough so near
                 return Run(self.problem.retract(state, step), near, jacobian, iterations, True)
             for damping in DAMPINGS:
@@ -103,9 +101,8 @@ class Descent(Generic[S]):
                 new_residual, new_jacobian = self.problem.linearise(trial)
                 if self._cost(trial, new_residual, keep, scale, huber) <= cost:
                     break
-            else:  # no step of any length helps: a minimum only where the best one is tiny
-                near_enough = length < FIRST_TOLERANCE**2 * k
-                return Run(state, residual, jacobian, iterations, near_enough)
+            else:  # no step of any length helps: not a minimum that can be trusted
+                return Run(state, residual, jacobian, iterations, False)
             state, residual, jacobian = trial, new_residual, new_jacobian
         return Run(state, residual, jacobian, iterations, False)
 
