@@ -13,7 +13,13 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.cell_sim_messages import in_joint_order, planned_step
 from robocal_ros.nodes.cell_sim_outputs import CellOutputs
-from robocal_ros.nodes.cell_sim_settings import SETTINGS, bent_tool, cell_plan, laser_pose
+from robocal_ros.nodes.cell_sim_settings import (
+    SETTINGS,
+    at_station,
+    bent_tool,
+    cell_plan,
+    laser_pose,
+)
 from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.run import run
 from robocal_ros.sessions.correction.inputs import trajectory_command
@@ -41,7 +47,8 @@ class CellSimNode(HouseNode):
         self._cell = SimulatedCell(plan)
         if settings["laser_csv"]:
             rng = np.random.default_rng([settings["seed"], 2])
-            points = known_laser(plan, laser_pose(settings), rng)
+            there = at_station(settings, plan)
+            points = known_laser(plan, laser_pose(settings), there, rng)
             rows = [f"{name},{_mm(place)}\n" for name, place in sorted(points.items())]
             write_text(Path(settings["laser_csv"]), "point,x_mm,y_mm,z_mm\n" + "".join(rows))
         self._out = CellOutputs(self.add_output, settings, self._cell)

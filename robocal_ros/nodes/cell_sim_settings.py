@@ -14,7 +14,7 @@ from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
 from robocal_ros.sim.cell_faults import FAULTS
 from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
-from robocal_ros.sim.kr150_cell import T_BASE_LASER, kr150_cell
+from robocal_ros.sim.kr150_cell import T_BASE_LASER, kr150_cell, poses
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -166,6 +166,11 @@ def laser_pose(settings: Mapping[str, Any]) -> Array:
         return T_BASE_LASER
     R = frames.exp_rotation(np.radians(settings["laser_rotation_deg"]))
     return frames.transform(R, np.array(settings["laser_xyz_mm"]) * MM)
+
+
+def at_station(settings: Mapping[str, Any], plan: CellPlan) -> Array:
+    """Joints (n,) with which the robot stands above the beams."""
+    return poses("tool")[0] if settings["cell"] == "kr150" else plan.q_start
 
 
 def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
