@@ -73,6 +73,9 @@ def read_events(
 ) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
     """Read the recorded commands, each with its outcome, and the configuration before them.
 
+    A later configuration with another thermal model is a command too, without an outcome, where
+    the session takes this model from the thermal node.
+
     ``from_ns`` is the stamp of the first recorded joint reading. What was commanded before it is
     in the bag only because the topic is latched; its samples are not. It is left out, and the
     configuration is the one that it led to.
@@ -83,26 +86,43 @@ def read_events(
         When an event cannot be read.
     """
     configured: Command | None = None
+    model: Any = None
     found: list[tuple[Command, dict[str, Any]]] = []
     for recorded in messages:
         event = recorded.message
         command = read_command(event.command, stamp_ns(event.stamp), event.arguments)
         if command.name == events.CONFIGURE:
-            configured = configured if found else command
+            if not found:
+                configured = command
+            elif _takes_over(command, model):
+                found.append((command, {}))
+            model = command.arguments.get("model")
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
     before = _jumps(configured)
-    return configured, [(_counted_from(before, command), outcome) for command, outcome in found]
+    return configured, [
+        (_counted_from(before, from_ns, command), outcome) for command, outcome in found
+    ]
+
+
+def _takes_over(configured: Command, model: Any) -> bool:
+    """Whether another node has brought another thermal model into force than the one before."""
+    own = "reference" in configured.arguments
+    return not own and configured.arguments.get("model") != model
 
 
 def _jumps(command: Command | None) -> int:
     return 0 if command is None or command.marks is None else command.marks.get(JUMPS, 0)
 
 
-def _counted_from(before: int, command: Command) -> Command:
-    """The command with the clock's jumps counted from those before the recording."""
-    marks = {**(command.marks or {}), JUMPS: max(_jumps(command) - before, 0)}
-    return replace(command, marks=marks)
+def _counted_from(before: int, from_ns: int, command: Command) -> Command:
+    """The command with what a replay can wait for.
+
+    Jumps of the clock count from those ``before`` the recording; a topic of which nothing came
+    since the recording began, at ``from_ns``, is not awaited.
+    """
+    marks = {topic: mark for topic, mark in (command.marks or {}).items() if mark >= from_ns}
+    return replace(command, marks=marks | {JUMPS: max(_jumps(command) - before, 0)})
 
 
 def input_topics(topics: Iterable[str], configured: Command | None = None) -> dict[str, str]:
