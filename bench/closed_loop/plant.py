@@ -21,7 +21,7 @@ from robocal_ros.sessions.maintenance.ways import STATION
 from robocal_ros.sessions.tool_results import REFERENCE
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_outputs import Happened
-from robocal_ros.sim.cell_samples import CellSamples
+from robocal_ros.sim.cell_samples import CellSamples, Sample
 from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.production import programme
 
@@ -39,7 +39,7 @@ PROGRAMME = programme(HOME, [*WORK, HOME])
 AT_WORK = slice(0, 2 * len(WORK), 2)  # its points where it arrives at the working poses
 PASS_S = float(PROGRAMME[0][-1])
 
-Heard = Callable[[Happened], None]
+Heard = Callable[[Happened, list[Sample]], None]
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,19 @@ class Plant:
     Attributes
     ----------
     every_reading : the sessions take all joint readings, also those of the production.
-    heard : takes everything that the cell tells to the sessions.
+    heard : takes everything that the cell tells, as it came and as samples for the sessions.
+    begin_s : of the shift, once it has begun.
+    commanded : joints (k, n) to which the last pass went for the working poses; None before.
     refused : what the correction refused, with the times.
     """
 
     cell: SimulatedCell
     suite: Suite | None
     every_reading: bool = False
-    heard: Heard = lambda came: None
+    heard: Heard = lambda came, samples: None
     refused: list[tuple[float, str]] = field(default_factory=list)
+    begin_s: float = np.inf
+    commanded: Array | None = None
     _is_open: bool = False
     _beat_s: float = -np.inf
 
@@ -109,13 +113,17 @@ class Plant:
     def step(self) -> None:
         """A step of time with everything listening."""
         came = self.cell.advance(self.now_s + STEP_S)
-        self.heard(came)
         if self.suite is None:
             return
         if self.now_s >= self._beat_s + BEAT_S:
             self._beat_s = self.now_s
             self.suite.maintenance.gap(self._is_open, self.now_s)
-        self.suite.step(self.samples.of(came, self.cell.faults), self.clock)
+        self._take(self.suite, came)
+
+    def _take(self, suite: Suite, came: Happened) -> None:
+        samples = self.samples.of(came, self.cell.faults)
+        self.heard(came, samples)
+        suite.step(samples, self.clock)
 
     def listen(self, until_s: float) -> None:
         """Step until a time."""
@@ -128,9 +136,7 @@ class Plant:
             self.listen(until_s)
             return
         if until_s - LISTEN_S > self.now_s:
-            came = self.cell.advance(until_s - LISTEN_S, readings=False)
-            self.heard(came)
-            self.suite.step(self.samples.of(came, self.cell.faults), self.clock)
+            self._take(self.suite, self.cell.advance(until_s - LISTEN_S, readings=False))
         self.listen(until_s)
 
     # ---- commissioning --------------------------------------------------------------------------
@@ -224,5 +230,6 @@ class Plant:
             q = sent.position
         else:
             self.cell.follow(begin_s + time_s, q, qd, qdd)
+        self.commanded = np.asarray(q[AT_WORK])
         self.work(end_s)
-        return np.asarray(q[AT_WORK])
+        return self.commanded

@@ -145,7 +145,6 @@ class Worker:
         self._plan, self._plant = plan, plant
         self._record = ShiftRecord(plan, seed, refused=plant.refused)
         self._waiting = list(plan.incidents)
-        self._begin_s = 0.0
 
     def run(self) -> ShiftRecord:
         """The whole shift."""
@@ -153,11 +152,11 @@ class Worker:
         worked_s = plant.now_s + plan.work_s
         while plant.now_s + PASS_S + REST_S < worked_s:
             plant.produce()
-        self._begin_s = plant.now_s
+        plant.begin_s = plant.now_s
         for number in range(1, plan.cycles + 1):
             self._happens()
             self._record.gaps.append(plant.gap(f"cycle-{number}", plan.gap_s))
-            self._produce(number, self._begin_s + number * plan.every_s)
+            self._produce(number, plant.begin_s + number * plan.every_s)
         return self._record
 
     def _produce(self, cycle: int, until_s: float) -> None:
@@ -167,15 +166,17 @@ class Worker:
             made = plant.produce()
             error = None if made is None else plant.cell.tcp_error(made)
             accuracy = None if plant.suite is None else plant.suite.accuracy()
-            time_s = plant.now_s - self._begin_s
-            self._record.passes.append(Judged(time_s, cycle, error, accuracy))
+            self._record.passes.append(Judged(self._now_s, cycle, error, accuracy))
         plant.work(until_s)
 
+    @property
+    def _now_s(self) -> float:
+        return self._plant.now_s - self._plant.begin_s
+
     def _pauses(self) -> bool:
-        now_s = self._plant.now_s - self._begin_s
-        return any(start <= now_s < end for start, end in self._plan.pauses)
+        return any(start <= self._now_s < end for start, end in self._plan.pauses)
 
     def _happens(self) -> None:
-        while self._waiting and self._plant.now_s - self._begin_s >= self._waiting[0].at_s:
+        while self._waiting and self._now_s >= self._waiting[0].at_s:
             incident = self._waiting.pop(0)
             self._plant.cell.set_fault(incident.fault, incident.size)
