@@ -17,7 +17,8 @@ collision, two thermal cycles, the check that sees the bent tool and its measure
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ sys.path.insert(0, str(ROOT))  # for the bench
 
 from bench.closed_loop import setting  # noqa: E402
 from bench.closed_loop.plant import WORK, Plant  # noqa: E402
-from bench.closed_loop.shift import GOLDEN, ShiftPlan, at, run_shift  # noqa: E402
+from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
 from robocal_ros.core.samples import (  # noqa: E402
     REFERENCE_SPHERE,
     SPHERE_CLOUD,
@@ -202,12 +203,12 @@ class Recorder:
         self._bag.write(topic, kind, message, self.plant.clock.now_ns)
 
 
-def record(path: Path, plan: ShiftPlan, window_s: tuple[float, float], seed: int = SEED) -> None:
-    """Run a shift, and write what happens in a window of it, s from its begin."""
+@contextmanager
+def recorder(path: Path, window_s: tuple[float, float]) -> Iterator[Recorder]:
+    """Writes a bag of a window of a shift, s from its begin."""
     latched = [f"/{name}/session_events" for name in NODES.values()]
     with BagWriter(path, latched=latched) as bag:
-        recorder = Recorder(bag, window_s)
-        run_shift(plan, seed, record=recorder.record, watch=recorder.watch)
+        yield Recorder(bag, window_s)
 
 
 def main() -> None:
@@ -219,7 +220,8 @@ def main() -> None:
         hours = np.ceil(WINDOW_S[1] / GOLDEN.every_s) * GOLDEN.every_s / 3600.0
         path, plan, window_s = EXCERPT, replace(GOLDEN, hours=float(hours)), WINDOW_S
     path.parent.mkdir(exist_ok=True)
-    record(path, plan, window_s)
+    with recorder(path, window_s) as writes:
+        run_shift(plan, SEED, record=writes.record, watch=writes.watch)
     print(f"{path.name} of {setting.SERIAL}: {path.stat().st_size / 1e6:.2f} MB, simulated")
 
 

@@ -6,4 +6,5 @@ plant     robot, PLC and suite on one clock: commissioning, gaps, production
 shift     the golden shift and shorter ones, and what came of them
 judging   how accurate that was, against the same shift without the suite
 faults    what each fault costs, and from which size on it is reported
+tables    all of it as the tables of the bench
 """
