@@ -132,9 +132,11 @@ class Plant:
 
     def work(self, until_s: float) -> None:
         """Let time pass in which the robot produces; without readings where none are wanted."""
-        if self.suite is None or self.every_reading:
-            self.listen(until_s)
+        if self.suite is None:
+            self.cell.advance(until_s, readings=False)
             return
+        if self.every_reading:
+            self.listen(until_s)
         if until_s - LISTEN_S > self.now_s:
             self._take(self.suite, self.cell.advance(until_s - LISTEN_S, readings=False))
         self.listen(until_s)

@@ -162,7 +162,8 @@ def _stamps(window: Window, recording: Recording) -> tuple[int, int]:
 
 
 def _document(report: ReplayReport, session: ThermalSession, recording: Recording) -> Document:
-    made = [outcome for outcome in report.outcomes if outcome.document is not None]
+    placed = events.CALIBRATE_SENSOR  # what it found is no candidate for the model
+    made = [o for o in report.outcomes if o.document is not None and o.command.name != placed]
     place = {outcome.calibration_id: index for index, outcome in enumerate(made)}
     head = session.in_force
     topic = {kind: name for name, kind in recording.inputs.items()}
