@@ -1,7 +1,8 @@
 """The long form of what the tests show briefly: ``make soak``, or ``python -m bench.soak --short``.
 
 Kills at random moments, other random examples in each round, hours of a live graph, more simulated
-robots, shifts and faults of the whole cell. Writes out/soak/soak.md, with ``--keep`` docs/figures/soak.md too.
+robots, shifts and faults of the whole cell. Writes out/soak/soak.md, with ``--keep``
+docs/figures/soak.md too.
 """
 
 import argparse
