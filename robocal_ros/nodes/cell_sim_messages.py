@@ -130,6 +130,14 @@ def cloud(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
     )
 
 
+def profile(stamp_ns: int, frame: str, points: Array) -> PointCloud2:
+    """A profile (m, 2), x and z, in its sensor's plane y = 0."""
+    x, z = points.T
+    message = cloud(stamp_ns, frame, np.column_stack([x, np.zeros_like(x), z]))
+    message.is_dense = bool(np.all(np.isfinite(points)))
+    return message
+
+
 def temperature(stamp_ns: int, joint: str, celsius: float) -> Temperature:
     """A motor's."""
     return Temperature(header=header(stamp_ns, joint), temperature=celsius, variance=0.01)

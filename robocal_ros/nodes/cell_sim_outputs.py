@@ -13,8 +13,16 @@ from std_msgs.msg import String
 
 from robocal_ros.core.samples import REFERENCE_SPHERE, SPHERE_CLOUD
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.cell_sim_messages import beam_event, cloud, joint_state, point, temperature
+from robocal_ros.nodes.cell_sim_messages import (
+    beam_event,
+    cloud,
+    joint_state,
+    point,
+    profile,
+    temperature,
+)
 from robocal_ros.nodes.conversions import header, transform_message
+from robocal_ros.sessions.hand_eye_shots import PROFILE
 from robocal_ros.sim.beams import RoundTool
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_outputs import Happened
@@ -44,6 +52,8 @@ class CellOutputs:
             clouds = cell.plan.sphere.points > 0
             kinds |= {SPHERE_CLOUD: PointCloud2} if clouds else {CENTRE: PointStamped}
             kinds |= {REFERENCE_SPHERE: PointStamped}
+        if cell.plan.profile:
+            kinds |= {PROFILE: PointCloud2}
         if cell.heating:
             kinds |= {"motor_temperatures": Temperature}
         self._outputs = {
@@ -77,6 +87,9 @@ class CellOutputs:
             else:
                 self._send(CENTRE, point(at, ball, shot.centre))
             self._send(REFERENCE_SPHERE, point(at, floor, shot.floor))
+        for view in came.profiles:
+            frame = settings["profile_frame"]
+            self._send(PROFILE, profile(stamp_ns(view.time_s), frame, view.points))
         for told in came.temperatures:
             for name, celsius in zip(names, told.celsius.tolist(), strict=True):
                 message = temperature(stamp_ns(told.time_s), name, celsius)

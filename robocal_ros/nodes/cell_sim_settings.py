@@ -76,6 +76,8 @@ SETTINGS = (
         high=100_000,
     ),
     Setting("sensor_frame", "sensor", "Frame of the sphere sensor"),
+    Setting("profile", False, "A line laser on the flange of the kr150"),
+    Setting("profile_frame", "profile_sensor", "Frame of the line laser"),
     Setting("station", "station", "Name of the beam station: frame_id of its edges"),
     Setting(
         "laser_xyz_mm",
@@ -183,7 +185,12 @@ def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
     """
     seed = settings["seed"]
     if settings["cell"] == "kr150":
-        plan = kr150_cell(load_robot(KR150), seed, points=settings["cloud_points"])
+        plan = kr150_cell(
+            load_robot(KR150),
+            seed,
+            points=settings["cloud_points"],
+            profile=settings["profile"],
+        )
     else:
         plan = _tool_cell(settings)
     source = TrueInput(

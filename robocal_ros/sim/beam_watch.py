@@ -29,14 +29,16 @@ class BeamWatch:
         tool: RoundTool,
         ticks: NDArray[np.int64],
         time_s: Array,
+        q: Array,
         joints: Callable[[Array], Array],
         flange: Callable[[Array], Array],
     ) -> list[BeamEdge]:
         """Edges between ticks (k,) at times (k,), in the order of the ticks.
 
-        ``joints`` and ``flange``: readings (m, n) and true T_base_flange (m, 4, 4) at times (m,).
+        ``q`` (k, n): joints there; ``joints`` and ``flange``: joints (m, n) and true T_base_flange
+        (m, 4, 4) at times (m,).
         """
-        first, last = self._near(station, tool, joints(time_s))
+        first, last = self._near(station, tool, q)
         if last - first < 1:
             return []
         inside = slice(first, last + 1)
@@ -52,9 +54,10 @@ class BeamWatch:
 
     def _near(self, station: BeamStation, tool: RoundTool, q: Array) -> tuple[int, int]:
         """First and last tick with the tool near the beams; last < first where there is none."""
-        middle = np.mean([0.5 * (b.start + b.end) for b in station.beams], axis=0)
+        middle = np.array([0.5 * (beam.start + beam.end) for beam in station.beams])
         tip = (self._arm.fk(q) @ tool.T_flange_tool[:, 3])[:, :3]
-        near = np.linalg.norm(tip - middle, axis=1) < np.max(tool.height) + ROOM_M
+        away = np.min(np.linalg.norm(tip[:, None] - middle, axis=2), axis=1)
+        near = away < np.max(tool.height) + ROOM_M
         places = np.flatnonzero(near)
         return (int(places[0]), int(places[-1])) if len(places) else (0, -1)
 

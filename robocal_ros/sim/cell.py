@@ -6,6 +6,7 @@ each time it moves after a rest. Every random number belongs to its place in tim
 not matter when the cell is asked, and what is switched on or off leaves all else alone.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -31,6 +32,7 @@ from robocal_ros.sim.draws import Draws, Stream
 from robocal_ros.sim.heating import Heating
 from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.joint_readings import JointReadings
+from robocal_ros.sim.profile_station import ProfileStation
 from robocal_ros.sim.scatter import Scatter
 from robocal_ros.sim.sphere_station import SphereStation
 from robocal_ros.sim.standing import Standing
@@ -75,9 +77,8 @@ class SimulatedCell:
         self._ticks = self._motions = 0
         self._way = np.zeros((BEAT, plan.arm.n))
         self._out = Outbox()
-        self._see_edges(
-            np.arange(2), TICK_S * np.arange(2)
-        )  # what it loads shall not stop a motion
+        # What it loads at its first use shall not stop a motion.
+        self._see_edges(np.arange(2), np.array([0.0, TICK_S]), np.tile(plan.q_start, (2, 1)))
 
     @property
     def now_s(self) -> float:
@@ -190,7 +191,7 @@ class SimulatedCell:
         return plan.robot.point(plan.working, Warmth.cold(plan.arm.n), p)
 
     def _joints(self, time_s: Array) -> Array:
-        return self.motion.at(time_s)[0]
+        return self.motion.joints(time_s)
 
     def _pass(self, stop: int) -> None:
         """From tick to tick, at most to the next beat."""
@@ -202,9 +203,11 @@ class SimulatedCell:
         for tick in departed.tolist():
             self._depart(tick)
         if not np.all(stood) or self._scatter.settled_s > time[0]:
-            self._see_edges(ticks, time)
+            self._see_edges(ticks, time, q)
         if self.plan.sphere:
-            self._see_sphere(self.plan.sphere, ticks[1:], stood)
+            self._see_sphere(self.plan.sphere, ticks[1:], q[1:], stood)
+        if self.plan.profile:
+            self._see_profile(self.plan.profile, ticks[1:], q[1:], stood)
         begin = now % BEAT
         self._way[begin : begin + len(way)] = way
         self._ticks = stop
@@ -213,26 +216,40 @@ class SimulatedCell:
             swapped = "swapped_temperatures" in self.faults
             self._out.temperatures.append(self.heating.tell(self.now_s, stop // BEAT, swapped))
 
-    def _see_edges(self, ticks: Index, time_s: Array) -> None:
+    def _see_edges(self, ticks: Index, time_s: Array, q: Array) -> None:
         station = self.faults.station(self._station)
-        found = self._watch.edges(station, self.tool, ticks, time_s, self._joints, self.flange)
+        found = self._watch.edges(station, self.tool, ticks, time_s, q, self._joints, self.flange)
         lost = self.faults.size("lost_messages")
         for edge in self._input.passed(found):
             place = round(edge.time_s * 1e9)
             if not lost or self._draws.of(Stream.LOST_EDGES, place).random() >= lost:
                 self._out.add_edge(edge)
 
-    def _see_sphere(self, sphere: SphereStation, ticks: Index, stood: Index) -> None:
-        """Measure where the robot has ``stood`` still for so many ticks."""
-        settle, period = round(sphere.settle_s / TICK_S), round(sphere.period_s / TICK_S)
-        due = (stood >= settle) & ((stood - settle) % period == 0)
-        for tick in ticks[due].tolist():
-            T = self.flange(np.array([tick * TICK_S]))[0]
+    def _see_sphere(self, sphere: SphereStation, ticks: Index, q: Array, stood: Index) -> None:
+        """Measure the ball where the robot has ``stood`` still for so many ticks."""
+        for tick, T in self._standstills(sphere, ticks, q, stood):
             if sphere.sees(T):
                 rise = float(self.warmth.link[-1])
                 shot = sphere.shoot(T, rise, tick, tick * TICK_S, self.faults, self._draws)
                 if shot is not None:
                     self._out.shots.append(shot)
+
+    def _see_profile(self, profile: ProfileStation, ticks: Index, q: Array, stood: Index) -> None:
+        """Look at the target with the robot's own sensor."""
+        for tick, T in self._standstills(profile, ticks, q, stood):
+            shot = profile.shoot(T, tick, tick * TICK_S, self._draws)
+            if shot is not None:
+                self._out.profiles.append(shot)
+
+    def _standstills(
+        self, station: SphereStation | ProfileStation, ticks: Index, q: Array, stood: Index
+    ) -> Iterator[tuple[int, Array]]:
+        """Ticks at which a station near the robot measures, and true flange poses (4, 4) there."""
+        settle, period = round(station.settle_s / TICK_S), round(station.period_s / TICK_S)
+        for i in np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0)):
+            if station.near(self.plan.arm.fk(q[i])):
+                tick = int(ticks[i])
+                yield tick, self.flange(np.array([tick * TICK_S]))[0]
 
     # ---- what changes ---------------------------------------------------------------------------
 

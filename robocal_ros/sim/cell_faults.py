@@ -74,6 +74,7 @@ LASTING: frozenset[Fault] = frozenset(
 )
 """What was moved or mounted stays so while other faults come and go."""
 
+FAR = np.array([0.0, 0.0, -1e3])  # m
 BENT = np.array([0.6, -0.7, 0.38])  # of a collision, flange axes; about unit length
 LEVER_M = 0.15  # between the bend and the tip
 THICKER = 0.1  # of a wrong tool: growth of its radius over that of its length
@@ -111,7 +112,7 @@ class Faults:
         if "wrong_tool" in self:
             longer = self.size("wrong_tool")
             T = mounted.T_flange_tool @ frames.transform(np.eye(3), [0.0, 0.0, longer])
-            wider, height = THICKER * longer, mounted.height + longer
+            wider, height = THICKER * max(longer, 0.0), mounted.height + longer
             height[0] = mounted.height[0] + wider
             mounted = RoundTool(T, height, mounted.radius + wider)
         if "collision" in self:
@@ -142,8 +143,10 @@ class Faults:
         if left == 1.0:
             return clean
         x, y = clean.beams
-        dark, light = (min(share / left, 1.0) for share in (x.dark_at, x.light_at))
-        return replace(clean, beams=(replace(x, dark_at=dark, light_at=light), y))
+        if max(x.dark_at, x.light_at) >= left:  # dark for good: no tool ever meets it
+            return replace(clean, beams=(replace(x, start=x.start + FAR, end=x.end + FAR), y))
+        x = replace(x, dark_at=x.dark_at / left, light_at=x.light_at / left)
+        return replace(clean, beams=(x, y))
 
 
 class FaultyInput:

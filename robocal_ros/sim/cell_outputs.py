@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.sim.heating import Temperatures
+from robocal_ros.sim.profile_station import ProfileShot
 from robocal_ros.sim.sphere_station import SphereShot
 
 Array = NDArray[np.float64]
@@ -22,6 +23,7 @@ class Happened:
     time_s, q, qd : (k,), (k, n), (k, n) joint readings.
     edges : those whose stamp has passed, in its order.
     shots : measurements of the spheres that were told by now.
+    profiles : those that were told by now.
     temperatures : of the motors.
     """
 
@@ -30,6 +32,7 @@ class Happened:
     qd: Array
     edges: list[BeamEdge]
     shots: list[SphereShot]
+    profiles: list[ProfileShot]
     temperatures: list[Temperatures]
 
 
@@ -39,6 +42,7 @@ class Outbox:
 
     edges: list[BeamEdge] = field(default_factory=list)
     shots: list[SphereShot] = field(default_factory=list)
+    profiles: list[ProfileShot] = field(default_factory=list)
     temperatures: list[Temperatures] = field(default_factory=list)
 
     def add_edge(self, edge: BeamEdge) -> None:
@@ -49,6 +53,7 @@ class Outbox:
         """Everything that is told by now, with joint readings."""
         edges = [edge for edge in self.edges if edge.time_s <= now_s]
         shots = [shot for shot in self.shots if shot.told_s <= now_s]
-        del self.edges[: len(edges)], self.shots[: len(shots)]
+        profiles = [shot for shot in self.profiles if shot.told_s <= now_s]
+        del self.edges[: len(edges)], self.shots[: len(shots)], self.profiles[: len(profiles)]
         temperatures, self.temperatures = self.temperatures, []
-        return Happened(time_s, q, qd, edges, shots, temperatures)
+        return Happened(time_s, q, qd, edges, shots, profiles, temperatures)

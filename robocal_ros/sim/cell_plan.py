@@ -10,6 +10,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sim.beam_calibration import laser_points
 from robocal_ros.sim.beams import BeamStation, RoundTool
 from robocal_ros.sim.heating import HeatPlan
+from robocal_ros.sim.profile_station import ProfileStation
 from robocal_ros.sim.robot import Body, Effects, TrueRobot
 from robocal_ros.sim.sphere_station import SphereStation
 from robocal_ros.sim.thermal import Warmth
@@ -26,11 +27,12 @@ class CellPlan:
     robot : the true one; its ``nominal`` is what the program and the readings' users know.
     station : the true one; its ``noise`` is the robot's scatter there.
     tool : as it is mounted at the begin.
-    q_start : (n,) where the robot stands then, with a straight tool above the station.
+    q_start : (n,) where the robot stands then.
     rate_hz, reading_noise_rad : of the joint readings; without noise they are exact.
     ripple : relative, of the speed of circles that the robot's program drives.
     heat : what warms it up; None: it stays cold.
     sphere : what it shows to a sensor; None: nothing.
+    profile : what it looks at with a sensor of its own; None: nothing.
     working : (k, n) poses of its work, at which its tool is judged.
     """
 
@@ -43,6 +45,7 @@ class CellPlan:
     ripple: float = 0.02
     heat: HeatPlan | None = None
     sphere: SphereStation | None = None
+    profile: ProfileStation | None = None
     working: Array = field(default_factory=lambda: np.zeros((0, 0)))
     seed: int = 1
 

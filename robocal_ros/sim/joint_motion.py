@@ -1,5 +1,7 @@
 """Joints that follow trajectories as a joint trajectory controller makes them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -64,11 +66,9 @@ class JointMotion:
         left = time > now_s
         if not np.any(left):
             raise InputError("all points of the trajectory lie in the past: there is no way left")
-        rows = np.stack([*(part[left] for part in given)], axis=1)
-        first = np.stack(begin[: len(given)])[None]
-        self._path = BPoly.from_derivatives(
-            np.concatenate([[now_s], time[left]]), np.concatenate([first, rows])
-        )
+        knots = np.append(now_s, time[left])
+        points = [np.vstack([first, part[left]]) for first, part in zip(begin, given, strict=False)]
+        self._path = BPoly(_bernstein(knots, points), knots)
         self._rate = self._path.derivative()
         self._begin_s, self.end_s = now_s, float(time[-1])
 
@@ -79,9 +79,15 @@ class JointMotion:
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Joints (k, n) and their velocities at times (k,) from the last trajectory's begin on."""
         t = np.asarray(time_s, dtype=np.float64)
-        inside = np.clip(t, self._begin_s - EARLIER_S, self.end_s)
         moving = (t < self.end_s)[:, None]
-        return np.asarray(self._path(inside)), np.where(moving, self._rate(inside), 0.0)
+        return self.joints(t), np.where(moving, self._rate(self._inside(t)), 0.0)
+
+    def joints(self, time_s: Array) -> Array:
+        """The joints (k, n) alone."""
+        return np.asarray(self._path(self._inside(time_s)))
+
+    def _inside(self, time_s: Array) -> Array:
+        return np.clip(time_s, self._begin_s - EARLIER_S, self.end_s)
 
     def _stand(self, now_s: float, q: Array) -> None:
         from scipy.interpolate import BPoly
@@ -89,3 +95,21 @@ class JointMotion:
         self._begin_s = self.end_s = now_s
         self._path = BPoly(np.tile(q, (1, 1, 1)), [now_s, now_s + 1.0])
         self._rate = BPoly(np.zeros((1, 1, len(q))), [now_s, now_s + 1.0])
+
+
+def _bernstein(time_s: Array, rows: Sequence[Array]) -> Array:
+    """Coefficients (2 r, k - 1, n) of the polynomials through points (k,) with r ``rows`` (k, n).
+
+    ``rows``: positions, velocities, accelerations, of which the later ones may be missing.
+    """
+    h = np.diff(time_s)[:, None]
+    degree = 2 * len(rows) - 1
+    start, end = [rows[0][:-1]], [rows[0][1:]]
+    if len(rows) > 1:
+        start.append(start[0] + rows[1][:-1] * h / degree)
+        end.append(end[0] - rows[1][1:] * h / degree)
+    if len(rows) > 2:
+        bend = h**2 / (degree * (degree - 1))
+        start.append(2.0 * start[1] - start[0] + rows[2][:-1] * bend)
+        end.append(2.0 * end[1] - end[0] + rows[2][1:] * bend)
+    return np.stack([*start, *reversed(end)])

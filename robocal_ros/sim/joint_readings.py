@@ -58,7 +58,7 @@ class JointReadings:
 
     def _freeze(self, q: Array, qd: Array) -> None:
         """One encoder shows what it showed when the fault began."""
-        joint = int(self._faults.size("frozen_encoder")) - 1
+        joint = min(int(self._faults.size("frozen_encoder")), self._n) - 1
         if joint < 0:
             self._stuck = None
         elif len(q):

@@ -1,9 +1,10 @@
 """A whole cell: a KR 150 with a pin and a ball, a sphere sensor on its right, beams on its left.
 
 All figures are plausible, none measured. `kr150_cell.csv` holds its poses: ``home``, ``tool`` (the
-pin's tip 120 mm above the beams), ``cycle`` (six that show the ball to the sensor, in their order)
-and ``work`` (27, in the order of the programme). From home to each of them, and from each to the
-next of its kind, the joints' straight way keeps clear of everything that stands in the cell.
+pin's tip 120 mm above the beams), ``cycle`` (six that show the ball to the sensor, in their order),
+``work`` (27, in the order of the programme) and ``profile`` (12 that show a ball on a stem to the
+flange's line laser). From home to each of them, and from each to the next of its kind, the joints'
+straight way keeps clear of everything that stands in the cell.
 """
 
 from dataclasses import replace
@@ -20,8 +21,10 @@ from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, 
 from robocal_ros.sim.cell_plan import CellPlan
 from robocal_ros.sim.drift import UNCORRECTED
 from robocal_ros.sim.heating import HeatPlan
-from robocal_ros.sim.motion import JITTER_RAD
 from robocal_ros.sim.poses import read_poses
+from robocal_ros.sim.profile_sensor import ProfileSensor
+from robocal_ros.sim.profile_station import ProfileStation
+from robocal_ros.sim.profile_targets import ball_on_table
 from robocal_ros.sim.robot import Effects, TrueRobot
 from robocal_ros.sim.sphere_station import SphereStation
 from robocal_ros.sim.thermal import Warmth
@@ -30,14 +33,15 @@ Array = NDArray[np.float64]
 
 TAUGHT = frames.transform(np.eye(3), [0.0, 0.0, 0.40])  # the pin, longer than the ball's stem
 PIN_RADIUS_M = 2.5e-3
-T_BASE_LASER = frames.transform(
-    frames.exp_rotation([0.0, 0.0, np.radians(-135.0)]) @ frames.exp_rotation([0.02, -0.03, 0.0]),
-    [1.25, 1.00, 0.60],
-)
+T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.03, 0.01]), [1.25, 1.00, 0.60])
+SPIN_RAD = float(np.radians(-135.0))  # of the flange about the laser's z, where the robot measures
 BEAM_ANGLE_RAD = float(np.radians(91.4))
 BEAM_GAP_M = 5.8e-5
 INPUT = TrueInput(latency_s=0.004)
 NOISE = TrueNoise(step_m=0.0, edge_m=1e-5)  # the scatter of a motion is in the joints
+T_FLANGE_LASER = frames.transform(np.eye(3), [-0.12, 0.0, 0.10])
+TARGET = np.array([1.15, -0.60, 0.50])  # a ball on a stem
+TARGET_RADIUS_M = 0.0125
 FLOOR = np.array([-0.28, 0.22, 0.84])  # sphere on a post, in the sensor's frame
 DUTY = np.array([0.5, 1.0, 1.0, 0.8, 0.6, 0.6])  # of the programme at its usual speed
 PROGRAMME_RAD_S = np.array([0.296, 0.216, 0.172, 0.358, 0.300, 0.466])  # its mean joint speeds
@@ -50,12 +54,19 @@ def poses(kind: str) -> Array:
 
 
 def kr150_cell(
-    nominal: SerialArm, seed: int = 1, effects: Effects | None = None, points: int = 2000
+    nominal: SerialArm,
+    seed: int = 1,
+    effects: Effects | None = None,
+    points: int = 2000,
+    reading_noise_rad: float = 0.0,
+    profile: bool = False,
 ) -> CellPlan:
     """The cell with an individual robot, at home.
 
-    ``nominal``: the type's arm; ``points`` of a sphere's cloud, 0: centres alone. The robot's drift
-    has the published size: with the programme all day, 45 % of the tip's coordinates at the working
+    ``nominal``: the type's arm; ``points`` of a sphere's cloud, 0: centres alone;
+    ``reading_noise_rad``: of the encoders, which then show whole counts too;
+    ``profile``: with a line laser on the flange. The robot's drift has
+    the published size: with the programme all day, 45 % of the tip's coordinates at the working
     poses stay within 0.1 mm.
     """
     arm = replace(nominal, T_flange_tool=TAUGHT)
@@ -65,12 +76,18 @@ def kr150_cell(
         station=BeamStation(beams_of(T_BASE_LASER, BEAM_ANGLE_RAD, BEAM_GAP_M), INPUT, NOISE),
         tool=RoundTool.cylinder(TAUGHT, PIN_RADIUS_M),
         q_start=poses("home")[0],
-        reading_noise_rad=JITTER_RAD,
+        reading_noise_rad=reading_noise_rad,
         heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),
+        profile=_line_laser() if profile else None,
         working=poses("work"),
         seed=seed,
     )
+
+
+def _line_laser() -> ProfileStation:
+    scene = ball_on_table(TARGET, TARGET_RADIUS_M)
+    return ProfileStation(ProfileSensor(), T_FLANGE_LASER, scene, TARGET)
 
 
 def _as_published(robot: TrueRobot, working: Array) -> TrueRobot:

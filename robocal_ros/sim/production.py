@@ -17,7 +17,8 @@ def programme(
     """Times (k,) from 0, joints, velocities and accelerations (k, n) of a way through poses.
 
     From ``q_start`` (n,) at rest to each of ``poses`` (m, n) in turn, with a rest at each: what
-    `SimulatedCell.follow` takes. ``speed``: of the fastest joint, rad/s (prismatic: m/s).
+    `SimulatedCell.follow` takes. ``speed``: of the fastest joint, rad/s
+    (prismatic: m/s); ``rest_s`` longer than 0.
     """
     points = np.vstack([np.asarray(q_start)[None], np.asarray(poses)])
     moves = np.maximum(PEAK * np.max(np.abs(np.diff(points, axis=0)), axis=1) / speed, SHORTEST_S)

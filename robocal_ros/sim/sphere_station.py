@@ -14,6 +14,7 @@ from robocal_ros.sim.sphere_cloud import sphere_cloud
 Array = NDArray[np.float64]
 
 CLEAR_RAD = float(np.radians(60.0))  # between the stem and the view, else the stem hides the sphere
+ROOM = 1.3  # the field's corners are farther than its middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +38,11 @@ class SphereStation:
     settle_s: float = 0.5
     period_s: float = 1.0
     delay_s: float = 0.15
+
+    def near(self, T_base_flange: Array) -> bool:
+        """Whether the sphere may be in the field at a flange pose (4, 4) known to centimetres."""
+        ball = self.sensor.T_sensor_base @ T_base_flange @ np.append(self.sensor.ball, 1.0)
+        return bool(np.linalg.norm(ball[:3]) < ROOM * self.field.far_m)
 
     def sees(self, T_base_flange: Array) -> bool:
         """Whether the sphere is in the field, in front of its stem, at a flange pose (4, 4)."""

@@ -1,5 +1,6 @@
 """The simulated cell over DDS, in its own time."""
 
+import json
 from array import array
 from typing import Any
 
@@ -7,13 +8,16 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TransformStamped
+from geometry_msgs.msg import PointStamped, TransformStamped
 from rclpy.parameter import Parameter
 from robocal_msgs.msg import BeamEvent, ToolStep
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, PointCloud2, Temperature
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core import frames
+from robocal_ros.core.fitting.sphere import SphereRule
+from robocal_ros.core.samples import cloud_sample
 from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion, MeasuringPlan
 from robocal_ros.nodes import qos
@@ -21,6 +25,7 @@ from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.cell_sim_settings import SETTINGS, laser_pose, straight_arm
 from robocal_ros.nodes.conversions import header, transform_message
 from robocal_ros.sim.beams import beams_of
+from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.storage.tool_tables import read_beam_points
 
 DEFAULTS = {setting.name: setting.default for setting in SETTINGS}
@@ -282,3 +287,97 @@ def test_the_cell_goes_on_after_a_pause(graph):
 def test_joints_that_do_not_fit_the_robot_are_refused(graph):
     node = graph.add(CellSimNode, {"q_start_deg": [0.0, 1.0]})
     assert node.state == "unconfigured"
+
+
+class WholeCell(Cell):
+    """The cell around a KR 150."""
+
+    def __init__(self, graph: Any, **parameters: Any) -> None:
+        kinds = {
+            "sphere_cloud": PointCloud2,
+            "sphere_center": PointStamped,
+            "reference_sphere_center": PointStamped,
+            "motor_temperatures": Temperature,
+            "/cell_sim_node/truth/state": String,
+        }
+        self.told = {topic: graph.collect(kind, topic) for topic, kind in kinds.items()}
+        super().__init__(graph, cell="kr150", **parameters)
+        self.to_judge = graph.publisher(JointTrajectory, "/cell_sim_node/truth/commanded")
+
+    @property
+    def names(self) -> list[str]:
+        return list(self.states[0].name)
+
+    def go(self, q: Any, time_s: float) -> None:
+        """Publish a trajectory with points in the arm's own order."""
+        self.to_path.publish(self.trajectory([q], time_s))
+
+    def trajectory(self, rows: Any, time_s: float = 1.0) -> JointTrajectory:
+        points = [
+            JointTrajectoryPoint(
+                positions=array("d", row),
+                velocities=array("d", np.zeros(6)),
+                time_from_start=Duration(sec=i, nanosec=round(time_s % 1 * 1e9)),
+            )
+            for i, row in enumerate(np.asarray(rows), start=int(time_s))
+        ]
+        return JointTrajectory(joint_names=self.names, points=points)
+
+    def truth(self) -> dict[str, Any]:
+        return json.loads(self.told["/cell_sim_node/truth/state"][-1].data)
+
+    def wait_for(self, topic: str, count: int) -> None:
+        self.graph.spin_until(lambda: len(self.told[topic]) >= count, topic)
+
+
+def test_the_whole_cell_shows_its_spheres_and_temperatures(graph):
+    cell = WholeCell(graph, cloud_points=300)
+    cell.go(poses("cycle")[0], 1.5)
+    cell.wait_for("sphere_cloud", 2)
+    cloud = cell.told["sphere_cloud"][0]
+    ball = cloud_sample(cloud, SphereRule(0.01905))
+    assert (ball.frame, ball.target) == ("sensor", "ball")
+    sphere = cell.node._cell.plan.sphere
+    T = sphere.sensor.T_sensor_base @ cell.node._cell.flange(np.array([cell.node._cell.now_s]))[0]
+    centre = (T @ np.append(sphere.sensor.ball, 1.0))[:3]
+    assert ball.position_m == pytest.approx(centre, abs=2e-4)
+    cell.wait_for("reference_sphere_center", 1)
+    floor = cell.told["reference_sphere_center"][0]
+    assert floor.header.frame_id == "sensor/floor"
+    assert floor.header.stamp == cloud.header.stamp
+    assert [floor.point.x, floor.point.y, floor.point.z] == pytest.approx(sphere.floor, abs=1e-4)
+    cell.wait_for("motor_temperatures", 12)
+    named = [m.header.frame_id for m in cell.told["motor_temperatures"][:12]]
+    assert named == cell.names * 2
+    assert cell.told["motor_temperatures"][0].temperature == pytest.approx(22.0, abs=0.6)
+    assert not cell.told["sphere_center"]
+
+
+def test_centres_in_place_of_clouds(graph):
+    cell = WholeCell(graph, cloud_points=0)
+    cell.go(poses("cycle")[1], 1.5)
+    cell.wait_for("sphere_center", 1)
+    assert cell.told["sphere_center"][0].header.frame_id == "sensor/ball"
+    assert not cell.told["sphere_cloud"]
+
+
+def test_the_truth_says_what_is_wrong_and_by_how_much(graph):
+    cell = WholeCell(graph, fault_size=3.0)
+    cell.wait_for("/cell_sim_node/truth/state", 1)
+    assert cell.truth()["simulated"]
+    assert cell.truth()["tcp_error_rms_m"] < 1e-5
+    cell.set(fault="collision")
+    cell.graph.spin_until(lambda: cell.truth()["faults"], "the collision")
+    assert cell.truth()["faults"] == pytest.approx({"collision": 3e-3})
+    assert cell.truth()["tcp_error_rms_m"] == pytest.approx(3e-3, rel=0.05)
+    work = poses("work")
+    cell.to_judge.publish(cell.trajectory(work + 1e-3 * np.eye(6)[0]))
+    key = "commanded_tcp_error_rms_m"
+    cell.graph.spin_until(lambda: key in cell.truth(), "it is judged")
+    wanted = cell.node._cell.tcp_error(work + 1e-3 * np.eye(6)[0])
+    assert cell.truth()[key] == pytest.approx(np.sqrt(np.mean(np.sum(wanted**2, axis=1))), rel=0.01)
+    cell.to_judge.publish(cell.trajectory(work[:3]))
+    judged = cell.node.inputs["~/truth/commanded"]
+    cell.graph.spin_until(lambda: judged.invalid == 1, "too few poses")
+    cell.set(fault="none")
+    cell.graph.spin_until(lambda: not cell.truth()["faults"], "all is well again")

@@ -43,15 +43,19 @@ def driven(cell: SimulatedCell, step) -> Happened:
 
 
 def measured(
-    cell: SimulatedCell, laser: LaserFrame, noise: RobotNoise
+    cell: SimulatedCell,
+    laser: LaserFrame,
+    noise: RobotNoise,
+    taught: np.ndarray = TAUGHT,
+    spin_rad: float = 0.0,
 ) -> tuple[ToolEstimate, list[int]]:
     """A whole run with each step driven as it follows from those before; edges of each step."""
-    plan = MeasuringPlan("full", laser, TAUGHT)
+    plan, arm = MeasuringPlan("full", laser, taught, spin_rad=spin_rad), cell.plan.arm
     steps, time, q, seen = [], [], [], None
 
     def estimate(held: Held) -> ToolEstimate:
-        path = JointPath(ARM, np.concatenate(time), np.concatenate(q))
-        return estimate_tool(laser, path, steps, TAUGHT, noise=noise, held=held)
+        path = JointPath(arm, np.concatenate(time), np.concatenate(q))
+        return estimate_tool(laser, path, steps, taught, noise=noise, held=held)
 
     for number in range(1, len(plan.names) + 1):
         if plan.needs_tool(number):
