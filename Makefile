@@ -36,7 +36,7 @@ demo: setup  ## a simulated shift through the live nodes, with a report in out/
 # timed to milliseconds stands beside what mostly computes or waits.
 HALF := test/core test/sessions test/sim test/report
 REST := $(HALF:%=--ignore=%) --ignore=test/nodes
-TIMED := $(addprefix test/nodes/test_,base cell_sim_node joint_correction_node launch replay_node run \
+TIMED := $(addprefix test/nodes/test_,base cell_sim_node joint_correction_node launch maintenance_node replay_node run \
 	tcf_node thermal_node tool_cell trajectory_proxy)
 TIMED := $(TIMED:%=%.py)
 test: setup  ## all tests; TESTS="test/core -k tool" for some

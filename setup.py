@@ -43,6 +43,7 @@ setup(
             "thermal_node = robocal_ros.nodes.thermal_node:main",
             "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
             "cell_sim_node = robocal_ros.nodes.cell_sim_node:main",
+            "maintenance_node = robocal_ros.nodes.maintenance_node:main",
             "replay_node = robocal_ros.nodes.replay_node:main",
         ]
     },

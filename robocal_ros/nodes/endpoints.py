@@ -179,6 +179,12 @@ class EndpointNode(LifecycleNode):
             service = self.create_service(kind, name, answer)
         self._release.append(lambda: self.destroy_service(service))
 
+    def add_client(self, kind: type, name: str) -> Any:
+        """Return a client of another node's service, until cleanup."""
+        client = self.create_client(kind, name)
+        self._release.append(lambda: self.destroy_client(client))
+        return client
+
     def add_timer(
         self, period_s: float, callback: Callable[[], None], *, steady: bool = False
     ) -> Timer:

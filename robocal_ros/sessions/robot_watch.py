@@ -16,19 +16,23 @@ Array = NDArray[np.float64]
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 REST_RAD = 1e-4  # a robot that rests moves less
 BACK_S = 1.0  # stamps that go back by more began anew
-LATE_S = 0.15  # a controller lags at most so far behind its trajectory
+APART_S = 0.00375  # instants of the plan that a reading is compared with
 
 
 class RobotWatch:
     """Readings of the joints as they arrive, and the plan in force; times of a steady clock.
+
+    Parameters
+    ----------
+    late_s : the robot lags at most so far behind its plan.
 
     Attributes
     ----------
     silence : how long no new reading came.
     """
 
-    def __init__(self, arm: SerialArm) -> None:
-        self._arm = arm
+    def __init__(self, arm: SerialArm, late_s: float) -> None:
+        self._arm, self._late_s = arm, late_s
         self.silence = Silence()
         self._heard_s = self._sent_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
@@ -88,7 +92,9 @@ class RobotWatch:
         if self._plan is None or self._cell is None or not self._readings:
             return 0.0, 0.0
         at_s, q = self._heard_s - self._sent_s, self._readings[-1][1]
-        times = np.clip(np.linspace(at_s - LATE_S, at_s, 41), 0.0, self._plan.duration_s)
+        count = round(self._late_s / APART_S) + 1
+        times = np.linspace(at_s - self._late_s, at_s, count)
+        times = np.clip(times, 0.0, self._plan.duration_s)
         planned, _ = self._plan.at(times)
         joints = np.max(np.abs(planned - q) * ~self._arm.prismatic, axis=1)
         T = self._cell.arm.fk(np.vstack([planned, q]))

@@ -75,7 +75,7 @@ class ToolDriver:
         self._send, self._ask = send, ask
         self.phase, self.armed, self.told = Phase.IDLE, False, ""
         self._armed_at_s = 0.0
-        self._robot = RobotWatch(session.nominal)
+        self._robot = RobotWatch(session.nominal, config.late_s)
         self._cell: MotionCell | None = None
         self._beams: Counter[bool] = Counter()
         self._kind = ""  # of the last step that was driven

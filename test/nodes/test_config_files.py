@@ -10,12 +10,13 @@ from rclpy.qos import ReliabilityPolicy
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.replay_node import ReplayNode
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import INPUTS, ThermalNode
 
 CONFIG = Path(__file__).parents[2] / "config"
-NODES = (ThermalNode, TcfNode, HandEyeNode, ReplayNode, CellSimNode)
+NODES = (ThermalNode, TcfNode, HandEyeNode, ReplayNode, CellSimNode, MaintenanceNode)
 
 
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)

@@ -1,7 +1,7 @@
 """A simulated robot with a thermal and a tool node that may fail in any way, under one session."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,7 @@ TIMES = Times(
     full_s=8.0,
     tool_home_s=3.5,
     reserve_s=0.3,
+    rest_s=2.0,
     stale_s=STALE_S,
 )
 
@@ -89,7 +90,7 @@ class Shelf:
 
 
 @dataclass
-class Broken(Exception):
+class NeverError(Exception):
     """The session did what it must never do."""
 
     words: str
@@ -108,7 +109,6 @@ class ToolNode:
 class Cell:
     """Robot, nodes and PLC around one session, in steps of `TICK_S`."""
 
-    folder: Path
     history: Any
     config: MaintenanceConfig = field(default_factory=config_of)
     shelf: Shelf = field(default_factory=Shelf)
@@ -154,7 +154,7 @@ class Cell:
             return error.code
         if not known:
             if cycle_id in self.begun:
-                raise Broken(f"cycle {cycle_id} ran twice")
+                raise NeverError(f"cycle {cycle_id} ran twice")
             self.begun.append(cycle_id)
             self.ends_s = self.now_s + gap_s
         return Code.ACCEPT
@@ -169,7 +169,7 @@ class Cell:
 
     @property
     def state(self) -> State:
-        return self.session.status(self.now_s).state
+        return self.session.state
 
     @property
     def wall_ns(self) -> int:
@@ -215,6 +215,7 @@ class Cell:
             self._require_allowed(request)
         if isinstance(request, ask.Move):
             self._require_fit(request)
+            self._require_taught(request.plan)
         match request:
             case ask.Move() | ask.Stop():
                 self.coming.append((self.now_s + LAG_S, request.plan))
@@ -274,9 +275,9 @@ class Cell:
 
     def _require_allowed(self, request: ask.Request) -> None:
         if not self.heard or self.now_s - self.beat_s > STALE_S:
-            raise Broken(f"{type(request).__name__} while the gap is closed or stale")
+            raise NeverError(f"{type(request).__name__} while the gap is closed or stale")
         if isinstance(request, ask.Move) and self.tool.armed:
-            raise Broken("a motion while the tool node is armed")
+            raise NeverError("a motion while the tool node is armed")
 
     def _require_fit(self, request: ask.Move) -> None:
         """The plan, and the straight way home from its end at full speed, within what is left."""
@@ -284,12 +285,25 @@ class Cell:
         velocity = np.max(np.asarray(DRIVING.limits.joint_velocity))
         shortest_s = float(np.max(np.abs(plan.q[-1] - HOME)) / velocity)
         if self.now_s + plan.duration_s + shortest_s > self.ends_s:
-            raise Broken("a motion that does not fit the gap with the way home")
+            raise NeverError("a motion that does not fit the gap with the way home")
         if request.worst_s < plan.duration_s or self.now_s + request.worst_s > self.ends_s:
-            raise Broken("a step whose worst case does not fit the gap")
+            raise NeverError("a step whose worst case does not fit the gap")
+
+    def _require_taught(self, plan: JointPlan) -> None:
+        """A way to a pose follows the taught lines, all of it."""
+        if np.max(np.abs(plan.q[-1] - HOME)) < 1e-9:
+            return
+        points = np.vstack([HOME, self.config.poses, HOME])
+        beside = np.full(len(plan.q), np.inf)
+        for start, end in pairwise(points):
+            share = np.clip((plan.q - start) @ (end - start) / np.sum((end - start) ** 2), 0.0, 1.0)
+            away = np.max(np.abs(start + share[:, None] * (end - start) - plan.q), axis=1)
+            beside = np.minimum(beside, away)
+        if np.max(beside) > self.config.home_near + 1e-6:
+            raise NeverError("a way that nobody taught")
 
     def at_home(self) -> bool:
-        return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near_rad)
+        return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near)
 
 
 def passed() -> Answer:

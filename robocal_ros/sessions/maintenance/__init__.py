@@ -10,7 +10,6 @@ tool_part     quick check, full measurement, verification
 hands         what a script does with robot and nodes
 mover         one motion at a time, supervised
 ways          the ways that the robot may take
-gap           whether the robot may be moved, and how long yet
 deciding      accept, reject, roll back; what needs no person
 memory        what outlives a restart
 accuracy      drift, tool and faults in one state

@@ -46,7 +46,7 @@ class Conductor:
         run.at(wall_ns)
         try:
             if why := hands.gap.over(hands.now_s):
-                self._gap_over(why)
+                self.give_up(why)
                 return
             hands.robot.require_sane(hands.now_s)
             if self._script is not None:
@@ -76,9 +76,11 @@ class Conductor:
         self._tell(FAULT, {}, code, reason)
         self._keep(run, code, reason, fault=reason)
 
-    def _gap_over(self, why: str) -> None:
-        """At home and disarmed the run just ends; anywhere else it is a fault."""
+    def give_up(self, why: str) -> None:
+        """End the run now: at home and disarmed it just ends, anywhere else it is a fault."""
         hands = self._hands
+        if self.run is None:
+            return
         if hands.engaged or hands.robot.moving or hands.robot.beside_home():
             self.fault(Code.CONFLICT, f"{why}, and the robot is not handed over at home")
         else:
@@ -87,6 +89,8 @@ class Conductor:
     def _script_ended(self, run: Run) -> None:
         if away := self._hands.robot.beside_home():
             self.fault(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
+        elif self._hands.engaged:
+            self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)
         else:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.sessions.driving_config import DrivingConfig
@@ -42,18 +42,20 @@ class Times:
     check_s, full_s : a quick check and a full measurement of the tool, from home to its end.
     tool_home_s : kept free for the way home from the beams.
     reserve_s : kept free before the end of a gap.
+    rest_s : after a motion's end, until the robot rests where it ends.
     stale_s : ``gap_open`` may pause for so long.
     """
 
-    answer_s: float = 2.0
+    answer_s: float = 1.0
     solve_s: float = 6.0
     settle_s: float = 0.3
     stay_s: float = 0.2
     measure_s: float = 3.0
-    check_s: float = 30.0
-    full_s: float = 60.0
-    tool_home_s: float = 20.0
+    check_s: float = 15.0
+    full_s: float = 30.0
+    tool_home_s: float = 10.0
     reserve_s: float = 1.0
+    rest_s: float = 1.0
     stale_s: float = 0.5
 
     def __post_init__(self) -> None:
@@ -75,7 +77,7 @@ class MaintenanceConfig:
     T_base_laser : (4, 4) of the beam station; None: no tool measurement.
     driving : limits, sizes and deviations; its limits hold at the station.
     travel_speed_m_s : of the tip on the ways between taught poses.
-    home_near_rad : the robot is at home with all joints so near (prismatic: m).
+    home_near : (n,), or one for all: the robot is at home with all joints so near, rad (m).
     measurements : so many make a pose measured.
     resume_within_s : an unfinished thermal cycle goes on when its last pose is no older.
     check_every_s, full_every_s : tool measurements that are due without a reason; 0: in each gap,
@@ -91,7 +93,7 @@ class MaintenanceConfig:
     driving: DrivingConfig
     T_base_laser: Array | None = None
     travel_speed_m_s: float = 0.25
-    home_near_rad: float = float(np.radians(0.5))
+    home_near: ArrayLike = float(np.radians(0.5))
     measurements: int = 1
     resume_within_s: float = 240.0
     check_every_s: float = 0.0

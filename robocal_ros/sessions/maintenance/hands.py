@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, LimitError
+from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
-from robocal_ros.sessions.maintenance.gap import Gap
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
 from robocal_ros.sessions.maintenance.requests import (
     Answer,
@@ -25,7 +25,7 @@ from robocal_ros.sessions.maintenance.requests import (
     Stop,
 )
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
-from robocal_ros.sessions.tool_driving import REST_WITHIN_S, SETTLED_S, STANDS_S
+from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
 
 Array = NDArray[np.float64]
 R = TypeVar("R")
@@ -69,6 +69,11 @@ class Hands:
     def fits(self, worst_s: float) -> bool:
         """Whether something that lasts so long at the most, way home included, fits the gap."""
         return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
+
+    def handed_out(self) -> list[Request]:
+        """The requests that wait; they are somebody else's now."""
+        found, self.out = self.out, []
+        return found
 
     # ---- requests -------------------------------------------------------------------------------
 
@@ -180,7 +185,7 @@ class Hands:
         FaultError
             When it does not come to rest.
         """
-        until_s = self.now_s + REST_WITHIN_S
+        until_s = self.now_s + self.config.times.rest_s
         while (q := self.robot.resting(span_s)) is None:
             if self.now_s >= until_s:
                 words = "the robot does not come to rest, or its joint states are missing"

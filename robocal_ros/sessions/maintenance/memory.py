@@ -87,7 +87,8 @@ class Memory:
     Attributes
     ----------
     fault_code, fault : what stopped the maintenance until it is acknowledged; empty: nothing.
-    running : the cycle that was open when it was kept.
+    running : the cycle that is open.
+    crashed : a cycle was open when it was read.
     """
 
     keeper: Keeper
@@ -96,6 +97,7 @@ class Memory:
     fault_code: Code = Code.NONE
     fault: str = ""
     running: str = ""
+    crashed: bool = False
 
     @classmethod
     def load(cls, keeper: Keeper) -> "Memory":
@@ -119,6 +121,7 @@ class Memory:
             str(document["running"]),
         )
         if memory.running:
+            memory.crashed = True
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
             result = CycleResult(memory.running, Code.CONFLICT, words)
             memory.end(result, Code.CONFLICT, words)

@@ -10,7 +10,6 @@ from robocal_ros.core.motion.stopping import stop
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Line, Route, Ways
 from robocal_ros.sessions.robot_watch import RobotWatch
-from robocal_ros.sessions.tool_driving import REST_WITHIN_S
 
 Array = NDArray[np.float64]
 
@@ -34,7 +33,7 @@ class Mover:
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
         self._config, self._ways = config, ways
         self._arm = ways.cell.arm
-        self._watch = RobotWatch(self._arm)
+        self._watch = RobotWatch(self._arm, config.driving.late_s)
         self._q: Array | None = None
         self._route: Route | None = None
         self._sent_s = 0.0
@@ -65,14 +64,15 @@ class Mover:
         if self._q is None or self.silent:
             return "joint states are missing"
         away = np.abs(self._q - self._config.home)
-        joint = int(np.argmax(away))
-        if away[joint] <= self._config.home_near_rad:
+        near = np.broadcast_to(self._config.home_near, away.shape)
+        joint = int(np.argmax(away / near))
+        if away[joint] <= near[joint]:
             return ""
-        near, name = self._config.home_near_rad, self._arm.joint_names[joint]
-        if self._arm.prismatic[joint]:
-            return f"{name} is {away[joint] * 1e3:.1f} mm off (allowed {near * 1e3:.1f} mm)"
-        degrees = np.degrees([away[joint], near])
-        return f"{name} is {degrees[0]:.2f} deg off (allowed {degrees[1]:.2f} deg)"
+        prismatic = self._arm.prismatic[joint]
+        unit, scale = ("mm", 1e3) if prismatic else ("deg", np.degrees(1.0))
+        found, allowed = scale * away[joint], scale * near[joint]
+        name = self._arm.joint_names[joint]
+        return f"{name} is {found:.2f} {unit} off (allowed {allowed:.2f} {unit})"
 
     def resting(self, span_s: float) -> Array | None:
         """The joints where the robot has rested for so long; None while it moves, or is silent."""
@@ -107,7 +107,7 @@ class Mover:
             words = f"joint states are silent for {self._watch.silent_s:.2f} s"
             raise FaultError(Code.TOO_FEW_SAMPLES, f"{words} while the robot moves")
         tip_m, joint_rad = self._watch.away()
-        if not self._kept():
+        if not self._kept(tip_m, joint_rad):
             driving = self._config.driving
             raise FaultError(
                 Code.LIMIT_EXCEEDED,
@@ -115,15 +115,16 @@ class Mover:
                 f"its plan (allowed {driving.deviation_m * 1e3:.1f} mm, "
                 f"{np.degrees(driving.deviation_rad):.2f} deg)",
             )
-        if self._watch.overdue_s(now_s) > REST_WITHIN_S:
-            words = f"the motion ended {REST_WITHIN_S:g} s ago, but the robot is not where it ends"
+        rest_s = self._config.times.rest_s
+        if self._watch.overdue_s(now_s) > rest_s:
+            words = f"the motion ended {rest_s:g} s ago, but the robot is not where it ends"
             raise FaultError(Code.LIMIT_EXCEEDED, words)
 
     def stop(self, now_s: float) -> JointPlan | None:
         """The stop of what moves, None where nothing does."""
         if self._route is None or not self._watch.heard:
             return None
-        state = self._watch.state(now_s, keeps=self._kept())
+        state = self._watch.state(now_s, keeps=self._kept(*self._watch.away()))
         self.place = self._route.line_at(now_s - self._sent_s)
         if self.place == (STATION[0], HOME):
             self.place = STATION
@@ -131,7 +132,6 @@ class Mover:
         self._watch.forget()
         return stop(self._arm, self._config.driving.limits, *state)
 
-    def _kept(self) -> bool:
-        tip_m, joint_rad = self._watch.away()
+    def _kept(self, tip_m: float, joint_rad: float) -> bool:
         driving = self._config.driving
         return tip_m <= driving.deviation_m and joint_rad <= driving.deviation_rad

@@ -27,7 +27,7 @@ from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
-from robocal_ros.sessions.maintenance.ways import Ways
+from robocal_ros.sessions.maintenance.ways import HOME, Ways
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 Array = NDArray[np.float64]
@@ -60,6 +60,8 @@ class MaintenanceSession:
         self._memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
         self._hands = Hands(config, self.ways)
+        # A cycle that was open may have left the tool's driver armed.
+        self._hands.engaged = self._memory.crashed and config.T_base_laser is not None
         self._book = CycleBook()
         self._record = record
         self._conductor = Conductor(self._hands, self._memory, self._tell)
@@ -118,6 +120,7 @@ class MaintenanceSession:
             words = f"robot is not at home: {away}"
             self._conductor.fault(Code.LIMIT_EXCEEDED, words)
             raise LimitError(f"{words}: bring it home, then acknowledge")
+        hands.robot.place = (HOME, HOME)
         memory.begin(cycle_id)
         run = Run(cycle_id, hands, self._book, self._decider, memory, self._decided)
         run.at(wall_ns)
@@ -174,6 +177,7 @@ class MaintenanceSession:
             raise ConflictError("the tool node has not confirmed that it is disarmed: wait for it")
         words = f"acknowledged: {self._memory.fault}"
         self._memory.set_fault(Code.NONE, "")
+        self._hands.doing = ""
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words
 
@@ -183,8 +187,13 @@ class MaintenanceSession:
         hands.now_s = now_s
         hands.robot.look(now_s)
         self._conductor.tick(wall_ns)
-        found, hands.out = hands.out, []
-        return found
+        return hands.handed_out()
+
+    def give_up(self, reason: str, now_s: float) -> list[Request]:
+        """The driver goes: stop and disarm, to be carried out at once; a fault unless at home."""
+        self._hands.now_s = now_s
+        self._conductor.give_up(reason)
+        return self._hands.handed_out()
 
     # ---- what is said ---------------------------------------------------------------------------
 
@@ -201,20 +210,30 @@ class MaintenanceSession:
         """How a cycle ended, or how far it is; None where it is not known."""
         return self._known(cycle_id)
 
+    @property
+    def running(self) -> CycleResult | None:
+        """The cycle that runs, as far as it has come."""
+        run = self._conductor.run
+        return None if run is None else run.result
+
+    @property
+    def state(self) -> State:
+        """What it is at."""
+        if self._memory.fault:
+            return State.FAULT
+        if self._conductor.run is None:
+            return State.IDLE
+        return State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
+
     def status(self, now_s: float) -> Status:
         """Everything at once."""
         memory, hands, run = self._memory, self._hands, self._conductor.run
-        state = State.IDLE
-        if memory.fault:
-            state = State.FAULT
-        elif run is not None:
-            state = State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
         last = next(reversed(memory.cycles.values()), None)
         named = last.cycle_id if last is not None else ""
         pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
         thermal, tool = (found[0].id if found else 0 for found in pending)
         return Status(
-            state=state,
+            state=self.state,
             cycle_id=named if run is None else run.result.cycle_id,
             doing=hands.doing,
             left_s=0.0 if run is None else max(hands.gap.left_s(now_s), 0.0),
@@ -244,7 +263,8 @@ class MaintenanceSession:
         return self._memory.cycles.get(cycle_id)
 
     def _decided(self, outcome: Outcome) -> None:
-        self._record(outcome.command, outcome)
+        if not outcome.repeated:
+            self._record(outcome.command, outcome)
 
     def _tell(self, name: str, arguments: dict[str, object], code: Code, words: str) -> None:
         command = Command(name, arguments)

@@ -8,7 +8,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.requests import Answer, BeginCycle, EndCycle
 from robocal_ros.sessions.maintenance.ways import HOME
-from robocal_ros.sessions.tool_driving import REST_WITHIN_S, STANDS_S
+from robocal_ros.sessions.tool_driving import STANDS_S
 
 NODE = "thermal node"
 
@@ -122,4 +122,4 @@ class ThermalPart:
 
     def _step_s(self, way_s: float, home_s: float) -> float:
         """Way, rest, measurement, way home, rest: at the most."""
-        return way_s + home_s + 4.0 * REST_WITHIN_S + self._times.measure_s
+        return way_s + home_s + 4.0 * self._times.rest_s + self._times.measure_s

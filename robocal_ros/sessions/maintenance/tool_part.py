@@ -11,7 +11,7 @@ from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook
-from robocal_ros.sessions.tool_driving import REST_WITHIN_S, STANDS_S
+from robocal_ros.sessions.tool_driving import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 NS = 1_000_000_000
@@ -66,7 +66,7 @@ class ToolPart:
         times = self._times
         limit_s = times.check_s if mode == QUICK else times.full_s
         # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
-        return limit_s + 3.0 * times.answer_s + 4.0 * REST_WITHIN_S + times.tool_home_s
+        return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + times.tool_home_s
 
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""

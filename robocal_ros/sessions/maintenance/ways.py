@@ -11,10 +11,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import InputError, LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.cell import MotionCell
 from robocal_ros.core.motion.housing import ToolBody
+from robocal_ros.core.motion.measuring import along, raised_way
 from robocal_ros.core.motion.plan import JointPlan, joined
 from robocal_ros.core.motion.travel import departure, joint_way
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
@@ -54,7 +55,7 @@ class Ways:
     Raises
     ------
     InputError
-        When poses have another number of joints.
+        When poses have another number of joints, or ``tool_home_s`` is too short.
     LimitError
         When a taught way breaks a limit, or cuts into the station's housing.
     """
@@ -80,6 +81,7 @@ class Ways:
         if laser is not None:
             for number, plan in enumerate(lines, start=1):
                 self.cell.require_clear(plan, f"taught way {number}")
+            self._require_time(config.times.tool_home_s)
         self._line_s = [plan.duration_s for plan in lines]
 
     @property
@@ -119,6 +121,22 @@ class Ways:
             return self.to(place, q, HOME)
         plan = departure(self.station, q, self._home)
         return Route(plan, ((STATION[0], HOME),), (plan.duration_s,))
+
+    def _require_time(self, tool_home_s: float) -> None:
+        """Refuse a time for the way home from the beams that is surely too short."""
+        cell, here = self.station, self.station.T_base_tip(self._home)
+        there = here.copy()
+        there[:3, 3] = cell.T_base_laser[:3, 3]
+        corners = raised_way(cell, here, there, cell.housing.retract_m)
+        try:
+            way_s = along(cell, self._home, corners, "way from home to the beams").duration_s
+        except LimitError:  # turned as at home it does not get there; tcf_node turns the tool
+            return
+        if way_s > tool_home_s:
+            raise InputError(
+                f"tool_home_s = {tool_home_s:g} s: the way between home and the beams alone takes "
+                f"{way_s:.1f} s; allow more, or teach a home pose that is nearer"
+            )
 
     def _ring(self, first: int, count: int, sense: int) -> list[Line]:
         points = [(first + sense * i) % len(self._points) for i in range(count + 1)]

@@ -1,0 +1,138 @@
+"""Carries out what the maintenance session asks: calls of other nodes, trajectories."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.action import ActionClient
+from rclpy.task import Future
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.srv import BeginCycle, EndCycle
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory
+
+from robocal_ros.core.codes import Code
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.endpoints import EndpointNode
+from robocal_ros.nodes.motion_settings import trajectory_message
+from robocal_ros.nodes.tcf_services import ANSWERS, MODES
+from robocal_ros.sessions.maintenance import requests as asked
+from robocal_ros.sessions.maintenance.requests import Answer
+
+MODE_OF = {name: number for number, name in MODES.items()}
+WORDS_OF = {number: words for words, number in ANSWERS.items()}
+Answered = Callable[[int, Answer], None]
+
+
+class MaintenanceDriver:
+    """Clients of ``thermal_node`` and ``tcf_node``, and ``~/joint_trajectory``.
+
+    Parameters
+    ----------
+    answered : takes the number of a request and what came of it.
+    names : of the joints.
+    """
+
+    def __init__(self, node: EndpointNode, names: tuple[str, ...], answered: Answered) -> None:
+        self._answered, self._names = answered, names
+        self._output = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
+        self._begin = node.add_client(BeginCycle, "thermal_node/begin_cycle")
+        self._end = node.add_client(EndCycle, "thermal_node/end_cycle")
+        self._arm = node.add_client(SetBool, "tcf_node/arm")
+        self._measure = ActionClient(node, MeasureTool, "tcf_node/measure")
+        self._goals: dict[int, Any] = {}  # handles; None until the goal is accepted
+        self._cancelled: set[int] = set()
+
+    def close(self) -> None:
+        """Take the action's client down."""
+        self._measure.destroy()
+
+    def carry_out(self, request: asked.Request) -> None:
+        """Do it; the answer comes later."""
+        number = request.number
+        match request:
+            case asked.Move(plan=plan) | asked.Stop(plan=plan):
+                self._output.publish(trajectory_message(plan, self._names))
+            case asked.BeginCycle(cycle_id=name):
+                self._call(self._begin, BeginCycle.Request(cycle_id=name), number, _status)
+            case asked.EndCycle(cycle_id=name):
+                self._call(self._end, EndCycle.Request(cycle_id=name), number, _cycle)
+            case asked.Arm():
+                self._call(self._arm, SetBool.Request(data=True), number, _done)
+            case asked.Disarm():
+                self._call(self._arm, SetBool.Request(data=False), number, _done)
+            case asked.Measure(mode=mode, cycle_id=name):
+                self._begin_measure(number, mode, name)
+            case asked.CancelMeasure():
+                self._cancel_measures()
+
+    def _call(self, client: Any, request: Any, number: int, read: Callable[[Any], Answer]) -> None:
+        if not client.service_is_ready():
+            words = f"{client.srv_name} is not there: start its node"
+            self._answered(number, Answer(Code.CONFLICT, words))
+            return
+        client.call_async(request).add_done_callback(
+            lambda future: self._answered(number, read(future.result()))
+        )
+
+    def _begin_measure(self, number: int, mode: str, cycle_id: str) -> None:
+        if not self._measure.server_is_ready():
+            words = "the action tcf_node/measure is not there: start its node"
+            self._answered(number, Answer(Code.CONFLICT, words))
+            return
+        self._goals[number] = None
+        goal = MeasureTool.Goal(mode=MODE_OF[mode], cycle_id=cycle_id)
+        self._measure.send_goal_async(goal).add_done_callback(
+            lambda future: self._accepted(number, future)
+        )
+
+    def _accepted(self, number: int, future: Future) -> None:
+        handle: Any = future.result()
+        if not handle.accepted:
+            self._goals.pop(number, None)
+            self._answered(number, Answer(Code.CONFLICT, "tcf_node rejected the goal"))
+            return
+        self._goals[number] = handle
+        if number in self._cancelled:
+            handle.cancel_goal_async()
+        handle.get_result_async().add_done_callback(lambda ended: self._measured(number, ended))
+
+    def _measured(self, number: int, ended: Future) -> None:
+        self._goals.pop(number, None)
+        self._cancelled.discard(number)
+        result: Any = ended.result().result
+        self._answered(
+            number,
+            Answer(
+                _code(result.status),
+                result.message,
+                result.candidate_id,
+                has_result=result.success,
+                answer=WORDS_OF.get(result.answer, ""),
+                deviation_mm=result.deviation_mm,
+                sigma_mm=result.sigma_mm,
+            ),
+        )
+
+    def _cancel_measures(self) -> None:
+        for number, handle in self._goals.items():
+            self._cancelled.add(number)
+            if handle is not None:
+                handle.cancel_goal_async()
+
+
+def _code(status: int) -> Code:
+    """A status of another node; one that this version does not know is a refusal."""
+    return Code(status) if status in set(Code) - {Code.NONE} else Code.BAD_INPUT
+
+
+def _done(response: Any) -> Answer:
+    return Answer(Code.ACCEPT if response.success else Code.CONFLICT, response.message)
+
+
+def _status(response: Any) -> Answer:
+    return Answer(_code(response.status), response.message)
+
+
+def _cycle(response: Any) -> Answer:
+    missing = tuple(response.missing)
+    return Answer(_code(response.status), response.message, response.candidate_id, missing)

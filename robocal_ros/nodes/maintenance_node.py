@@ -1,0 +1,236 @@
+"""The maintenance node: one call from the PLC keeps a cell accurate (docs/maintenance_node.md)."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+from geometry_msgs.msg import PointStamped, PoseStamped
+from robocal_msgs.msg import AccuracyState
+from sensor_msgs.msg import JointState, PointCloud2
+from std_msgs.msg import Bool
+
+from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.motion.loading import load_motion
+from robocal_ros.core.samples import joint_sample, stamp_ns
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.base import HouseNode
+from robocal_ros.nodes.diagnostics import ERROR, Health
+from robocal_ros.nodes.endpoints import NotActiveError
+from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
+from robocal_ros.nodes.maintenance_outputs import MaintenanceOutputs
+from robocal_ros.nodes.maintenance_services import MaintenanceServices, Now
+from robocal_ros.nodes.maintenance_settings import SETTINGS, session_config
+from robocal_ros.nodes.run import run
+from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.sessions.accuracy import Accuracy
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
+from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.sessions.maintenance.requests import Answer, Request
+from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.state_files import StateFile
+
+TICK_S = 0.02
+SHOW_S = 0.2
+ACCURACY_S = 1.0
+NS = 1_000_000_000
+MM = 1e-3
+GAP_OPEN, ACCURACY = "gap_open", "thermal_node/accuracy"
+MEASUREMENTS = {
+    POINT: PointStamped,
+    CENTRE: PointStamped,
+    CLOUD: PointCloud2,
+    POSE: PoseStamped,
+}
+
+
+class MaintenanceNode(HouseNode):
+    """Drives a `MaintenanceSession` with live messages and calls."""
+
+    NAME = "maintenance_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._session: MaintenanceSession | None = None
+        self._history: CalibrationHistory | None = None
+        self._calls: MaintenanceServices | None = None
+        self._driver: MaintenanceDriver | None = None
+
+    def configure(self) -> None:
+        """Read the robot and the ways, open the history, then the topics, services and clients."""
+        settings = self.settings
+        self._nominal = load_robot(settings["robot"])
+        self._config = session_config(settings, self._nominal)
+        load_motion(self._nominal)
+        self._serial_in_use, self._history = open_history(settings, self._nominal)
+        self._keeper = StateFile(self._history.path, "maintenance")
+        self._outputs = MaintenanceOutputs(
+            self.add_output, self._nominal.name, self._serial_in_use, settings["base_frame"]
+        )
+        self._driver = MaintenanceDriver(self, self._nominal.joint_names, self._answered)
+        self._calls = MaintenanceServices(
+            self, self._running, self._clocks, self._outputs, settings["default_gap_s"]
+        )
+        self._guard = SourceGuard(self, JOINTS)
+        self.add_input(JointState, JOINTS, self._take_joints, qos.STREAM)
+        self.add_input(Bool, GAP_OPEN, self._take_gap, qos.RELIABLE)
+        self.add_input(AccuracyState, ACCURACY, self._take_accuracy, qos.LATCHED)
+        for topic, kind in MEASUREMENTS.items():
+            self.add_input(kind, topic, self._take_measurement, qos.STREAM)
+        self.add_timer(TICK_S, self._tick, steady=True)
+        self.add_timer(SHOW_S, self._show, steady=True)
+        self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
+
+    def activate(self) -> None:
+        """Begin a session: with what was kept, a fault too."""
+        if self._history is None:
+            raise ValueError("activated before it was configured")
+        self._session = MaintenanceSession(
+            self._nominal, self._history, self._config, self._keeper, self._record
+        )
+        self._shown: Status | None = None
+        for step, worst_s in self._session.worst_cases().items():
+            self.get_logger().info(f"{step}: {worst_s:.1f} s at the most, way home included")
+        self._show()
+
+    def deactivate(self) -> None:
+        """Stop what moves, disarm, and end the session."""
+        if self._session is not None:
+            self._carry_out(self._session.give_up("the node was deactivated", time.monotonic()))
+        if self._calls is not None:
+            self._calls.break_off("the node was deactivated")
+        self._session = None
+
+    def cleanup(self) -> None:
+        """Take action and clients down, close the history."""
+        self._session = None
+        for part in (self._calls, self._driver, self._history):
+            if part is not None:
+                part.close()
+        self._calls = self._driver = self._history = None
+
+    def _running(self) -> MaintenanceSession:
+        if self._session is None:
+            raise NotActiveError("no session: activate the node")
+        return self._session
+
+    # ---- what comes in --------------------------------------------------------------------------
+
+    def _take_joints(self, message: Any) -> None:
+        session = self._session
+        if session is None:
+            return
+        if fault := self._guard.fault_at(self.inputs[JOINTS].received - 1):
+            raise InputError(fault)
+        sample = joint_sample(message)
+        q = sample.position[sample.order(self._nominal.joint_names)]
+        session.reading(sample.stamp_ns / NS, q, time.monotonic())
+
+    def _take_gap(self, message: Any) -> None:
+        if self._session is not None:
+            self._session.gap(message.data, time.monotonic())
+            self._tick()  # a gap that closes stops the robot now
+
+    def _take_measurement(self, message: Any) -> None:
+        if self._session is not None:
+            self._session.measured(stamp_ns(message.header.stamp) / NS)
+
+    def _take_accuracy(self, message: Any) -> None:
+        if self._session is None:
+            return
+        try:
+            level = AccuracyLevel(message.state)
+        except ValueError as error:
+            raise InputError(f"accuracy state {message.state} is unknown") from error
+        known = message.predicted_error_mm >= 0.0 and message.bound_mm >= 0.0
+        rms_m, bound_m = message.predicted_error_mm * MM, message.bound_mm * MM
+        drift = Drift(
+            level, message.reason, ToolError(rms_m, bound_m) if known else None, message.due_in_s
+        )
+        self._session.drift(drift, time.monotonic())
+
+    def _answered(self, number: int, answer: Answer) -> None:
+        if self._session is not None:
+            self._session.answered(number, answer)
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def _clocks(self) -> Now:
+        return Now(time.monotonic(), time.time_ns())
+
+    def _tick(self) -> None:
+        if self._session is not None:
+            self._carry_out(self._session.tick(*self._clocks()))
+
+    def _carry_out(self, requests: list[Request]) -> None:
+        if self._driver is not None:
+            for request in requests:
+                self._driver.carry_out(request)
+
+    # ---- what goes out --------------------------------------------------------------------------
+
+    def _record(self, command: Command, outcome: Outcome) -> None:
+        words = f"{command.name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
+        stamped = replace(command, stamp_ns=self.now_ns())
+        self._outputs.event(stamped, replace(outcome, command=stamped))
+
+    def _show(self) -> None:
+        """Say what changed; tell the callers of the action."""
+        self._guard.look()
+        session = self._session
+        if session is None or self._calls is None:
+            return
+        try:
+            status = session.status(time.monotonic())
+            shown = replace(status, left_s=round(status.left_s))
+            if shown != self._shown:
+                self._shown = shown
+                self._outputs.status(status, self.now_ns())
+            self._calls.look(status)
+        except RobocalError as error:  # the history cannot be read: tried again
+            self.get_logger().error(str(error), throttle_duration_sec=5.0)
+
+    def _show_accuracy(self) -> None:
+        if self._session is None:
+            return
+        try:
+            found = self._session.accuracy(*self._clocks())
+        except RobocalError as error:
+            found = Accuracy(AccuracyLevel.FAULT, str(error))
+        self._outputs.accuracy(found, self._config.tolerance_m, self.now_ns())
+
+    def health(self) -> Health:
+        """Tell what goes on, how long each step may take, what is wrong."""
+        session, health = self._session, Health()
+        if session is None:
+            return health
+        status = session.status(time.monotonic())
+        values: dict[str, object] = {
+            "state": status.state.name,
+            "doing": status.doing or "nothing",
+            "last cycle": "none" if status.last is None else status.last.message,
+            "tool node": "disarmed" if status.disarmed else "may be armed",
+        }
+        for step, worst_s in session.worst_cases().items():
+            values[f"worst case of {step}"] = f"{worst_s:.1f} s"
+        health.values = values
+        if status.state is State.FAULT:
+            health.worsen(ERROR, status.fault)
+        if self._guard.fault:
+            health.worsen(ERROR, self._guard.fault)
+        warn_without_serial(health, self._serial_in_use)
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(MaintenanceNode)

@@ -1,0 +1,214 @@
+"""A whole cell over DDS: robot, beams, thermal_node, tcf_node, maintenance_node; the probe is PLC
+and sphere sensor. Everything is simulated."""
+
+import contextlib
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from command import robocal_json
+from geometry_msgs.msg import PointStamped
+from rclpy.action import ActionClient
+from robocal_msgs.action import RunMaintenance
+from robocal_msgs.msg import AccuracyState, MaintenanceStatus, SessionEvent
+from robocal_msgs.srv import CaptureReference
+from sensor_msgs.msg import JointState
+from shift import BALL, NOISE_M, T_SENSOR_BASE
+from std_msgs.msg import Bool
+from trajectory_msgs.msg import JointTrajectory
+
+from robocal_ros.core.kinematics.inverse import inverse
+from robocal_ros.core.motion.cell import MotionCell
+from robocal_ros.core.motion.housing import Housing, ToolBody
+from robocal_ros.core.motion.limits import MotionLimits
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.motion.travel import joint_way
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.motion_settings import trajectory_message
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.storage.robots import load_robot
+
+START_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]  # of cell_sim_node, over its station
+RAISED_M = 0.08
+
+
+def raised_home() -> list[float]:
+    """Higher than the start, so that the ways from there are clear of the housing."""
+    arm, q = load_robot("ur10"), np.radians(START_DEG)
+    way = np.tile(arm.fk(q), (11, 1, 1))
+    way[:, 2, 3] += np.linspace(0.0, RAISED_M, 11)
+    return np.degrees(inverse(arm, way, q)[-1]).tolist()
+
+
+HOME_DEG = raised_home()
+OFFSETS_DEG = [
+    [25.0, 10, 0, 0, 0, 0],
+    [35.0, 10, 15, -10, 20, 15],
+    [45.0, -5, 20, 15, 30, 40],
+    [55.0, 15, -10, 25, 10, -30],
+    [40.0, 20, 10, -25, -20, -50],
+    [20.0, 5, 20, 10, 15, 60],
+]
+POSES_DEG = (np.array(HOME_DEG) + OFFSETS_DEG).tolist()
+ROBOT = "/robot/joint_trajectory"
+BEAT_S = 0.1
+SENSE_S = 0.1
+RESTS_S = 0.35
+SERIAL = "K7"
+BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6}  # a machine that has other work too
+
+
+def yaml_list(numbers: list[float]) -> str:
+    return str([float(x) for x in numbers])
+
+
+class LiveCell:
+    """All nodes as processes; time is real."""
+
+    def __init__(self, graph: Any, folder: Path, **faults: Any) -> None:
+        self.graph = graph
+        self.arm = load_robot("ur10")
+        self.rng = np.random.default_rng(2)
+        self.is_open = self.beating = self.sensing = True
+        self.joints: list[JointState] = []
+        self.sent = graph.collect(JointTrajectory, ROBOT)
+        self.statuses = graph.collect(MaintenanceStatus, "/maintenance_node/status", qos.LATCHED)
+        self.states = graph.collect(AccuracyState, "/accuracy_state", qos.LATCHED)
+        self.events = graph.collect(SessionEvent, "/maintenance_node/session_events", EVENTS)
+        graph.probe.create_subscription(JointState, "joint_states", self._joints, qos.STREAM)
+        self.drive = graph.probe.create_publisher(JointTrajectory, ROBOT, 10)
+        self.sphere = graph.probe.create_publisher(PointStamped, "sphere_center", 10)
+        self.gap = graph.probe.create_publisher(Bool, "gap_open", 10)
+        threading.Thread(target=self._beats, daemon=True).start()
+        graph.probe.create_timer(SENSE_S, self._sense)
+        csv, laser = folder / "beams.csv", folder / "laser.yaml"
+        simulated = {"laser_csv": str(csv), "seed": 7, "q_start_deg": yaml_list(HOME_DEG)} | faults
+        graph.start("cell_sim_node", simulated, {"joint_trajectory": ROBOT})
+        graph.spin_until(lambda: self.joints and csv.exists(), "the cell")
+        robocal_json(
+            "tool.beams.json", "tool", "beams", "--data", csv, "--radius-mm", 2.5,
+            "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
+        )  # fmt: skip
+        self.tool = {
+            "laser": str(laser),
+            "taught_xyz_mm": "[0.0, 0.0, 150.0]",
+            "serial": SERIAL,
+        } | BUSY
+        out = {"~/joint_trajectory": ROBOT}
+        self.tcf = graph.start(
+            "tcf_node", self.tool | {"motion": "trajectory", "gap_stale_s": 0.5}, out
+        )
+        self.thermal = graph.start(
+            "thermal_node", {"robot": "ur10", "serial": SERIAL, "sphere_radius_mm": 19.05}
+        )
+        self.start_maintenance()
+        self.client = ActionClient(graph.probe, RunMaintenance, "/maintenance_node/run_maintenance")
+
+    def start_maintenance(self, **changes: Any) -> None:
+        self.statuses.clear()
+        self.states.clear()
+        poses = ", ".join(f"'{' '.join(f'{x:.4f}' for x in pose)}'" for pose in POSES_DEG)
+        settings = self.tool | {
+            "answer_s": 3.0,
+            "rest_s": 2.0,
+            "check_s": 30.0,
+            "full_s": 60.0,
+            "home_deg": yaml_list(HOME_DEG),
+            "measuring_poses_deg": f"[{poses}]",
+        }
+        out = {"~/joint_trajectory": ROBOT}
+        self.node = self.graph.start("maintenance_node", settings | changes, out)
+        self.graph.spin_until(lambda: self.statuses and self.states, "the maintenance node", 30.0)
+        self.graph.spin_for(1.0)
+
+    # ---- sensor and PLC -------------------------------------------------------------------------
+
+    def _joints(self, message: JointState) -> None:
+        self.joints.append(message)
+        del self.joints[:-500]
+
+    def _beats(self) -> None:
+        """As a PLC does it: whatever else goes on here."""
+        while self.graph.context.ok():
+            if self.beating:
+                with contextlib.suppress(Exception):  # the test ends
+                    self.gap.publish(Bool(data=self.is_open))
+            time.sleep(BEAT_S)
+
+    def _sense(self) -> None:
+        recent = self.joints[-round(RESTS_S * 125) :]
+        if not self.sensing or len(recent) < 40:
+            return
+        q = np.array([message.position for message in recent])
+        if np.max(np.ptp(q, axis=0)) > 1e-5:
+            return
+        ball = (T_SENSOR_BASE @ self.arm.fk(q[-1]) @ BALL)[:3]
+        message = PointStamped()
+        message.header.stamp, message.header.frame_id = recent[-5].header.stamp, "sensor/ball"
+        place = ball + NOISE_M * self.rng.normal(size=3)
+        message.point.x, message.point.y, message.point.z = place.tolist()
+        self.sphere.publish(message)
+
+    @property
+    def q(self) -> np.ndarray:
+        return np.array(self.joints[-1].position)
+
+    def at_home(self) -> bool:
+        return bool(np.max(np.abs(self.q - np.radians(HOME_DEG))) < 1e-3)
+
+    def stands(self, seconds: float) -> bool:
+        """Whether the robot rests for so long from now."""
+        self.joints.clear()
+        self.graph.spin_for(seconds)
+        return bool(np.max(np.ptp([m.position for m in self.joints], axis=0)) < 1e-9)
+
+    def capture_reference(self) -> None:
+        """A person drives the cold robot through the poses, and back home."""
+        body = ToolBody(np.eye(4), 0.1, 0.01, 0.06)
+        housing = Housing(0.06, 0.03, -0.12, 0.05)
+        limits = MotionLimits(tcp_speed_m_s=1.0)
+        cell = MotionCell(self.arm, body, np.eye(4), housing, limits)
+        ends = np.radians([*POSES_DEG, HOME_DEG])
+        for start, end in zip(np.roll(ends, 1, axis=0), ends, strict=True):
+            plan: JointPlan = joint_way(cell, start, end)
+            self.drive.publish(trajectory_message(plan, self.arm.joint_names))
+            self.graph.spin_for(plan.duration_s + RESTS_S + 0.8)
+        # The visit home is none of the poses.
+        answer = self.graph.call(CaptureReference, "/thermal_node/capture_reference")
+        assert answer.success, answer.message
+
+    # ---- calls ----------------------------------------------------------------------------------
+
+    def begin(self, cycle_id: str, gap_s: float) -> Any:
+        """Send the goal; its handle."""
+        self.graph.spin_until(self.client.server_is_ready, "the action")
+        goal = RunMaintenance.Goal(cycle_id=cycle_id, gap_s=gap_s)
+        self.feedback: list[Any] = []
+        sent = self.client.send_goal_async(goal, feedback_callback=self.feedback.append)
+        self.graph.spin_until(sent.done, "the goal is taken")
+        return sent.result()
+
+    def run(self, cycle_id: str, gap_s: float) -> Any:
+        """A whole cycle by the action; its result."""
+        ended = self.begin(cycle_id, gap_s).get_result_async()
+        self.graph.spin_until(ended.done, "the result", within_s=gap_s + 5.0)
+        return ended.result().result
+
+    def timed(self, kind: type, name: str, **fields: Any) -> tuple[Any, float]:
+        """A call's answer, and how long it took."""
+        self.graph.call(kind, f"/maintenance_node/{name}", **fields)  # discovers it
+        begin = time.monotonic()
+        answer = self.graph.call(kind, f"/maintenance_node/{name}", **fields)
+        return answer, time.monotonic() - begin
+
+    def state(self, state: int, words: str = "") -> AccuracyState:
+        """Wait until the line reads so."""
+
+        def there() -> bool:
+            last = self.states[-1] if self.states else None
+            return last is not None and last.state == state and words in last.reason
+
+        self.graph.spin_until(there, f"accuracy_state {state}: {self.states[-1:]}")
+        return self.states[-1]

@@ -1,0 +1,199 @@
+"""The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from rclpy.action import ActionClient
+from robocal_msgs.action import RunMaintenance
+from robocal_msgs.msg import AccuracyState, MaintenanceStatus, SessionEvent
+from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.proposals import Proposal
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
+PERIOD_S = 0.05
+NODE = "/maintenance_node"
+
+
+class Plc:
+    """The probe: heartbeat, a robot that stands, and calls."""
+
+    def __init__(self, graph: Any) -> None:
+        self.graph = graph
+        self.is_open, self.q = True, np.radians(HOME_DEG)
+        self.names = list(load_robot("ur10").joint_names)
+        self.states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
+        self.statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
+        self.events = graph.collect(SessionEvent, f"{NODE}/session_events", EVENTS)
+        self.node = graph.add(MaintenanceNode, {"serial": "K7", "home_deg": HOME_DEG})
+        self.gap = graph.publisher(Bool, "gap_open")
+        self.joints = graph.publisher(JointState, "joint_states")
+        self.sent = 0
+        graph.probe.create_timer(PERIOD_S, self._beat)
+        graph.spin_for(0.5)
+
+    def _beat(self) -> None:
+        self.sent += 1
+        message = JointState(name=self.names, position=self.q.tolist())
+        ns = self.sent * round(PERIOD_S * 1e9)
+        message.header.stamp = Time(sec=1000 + ns // 10**9, nanosec=ns % 10**9)
+        self.joints.publish(message)
+        self.gap.publish(Bool(data=self.is_open))
+
+    def call(self, kind: type, name: str, **fields: Any) -> Any:
+        return self.graph.call(kind, f"{NODE}/{name}", **fields)
+
+    def run(self, cycle_id: str, gap_s: float = 30.0) -> Any:
+        return self.call(RunMaintenanceCycle, "run", cycle_id=cycle_id, gap_s=gap_s)
+
+    def trigger(self, name: str) -> str:
+        answer = self.call(Trigger, f"{name}_trigger")
+        assert answer.success == (answer.message.split()[1] == "ACCEPT")
+        return str(answer.message)
+
+
+@pytest.fixture
+def plc(graph: Any) -> Plc:
+    return Plc(graph)
+
+
+def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
+    begun = plc.run("4711")
+    assert (begun.success, begun.status) == (True, Code.ACCEPT), begun.message
+    graph.spin_until(lambda: plc.run("4711").result.code == Code.ACCEPT, "it ends")
+    ended = plc.run("4711")
+    assert (ended.success, ended.result.complete) == (True, True)
+    plc.node.trigger_deactivate()
+    plc.node.trigger_activate()
+    graph.spin_for(0.3)
+    assert plc.run("4711") == ended
+    known = plc.call(GetMaintenance, "status", cycle_id="4711")
+    assert known.result == ended.result
+    assert known.state.state == MaintenanceStatus.IDLE
+    assert plc.call(GetMaintenance, "status", cycle_id="4712").status == Code.BAD_INPUT
+    names = [event.command for event in plc.events]
+    assert names == ["run_maintenance", "maintenance_ended"]
+
+
+def test_the_action_does_the_same(plc, graph):
+    client = ActionClient(graph.probe, RunMaintenance, f"{NODE}/run_maintenance")
+    graph.spin_until(client.server_is_ready, "the action")
+    results = []
+    for gap_s in (30.0, 30.0, -1.0):
+        name = "a" if gap_s > 0.0 else "b"
+        sent = client.send_goal_async(RunMaintenance.Goal(cycle_id=name, gap_s=gap_s))
+        graph.spin_until(sent.done, "the goal is taken")
+        ended = sent.result().get_result_async()
+        graph.spin_until(ended.done, "the result")
+        results.append(ended.result().result)
+    assert results[0].success, results[0].message
+    assert results[0] == results[1]
+    assert (results[2].success, results[2].status) == (False, Code.BAD_INPUT)
+
+
+def test_nothing_runs_while_the_gap_is_closed(plc, graph):
+    plc.is_open = False
+    graph.spin_for(0.3)
+    refused = plc.run("4711")
+    assert (refused.success, refused.status) == (False, Code.CONFLICT)
+    assert "gap_open is false" in refused.message
+    plc.is_open = True
+    graph.spin_for(0.3)
+    assert plc.run("4711").success
+
+
+def test_a_robot_away_from_home_is_a_fault_until_it_is_acknowledged(plc, graph):
+    plc.q = plc.q + np.radians([0.0, 0.0, 4.0, 0.0, 0.0, 0.0])
+    graph.spin_for(0.3)
+    refused = plc.run("4711")
+    assert refused.status == Code.LIMIT_EXCEEDED
+    assert "robot is not at home: elbow_joint is 4.00 deg off" in refused.message
+    graph.spin_until(
+        lambda: plc.states and "not at home" in plc.states[-1].reason, "the line reads it"
+    )
+    assert plc.states[-1].state == AccuracyState.FAULT
+    plc.q = np.radians(HOME_DEG)
+    graph.spin_for(0.3)
+    assert plc.run("4711").status == Code.CONFLICT
+    plc.node.trigger_deactivate()
+    plc.node.trigger_activate()
+    graph.spin_for(0.3)
+    assert plc.trigger("status").startswith("0 LIMIT_EXCEEDED robot is not at home")
+    answer = plc.call(Acknowledge, "acknowledge", by="me")
+    assert answer.success, answer.message
+    assert plc.run("4711").success
+
+
+def test_twins_of_a_plc_without_arguments(plc, graph):
+    assert plc.trigger("status") == "0 CONFLICT no cycle has ended yet"
+    assert plc.trigger("run").startswith("0 ACCEPT cycle 'at ")
+    graph.spin_until(lambda: plc.trigger("status").startswith("0 ACCEPT"), "it ends")
+    assert plc.trigger("cancel") == "0 CONFLICT no cycle runs"
+    assert plc.trigger("acknowledge") == "0 ACCEPT there is no fault"
+    for name in ("accept", "reject"):
+        assert plc.trigger(name).startswith("0 CONFLICT one candidate must wait")
+    assert plc.trigger("rollback").startswith("0 BAD_INPUT nothing was accepted")
+    for name in ("accept", "reject", "rollback"):
+        for number in (0, 99):
+            assert plc.call(Decide, name, id=number).status == Code.BAD_INPUT
+
+
+def candidates(graph: Any, count: int) -> list[int]:
+    """Thermal candidates that other nodes proposed, all against the nominal model."""
+    arm = load_robot("ur10")
+    with CalibrationHistory.open("K7", model_hash=arm.model_hash, state_dir=graph.state) as history:
+        return [
+            history.propose(
+                Proposal(
+                    model_hash=arm.model_hash, based_on=0, cycle_id=f"c{i}", stamp_ns=i,
+                    created_ns=i, software="test", method="map", code=Code.ACCEPT, reason="better",
+                    document={}, model=model_document(arm),
+                )
+            )
+            for i in range(count)
+        ]  # fmt: skip
+
+
+def test_decisions_by_id_are_quick_and_stale_ones_are_told(plc, graph):
+    first, second, third = candidates(graph, 3)
+    took_s = []
+    for number, status in ((second, Code.ACCEPT), (second, Code.ACCEPT), (first, Code.STALE)):
+        begin = time.monotonic()
+        answer = plc.call(Decide, "accept", id=number, by="plc")
+        took_s.append(time.monotonic() - begin)
+        assert answer.status == status, answer.message
+        assert answer.revision == (1 if answer.success else 0)
+    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait, found none")
+    assert plc.call(Decide, "reject", id=third, by="plc").success
+    assert plc.trigger("rollback").startswith("0 ACCEPT revision 2: the nominal model in force")
+    print("accept:", [f"{1e3 * took:.1f} ms" for took in took_s[1:]])
+    assert max(took_s[1:]) < 0.5  # the first one has to find the service
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"home_deg": [0.0]}, "home_deg has 1 numbers, UR10 has 6 joints"),
+        ({"measuring_poses_deg": ["1 2 3"]}, "pose 1 has 3 numbers"),
+        ({"measuring_poses_deg": ["1 2 3 4 5 up"]}, "no list of numbers"),
+        ({"laser": "/nowhere.yaml"}, "no such"),
+        ({"measuring_poses_deg": ["0 0 0 0 0 400"]}, "wrist_3_joint"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_at_the_start(graph, changes, words):
+    node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG} | changes)
+    assert not node.is_active
+    assert words in node._failure

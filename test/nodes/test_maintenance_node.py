@@ -1,0 +1,146 @@
+"""The maintenance of a whole cell over DDS; the test is the PLC."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from maintenance_live import LiveCell
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.msg import AccuracyState, MaintenanceStatus
+from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
+from std_srvs.srv import Trigger
+
+from robocal_ros.core.codes import Code
+
+GAP_S = 150.0
+BEND_MM = "[1.5, -0.8, 0.4]"
+
+
+def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
+    cell = LiveCell(graph, tmp_path, tool_bend_mm=BEND_MM)
+    cell.state(AccuracyState.EXPIRED)
+    cell.capture_reference()
+    first = cell.run("c1", GAP_S)
+    assert first.success, first.message
+    result = first.result
+    assert result.complete, first.message
+    # In seconds nothing has drifted: the model in force stays, whatever the noise says.
+    stays = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
+    assert result.thermal_code in stays, first.message
+    assert (result.thermal_id > 0, result.tool_code) == (True, Code.ACCEPT), first.message
+    assert result.tool_answer == MeasureTool.Result.RECALIBRATE
+    assert cell.at_home()
+    assert cell.stands(1.0)
+    assert {f.feedback.state.state for f in cell.feedback} == {MaintenanceStatus.RUNNING}
+    cell.state(AccuracyState.DEGRADED)
+    # Nothing was accepted without a person; now the PLC accepts by the id.
+    status = graph.call(GetMaintenance, "/maintenance_node/status", cycle_id="c1")
+    assert status.state.thermal_pending == 0
+    assert status.state.tool_pending == result.tool_id
+    assert status.result == result
+    refused = graph.call(Decide, "/maintenance_node/accept", id=result.thermal_id, by="plc")
+    assert (refused.success, refused.status) == (False, result.thermal_code)
+    for _ in range(2):
+        answer = graph.call(Decide, "/maintenance_node/accept", id=result.tool_id, by="plc")
+        assert (answer.success, answer.revision) == (True, 1), answer.message
+    count = len(cell.sent)
+    repeated = cell.run("c1", GAP_S)
+    assert repeated == first
+    assert len(cell.sent) == count
+    second = cell.run("c2", GAP_S)  # verifies the tool that was accepted
+    assert second.success, second.message
+    assert second.result.tool_answer == MeasureTool.Result.PASS, second.message
+    said = cell.state(AccuracyState.OK)
+    assert 0.0 < said.predicted_error_mm < said.bound_mm <= said.tolerance_mm
+    recorded = [e.command for e in cell.events]
+    assert [n for n in recorded if n != "maintenance_ended"] == [
+        "run_maintenance", "accept", "accept", "run_maintenance",
+    ]  # fmt: skip
+
+
+def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Path) -> None:
+    cell = LiveCell(graph, tmp_path)
+    handle = cell.begin("c1", GAP_S)  # without a cold reference the tool alone is measured
+    ended = handle.get_result_async()
+    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
+    graph.spin_for(0.5)
+    cell.is_open = False
+    graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=1.0)
+    assert not any(cell.sent[-1].points[-1].velocities)
+    graph.spin_for(0.5)
+    assert cell.stands(1.0)
+    graph.spin_until(ended.done, "the result")
+    assert not ended.result().result.success
+    status = graph.call(GetMaintenance, "/maintenance_node/status")
+    assert status.state.state == MaintenanceStatus.FAULT
+    assert status.state.disarmed
+    assert not status.state.at_home
+    cell.state(AccuracyState.FAULT)
+    cell.is_open = True
+    graph.spin_for(0.5)
+    refused = graph.call(RunMaintenanceCycle, "/maintenance_node/run", cycle_id="c2", gap_s=GAP_S)
+    assert (refused.success, refused.status) == (False, Code.CONFLICT)
+    cell.node.kill()
+    cell.start_maintenance()  # a fault outlives its node
+    assert cell.statuses[-1].state == MaintenanceStatus.FAULT
+    answer = graph.call(Acknowledge, "/maintenance_node/acknowledge", by="me")
+    assert answer.success, answer.message
+    away = graph.call(RunMaintenanceCycle, "/maintenance_node/run", cycle_id="c2", gap_s=GAP_S)
+    assert away.status == Code.LIMIT_EXCEEDED
+    assert "robot is not at home: " in away.message
+    assert len(cell.sent) == 3
+
+
+def test_calls_are_answered_at_once_while_the_robot_moves(graph: Any, tmp_path: Path) -> None:
+    cell = LiveCell(graph, tmp_path)
+    begun = graph.call(RunMaintenanceCycle, "/maintenance_node/run", cycle_id="c1", gap_s=GAP_S)
+    assert begun.success, begun.message
+    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
+    calls = {
+        "run": (RunMaintenanceCycle, {"cycle_id": "c1", "gap_s": GAP_S}, Code.ACCEPT),
+        "status": (GetMaintenance, {}, Code.ACCEPT),
+        "accept": (Decide, {"id": 99}, Code.BAD_INPUT),
+        "reject": (Decide, {"id": 99}, Code.BAD_INPUT),
+        "rollback": (Decide, {"id": 99}, Code.BAD_INPUT),
+        "acknowledge": (Acknowledge, {"by": "plc"}, Code.ACCEPT),
+    }
+    for name, (kind, fields, code) in calls.items():
+        answer, took_s = cell.timed(kind, name, **fields)
+        assert answer.status == code, (name, answer.message)
+        print(f"{name}: {took_s * 1e3:.1f} ms")
+        assert took_s < 0.25, name
+    for name, words in {
+        "run_trigger": "0 ACCEPT cycle 'c1' runs already",
+        "status_trigger": "0 NONE ",
+        "accept_trigger": "0 CONFLICT one candidate must wait",
+        "rollback_trigger": "0 BAD_INPUT nothing was accepted",
+        "acknowledge_trigger": "0 ACCEPT there is no fault",
+    }.items():
+        answer, took_s = cell.timed(Trigger, name)
+        assert answer.message.startswith(words), answer.message
+        print(f"{name}: {took_s * 1e3:.1f} ms")
+        assert took_s < 0.25, name
+    cancelled, _ = cell.timed(Trigger, "cancel_trigger")
+    assert cancelled.success
+    graph.spin_until(
+        lambda: cell.statuses[-1].state == MaintenanceStatus.IDLE, "it has ended", within_s=60.0
+    )
+    assert cell.statuses[-1].last.code == Code.CONFLICT
+    assert cell.at_home()
+    assert np.max(np.abs(cell.sent[-1].points[-1].velocities)) == 0.0
+
+
+def test_the_tool_node_stops_at_the_gaps_end_without_this_node(graph: Any, tmp_path: Path) -> None:
+    cell = LiveCell(graph, tmp_path)
+    cell.begin("c1", GAP_S)
+    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
+    cell.node.kill()
+    graph.spin_for(0.3)
+    cell.is_open = False
+    graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=1.5)
+    graph.spin_for(0.5)
+    assert cell.stands(1.0)
+    cell.start_maintenance()
+    assert cell.statuses[-1].state == MaintenanceStatus.FAULT
+    assert "see where the robot is" in cell.statuses[-1].fault
+    graph.spin_until(lambda: cell.statuses[-1].disarmed, "it is disarmed")

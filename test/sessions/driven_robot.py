@@ -1,0 +1,108 @@
+"""A simulated robot that follows what it is sent, under a tool session's driver."""
+
+import numpy as np
+from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
+
+from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.samples import JointSample
+from robocal_ros.core.tool.edge_samples import EdgeSample
+from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.sessions.events import MEASURE_TOOL, Command
+from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_driving import Phase, ToolDriver
+from robocal_ros.sim.beams import RoundTool
+from robocal_ros.sim.joint_motion import JointMotion
+from robocal_ros.sim.tool_cell import joints_at
+
+PERIOD_S = 0.008
+LAG_S = 0.02  # of the controller behind its trajectory
+HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.05)
+
+
+class Robot:
+    """Follows plans with a lag; its beams see the true tool."""
+
+    def __init__(self, history, tool=TRUTH, **changes):
+        self.cell = noisy_cell()
+        arm = self.cell.arm
+        self.session = ToolSession(arm, history, config_of(self.cell), "test")
+        config = DrivingConfig(HOUSING, 0.1, 0.008, 0.05, **changes)
+        self.driver = ToolDriver(self.session, config, self.send, self.ask)
+        self.tool = RoundTool.cylinder(tool, 0.0025)
+        self.rng = np.random.default_rng(3)
+        above = self.cell.pose(TAUGHT, 0.0)
+        above[:3, 3] += 0.08 * self.cell.up
+        self.q = joints_at(arm, above[None], self.cell.q_near)[0]
+        self.now_s = 0.0
+        self.motion = JointMotion(self.q)
+        self.coming: list[tuple[float, JointPlan]] = []
+        self.sent: list[tuple[float, JointPlan]] = []
+        self.outcomes = []
+        self.edges: list[EdgeSample] = []
+        self.path: list[np.ndarray] = []
+        self.silent = False
+        self.offset = np.zeros(arm.n)
+
+    def send(self, plan: JointPlan) -> None:
+        """The controller gets it with a lag, and goes on from where it is and moves by then."""
+        self.sent.append((self.now_s, plan))
+        self.coming.append((self.now_s + LAG_S, plan))
+
+    def receive(self, at_s: float, plan: JointPlan) -> None:
+        self.motion.follow(at_s, plan.time_s + at_s, plan.q, plan.qd)
+        fk, end_s = self.cell.arm.fk, at_s + plan.duration_s
+        moved = self.cell.station.edges(
+            self.tool, lambda t: fk(self.motion.at(t)[0]), (at_s, end_s), self.rng
+        )
+        self.edges = [
+            EdgeSample(self.ns(e.time_s), "", e.beam, e.blocked, e.sigma_s) for e in moved
+        ]
+
+    def ask(self, command: Command) -> None:
+        self.session.submit(command)
+        self.outcomes += self.session.step(wall_ns=START_NS + len(self.outcomes))
+        outcome = self.outcomes[-1]
+        if self.session.run is None and not outcome.done:
+            self.driver.run_failed(outcome.message, self.now_s)
+
+    def measure(self, mode="full") -> None:
+        self.driver.require_ready()
+        self.ask(Command(MEASURE_TOOL, {"mode": mode}))
+
+    @staticmethod
+    def ns(time_s: float) -> int:
+        return START_NS + round(time_s * 1e9)
+
+    def run(self, seconds: float, until=lambda: False) -> None:
+        """Let time pass."""
+        for _ in range(round(seconds / PERIOD_S)):
+            self.step()
+            if until():
+                return
+
+    def step(self) -> None:
+        self.now_s += PERIOD_S
+        while self.coming and self.coming[0][0] <= self.now_s:
+            self.receive(*self.coming.pop(0))
+        self.q = self.motion.at([self.now_s])[0][0]
+        self.path.append(self.q.copy())
+        while self.edges and self.edges[0].stamp_ns <= self.ns(self.now_s):
+            self.driver.beam(self.edges[0].blocked)
+            self.session.add(self.edges.pop(0))
+        if self.silent:
+            self.driver.tick(self.now_s)
+            return
+        q = self.q + self.offset
+        self.driver.reading(self.now_s, q, self.now_s)
+        self.session.add(JointSample(self.ns(self.now_s), self.cell.arm.joint_names, q))
+        if (command := self.session.recognised()) is not None:
+            self.ask(command)
+
+    def at_rest(self) -> bool:
+        """Whether all is over."""
+        return not self.driver.armed and self.driver.phase is Phase.IDLE
+
+    def stands_still(self, since_s: float) -> bool:
+        count = round((self.now_s - since_s) / PERIOD_S)
+        return bool(np.ptp(np.array(self.path[-count:]), axis=0).max() < 1e-9)
