@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # for the bench
 
 from bench.closed_loop import setting  # noqa: E402
-from bench.closed_loop.plant import WORK, Plant  # noqa: E402
+from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
 from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
 from robocal_ros.core.samples import (  # noqa: E402
     REFERENCE_SPHERE,
@@ -53,7 +53,7 @@ FULL = ROOT / "out" / "golden_shift.mcap"
 EXCERPT = Path(__file__).with_name("golden_excerpt.mcap")
 SEED = 1
 WINDOW_S = (at(10, 38), at(10, 48))  # of the excerpt
-SETTLE_S = 5.0  # the sessions hear every reading from so long before it on
+AHEAD_S = 2.0 * PASS_S  # the sessions hear every reading from so long before it on
 NODES = {"thermal": "thermal_node", "tool": "tcf_node", "maintenance": "maintenance_node"}
 THERMAL = {kind: f"/{kind}" for kind in (JOINTS, SPHERE_CLOUD, REFERENCE_SPHERE, TEMPERATURES)}
 TOOL = {kind: f"/{kind}" for kind in (JOINTS, EDGES)}
@@ -93,7 +93,7 @@ class Recorder:
 
     def heard(self, came: Happened, samples: Sequence[Sample]) -> None:
         """Write what came, in the order of its stamps."""
-        self.plant.every_reading = self._inside(SETTLE_S)
+        self.plant.every_reading = self._inside(AHEAD_S)
         if not self._inside():
             return
         self._show_in_force()

@@ -11,7 +11,7 @@ from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
 from robocal_ros.sim.cell_plan import CellPlan, known_laser
-from robocal_ros.sim.kr150_cell import T_BASE_LASER, TAUGHT, poses
+from robocal_ros.sim.kr150_cell import SPIN_RAD, T_BASE_LASER, TAUGHT, poses
 
 SERIAL = "SIM-KR150"
 STATION, FRAME, TARGET = "station", "sensor", "ball"
@@ -43,6 +43,7 @@ def tool_config(laser: LaserFrame) -> ToolConfig:
         reach_m=(float(laser.reach[0]), float(laser.reach[1])),
         taught=rows_of(TAUGHT),
         station=STATION,
+        spin_rad=SPIN_RAD,
     )
 
 
@@ -55,7 +56,7 @@ def maintenance_config(laser: LaserFrame) -> MaintenanceConfig:
         driving=DRIVING,
         T_base_laser=laser.T_base_laser,
         travel_speed_m_s=TRAVEL_M_S,
-        home_near_rad=HOME_NEAR_RAD,
+        home_near=HOME_NEAR_RAD,
         tolerance_m=TOLERANCE_M,
         times=TIMES,
         bounds=BOUNDS,

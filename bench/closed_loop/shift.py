@@ -15,6 +15,7 @@ from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_faults import Fault
 from robocal_ros.sim.kr150_cell import kr150_cell
+from robocal_ros.sim.motion import JITTER_RAD
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
@@ -122,7 +123,8 @@ def run_shift(
 ) -> ShiftRecord:
     """A whole shift; ``watch`` is given the plant before its commissioning."""
     nominal = load_robot(ROBOT)
-    cell = SimulatedCell(kr150_cell(nominal, seed, points=plan.points))
+    made = kr150_cell(nominal, seed, points=plan.points, reading_noise_rad=JITTER_RAD)
+    cell = SimulatedCell(made)
     with (
         tempfile.TemporaryDirectory() as folder,
         CalibrationHistory.open(
