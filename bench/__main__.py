@@ -41,6 +41,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         thermal,
         tool,
     )
+    from bench.closed_loop import tables as closed_loop
 
     def times() -> Sequence[Table]:
         return [
@@ -69,6 +70,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "correction": correction.tables,
         "startup": start,
         "correction_stream": streams,
+        "closed_loop": closed_loop.tables,
         "files": lambda: [files.file_times()],
         "replay_speed": replay_speed.tables,
     }

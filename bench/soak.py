@@ -1,7 +1,8 @@
 """The long form of what the tests show briefly: ``make soak``, or ``python -m bench.soak --short``.
 
 Kills at random moments, other random examples in each round, hours of a live graph, more simulated
-robots. Writes out/soak/soak.md, with ``--keep`` docs/figures/soak.md too.
+robots, shifts and faults of the whole cell. Writes out/soak/soak.md, with ``--keep``
+docs/figures/soak.md too.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import numpy as np
 
 from bench import monte_carlo
 from bench.__main__ import about
+from bench.closed_loop import tables as closed_loop
 from bench.tables import Goal, Table, show
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -179,7 +181,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     amount = SHORT if given.short else LONG
     start = time.monotonic()
     streams = (live(amount.live_s), correction(amount.live_s))
-    tables = [*streams, *simulated(amount.robots), endurance(amount)]
+    loop = closed_loop.tables(closed_loop.SHORT if given.short else closed_loop.LONG)
+    tables = [*streams, *simulated(amount.robots), *loop, endurance(amount)]
     show(tables)
     facts = about(time.monotonic() - start) | {"cpus": str(os.cpu_count())}
     command = "make soak SOAK=--short" if given.short else "make soak"

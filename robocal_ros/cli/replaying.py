@@ -18,16 +18,14 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.found_cycles import accepting, automatic_commands, window_commands
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import (
     ReplayReport,
-    accepting,
-    automatic_commands,
     feed,
     one_by_one,
     replay,
-    window_commands,
 )
 from robocal_ros.sessions.seeding import session_as_recorded
 from robocal_ros.sessions.thermal import ThermalSession
@@ -172,7 +170,8 @@ def _stamps(window: Window, recording: Recording) -> tuple[int, int]:
 
 
 def _document(report: ReplayReport, session: ThermalSession, recording: Recording) -> Document:
-    made = [outcome for outcome in report.outcomes if outcome.document is not None]
+    placed = events.CALIBRATE_SENSOR  # what it found is no candidate for the model
+    made = [o for o in report.outcomes if o.document is not None and o.command.name != placed]
     place = {outcome.calibration_id: index for index, outcome in enumerate(made)}
     head = session.in_force
     topic = {kind: name for name, kind in recording.inputs.items()}

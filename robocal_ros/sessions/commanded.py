@@ -4,8 +4,10 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from robocal_ros import __version__
+from robocal_ros.core.codes import Code
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import Head
+from robocal_ros.core.proposals import THERMAL, Head
 from robocal_ros.core.samples import JointBlock, JointSample
 from robocal_ros.core.streams import JointStream
 from robocal_ros.sessions import events
@@ -17,7 +19,9 @@ from robocal_ros.sessions.history import History
 from robocal_ros.sessions.ignored import Ignored
 from robocal_ros.sessions.in_force import outside_decision
 from robocal_ros.sessions.observations import JOINTS, JUMPS
+from robocal_ros.sessions.seeding import BY, bring_into_force
 
+WHILE = "in force while this was recorded"
 GAP_NS = 250_000_000
 Handler = Callable[[Command, int], Outcome]
 
@@ -126,7 +130,8 @@ class Commanded:
         if command.marks is None:
             command = replace(command, marks=self.marks)
         decisions = dict.fromkeys((events.ACCEPT, events.REJECT, events.ROLLBACK), self._decide)
-        outcome = events.carried_out({**self._handlers(), **decisions}, command, wall_ns)
+        common = {**decisions, events.CONFIGURE: self._reconfigured}
+        outcome = events.carried_out({**self._handlers(), **common}, command, wall_ns)
         outside += [outside_decision(d, self.marks) for d in self._followed.look(wall_ns)]
         return [*outside, replace(outcome, revision=self.in_force.revision)]
 
@@ -139,3 +144,13 @@ class Commanded:
 
     def _decide(self, command: Command, wall_ns: int) -> Outcome:
         return decide(self._history, command, self.in_force.revision, wall_ns, self._kind)
+
+    def _reconfigured(self, command: Command, wall_ns: int) -> Outcome:
+        """A thermal model that another node brought into force while this was recorded."""
+        model = command.arguments["model"]
+        if model is None:
+            why = {"by": BY, "reason": WHILE}
+            self._history.rollback(to=0, kind=THERMAL, **why, expected_head=None, wall_ns=wall_ns)
+        else:
+            bring_into_force(self._history, THERMAL, self.nominal, model, __version__, WHILE)
+        return Outcome(command, Code.ACCEPT, f"thermal model {WHILE}")

@@ -5,22 +5,16 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
-import numpy as np
-
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import JointBlock, stamp_ns
-from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions import events
-from robocal_ros.sessions.decisions import NEWEST
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.observation import Observation
 from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
 from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.temperatures import TEMPERATURES
 
 EVENTS = "session_events"
 UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
-LARGEST_CYCLE = 60  # more poses than this are a calibration, not a measuring cycle
 
 
 class Recorded(Protocol):
@@ -80,6 +74,9 @@ def read_events(
 ) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
     """Read the recorded commands, each with its outcome, and the configuration before them.
 
+    A later configuration with another thermal model is a command too, without an outcome, where
+    the session takes this model from the thermal node.
+
     ``from_ns`` is the stamp of the first recorded joint reading. What was commanded before it is
     in the bag only because the topic is latched; its samples are not. It is left out, and the
     configuration is the one that it led to.
@@ -90,26 +87,43 @@ def read_events(
         When an event cannot be read.
     """
     configured: Command | None = None
+    model: Any = None
     found: list[tuple[Command, dict[str, Any]]] = []
     for recorded in messages:
         event = recorded.message
         command = read_command(event.command, stamp_ns(event.stamp), event.arguments)
         if command.name == events.CONFIGURE:
-            configured = configured if found else command
+            if not found:
+                configured = command
+            elif _takes_over(command, model):
+                found.append((command, {}))
+            model = command.arguments.get("model")
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
     before = _jumps(configured)
-    return configured, [(_counted_from(before, command), outcome) for command, outcome in found]
+    return configured, [
+        (_counted_from(before, from_ns, command), outcome) for command, outcome in found
+    ]
+
+
+def _takes_over(configured: Command, model: Any) -> bool:
+    """Whether another node has brought another thermal model into force than the one before."""
+    own = "reference" in configured.arguments
+    return not own and configured.arguments.get("model") != model
 
 
 def _jumps(command: Command | None) -> int:
     return 0 if command is None or command.marks is None else command.marks.get(JUMPS, 0)
 
 
-def _counted_from(before: int, command: Command) -> Command:
-    """The command with the clock's jumps counted from those before the recording."""
-    marks = {**(command.marks or {}), JUMPS: max(_jumps(command) - before, 0)}
-    return replace(command, marks=marks)
+def _counted_from(before: int, from_ns: int, command: Command) -> Command:
+    """The command with what a replay can wait for.
+
+    Jumps of the clock count from those ``before`` the recording; a topic of which nothing came
+    since the recording began, at ``from_ns``, is not awaited.
+    """
+    marks = {topic: mark for topic, mark in (command.marks or {}).items() if mark >= from_ns}
+    return replace(command, marks=marks | {JUMPS: max(_jumps(command) - before, 0)})
 
 
 def input_topics(topics: Iterable[str], configured: Command | None = None) -> dict[str, str]:
@@ -241,73 +255,3 @@ def _take(
                 f"'{recorded['message']}', here '{outcome.message}'"
             )
     return _submit_next(session, expected, ids)
-
-
-def window_commands(
-    cold: tuple[int, int] | None, warm: Sequence[tuple[int, int]]
-) -> list[tuple[Command, Mapping[str, Any]]]:
-    """Commands for time windows (from, to; ns): the cold reference, then one cycle each."""
-    commands: list[tuple[Command, Mapping[str, Any]]] = []
-    if cold is not None:
-        arguments = {"from_ns": cold[0], "by": "replay"}
-        commands.append((Command(events.CAPTURE_REFERENCE, arguments, cold[1]), {}))
-    for number, (start, end) in enumerate(warm, start=1):
-        arguments = {"from_ns": start, "cycle_id": f"window-{number}"}
-        commands.append((Command(events.IDENTIFY, arguments, end), {}))
-    return commands
-
-
-def automatic_commands(
-    observations: Sequence[Observation],
-) -> list[tuple[Command, Mapping[str, Any]]]:
-    """Find the cycles of a recording without commands.
-
-    Poses that recur from cycle to cycle: the first visit is the cold reference, each later one
-    a warm cycle. Otherwise everything is one calibration.
-
-    Raises
-    ------
-    InputError
-        When nothing was observed.
-    """
-    if not observations:
-        raise InputError("no measurement at standstill in this recording")
-    starts = _cycle_starts(observations)
-    end = observations[-1].stamp_ns
-    if len(starts) < 2:
-        return window_commands(None, [(observations[0].stamp_ns, end)])
-    edges = [observations[i].stamp_ns for i in starts]
-    last = [observations[i - 1].stamp_ns for i in starts[1:]] + [end]
-    windows = list(zip(edges, last, strict=True))
-    return window_commands(windows[0], windows[1:])
-
-
-def accepting(
-    commands: Iterable[tuple[Command, Mapping[str, Any]]], by: str
-) -> list[tuple[Command, Mapping[str, Any]]]:
-    """The same commands, with each candidate accepted where its own verdict accepts it."""
-    found: list[tuple[Command, Mapping[str, Any]]] = []
-    for command, outcome in commands:
-        found.append((command, outcome))
-        if command.name == events.IDENTIFY:
-            arguments = {"choose": NEWEST, "by": by, "reason": "its verdict accepts"}
-            found.append((Command(events.ACCEPT, arguments, command.stamp_ns), {}))
-    return found
-
-
-def _cycle_starts(observations: Sequence[Observation]) -> list[int]:
-    """Index of the first observation of each cycle; one alone when poses do not recur."""
-
-    def same(a: Observation, b: Observation) -> bool:
-        near = np.max(np.abs(a.q - b.q)) < SAME_VISIT_RAD
-        return a.target == b.target and bool(near)
-
-    first = observations[0]
-    limit = min(len(observations), LARGEST_CYCLE + 1)
-    length = next((i for i in range(1, limit) if same(first, observations[i])), None)
-    if length is None:
-        return [0]
-    starts = [i for i, o in enumerate(observations) if same(first, o)]
-    known = observations[:length]
-    recurring = sum(any(same(o, k) for k in known) for o in observations[length:])
-    return starts if recurring >= 0.9 * len(observations[length:]) else [0]

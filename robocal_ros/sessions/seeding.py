@@ -82,25 +82,30 @@ def seeded(
 
 
 def bring_into_force(
-    history: History, kind: str, nominal: SerialArm, model: Mapping[str, Any] | None, software: str
+    history: History,
+    kind: str,
+    nominal: SerialArm,
+    model: Mapping[str, Any] | None,
+    software: str,
+    why: str = WHY,
 ) -> None:
-    """Accept what was in force when a recording began; None: nothing was."""
+    """Accept what was in force when, or while, a recording was made; None: nothing was."""
     if model is None:
         return
     calibration_id = history.propose(
         Proposal(
             kind=kind,
             model_hash=nominal.model_hash,
-            based_on=0,
+            based_on=history.head(kind).revision,
             cycle_id="",
             stamp_ns=0,
             created_ns=0,
             software=software,
             method="",
             code=Code.ACCEPT,
-            reason=WHY,
+            reason=why,
             document={},
             model=model,
         )
     )
-    history.accept(calibration_id, by=BY, reason=WHY, expected_head=None, wall_ns=0)
+    history.accept(calibration_id, by=BY, reason=why, expected_head=None, wall_ns=0)

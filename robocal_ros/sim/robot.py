@@ -132,18 +132,16 @@ class TrueRobot:
 
     def _frames(self, joint: Array, mdh: Array, sag: Array | None = None) -> list[Array]:
         """Poses (m, 4, 4) in base of the root and of the frame after each joint."""
-        T = np.broadcast_to(np.array(self.nominal.T_base_root), (len(joint), 4, 4))
-        frames = [T]
-        for i, (d, theta, a, alpha, beta) in enumerate(mdh):
-            moved = self.nominal.sign[i] * joint[:, i]
-            if sag is not None:
-                moved = moved + sag[:, i]
-            slides = bool(self.nominal.prismatic[i])
-            along = d + moved if slides else np.full(len(joint), d)
-            about = np.full(len(joint), theta) if slides else theta + moved
-            T = T @ shift(2, along) @ turn(2, about)
-            T = T @ shift(0, np.array([a])) @ turn(0, np.array([alpha])) @ turn(1, np.array([beta]))
-            frames.append(T)
+        nominal, slides = self.nominal, self.nominal.prismatic
+        moved = nominal.sign * joint if sag is None else nominal.sign * joint + sag
+        along = np.where(slides, mdh[:, 0] + moved, mdh[:, 0])
+        about = np.where(slides, mdh[:, 1], mdh[:, 1] + moved)
+        drive = shift(2, along.ravel()) @ turn(2, about.ravel())
+        fixed = shift(0, mdh[:, 2]) @ turn(0, mdh[:, 3]) @ turn(1, mdh[:, 4])
+        steps = drive.reshape(*joint.shape, 4, 4) @ fixed
+        frames = [np.broadcast_to(np.array(nominal.T_base_root), (len(joint), 4, 4))]
+        for i in range(nominal.n):
+            frames.append(frames[-1] @ steps[:, i])
         return frames
 
     def _load(self, frames: list[Array]) -> Array:
@@ -153,12 +151,13 @@ class TrueRobot:
             for T, centre in zip(frames[1:], self.body.centre, strict=True)
         ]
         load = np.zeros((len(frames[0]), self.nominal.n))
-        for i in range(self.nominal.n):
+        mass, moment = 0.0, np.zeros((len(frames[0]), 3))  # of all that the joint carries
+        for i in reversed(range(self.nominal.n)):
             axis, origin = frames[i][:, :3, 2], frames[i][:, :3, 3]
-            for mass, centre in zip(self.body.mass[i:], centres[i:], strict=True):
-                weight = mass * GRAVITY
-                pull = weight if self.nominal.prismatic[i] else np.cross(centre - origin, weight)
-                load[:, i] += np.sum(axis * pull, axis=1)
+            mass, moment = mass + self.body.mass[i], moment + self.body.mass[i] * centres[i]
+            slides = self.nominal.prismatic[i]
+            pull = mass * GRAVITY if slides else np.cross(moment - mass * origin, GRAVITY)
+            load[:, i] = np.sum(axis * pull, axis=1)
         return load
 
 

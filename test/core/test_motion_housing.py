@@ -88,6 +88,7 @@ def test_a_tool_is_seen_along_its_axis_and_on_to_the_flange():
         ({"floor_m": 0.01}, "floor_m < 0"),
         ({"retract_m": 0.02}, "retract_m"),
         ({"top_m": np.nan}, "finite"),
+        ({"reach_m": 0.03}, "beyond the opening"),
     ],
 )
 def test_sizes_that_make_no_sense_are_refused(bad, words):
@@ -95,3 +96,17 @@ def test_sizes_that_make_no_sense_are_refused(bad, words):
         Housing(**(vars(HOUSING) | bad))
     with pytest.raises(InputError, match="radius_m"):
         ToolBody(np.eye(4), 0.1, 0.0, 0.05)
+
+
+def test_beyond_the_reach_of_the_housing_nothing_is_solid():
+    """A capsule of 5 mm, level and 50 mm under the brim, passes z at several distances."""
+    housing = Housing(**(vars(HOUSING) | {"reach_m": 0.3}))
+    passes = np.array([0.1, 0.29, 0.304, 0.306, 1.0])
+    start = np.column_stack([passes, np.full(5, -0.5), np.full(5, -0.03)])
+    end = start * [1.0, -1.0, 1.0]
+    cut = housing.cut_by(start, end, 0.005)
+    assert (cut > 0.0).tolist() == [True, True, True, False, False]
+    assert cut[2] == pytest.approx(0.001, abs=1e-12)
+    np.testing.assert_allclose(cut[:1], HOUSING.cut_by(start, end, 0.005)[:1])
+    aside = start + np.array([0.0, 0.9, 0.0])  # the line would pass at 0.1 m, but it ends before
+    assert housing.cut_by(aside[:1], aside[:1] + np.array([0.0, 0.5, 0.0]), 0.005)[0] == 0.0

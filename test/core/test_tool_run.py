@@ -255,6 +255,37 @@ def test_a_robot_moved_by_hand_and_another_station_are_refused(exact):
         solved(exact, laser=other)
 
 
+def shaken(run: MeasuredRun, seed: int) -> JointPath:
+    """The run's path as an encoder of 4e-6 rad reads it."""
+    q = run.path.q + 4e-6 * rng(seed).standard_normal(run.path.q.shape)
+    return JointPath(run.cell.arm, run.path.time_s, q)
+
+
+def test_a_held_orientation_that_shakes_is_in_the_derivative_by_latency(exact):
+    path, noise = shaken(exact, 1), RobotNoise(NOISE.step_m, NOISE.edge_m)
+    problem, start = run_problem(exact.cell.laser, path, exact.steps, exact.taught, noise)
+    column, step = problem.names.index("latency"), np.zeros(len(problem.names))
+    step[column] = 1e-7
+    ahead, behind = (problem.linearise(problem.retract(start, s))[0] for s in (step, -step))
+    wanted = (ahead - behind)[:, 0] / 2e-7
+    found = problem.linearise(start)[1][:, 0, column]
+    assert found == pytest.approx(wanted, abs=1e-5 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_noisy_readings_do_not_end_the_search_early(exact, count):
+    """Two circles alone tell latency and hysteresis apart by the prior only."""
+    noise = RobotNoise(NOISE.step_m, NOISE.edge_m)
+    for seed in range(20):
+        held = Held(along_m=5e-3) if count == 2 else FREE
+        found = solved(
+            exact, path=shaken(exact, seed), steps=exact.steps[:count], noise=noise, held=held
+        )
+        assert np.linalg.norm(found.tip - TRUTH[:3, 3]) < 5 * np.sqrt(
+            np.trace(found.covariance[:3, :3])
+        )
+
+
 def test_joint_states_that_stop_are_refused(exact):
     cut = exact.path.time_s < exact.moves[2].window[0] + 0.2
     path = JointPath(exact.cell.arm, exact.path.time_s[cut], exact.path.q[cut])

@@ -73,6 +73,7 @@ class MaintainedCell(Robot):
         self.is_open, self.beat_s, self.sensed_s = True, -np.inf, -np.inf
         self.steps, self.rests_s = 0, 0.0
         self.sphere = np.random.default_rng(4)
+        self.sensor_off_m = np.zeros(3)
 
     @property
     def wall_ns(self) -> int:
@@ -104,7 +105,7 @@ class MaintainedCell(Robot):
     def _sense(self) -> None:
         self.sensed_s = self.now_s
         ball = (T_SENSOR_BASE @ self.true.fk(self.q) @ BALL)[:3]
-        measured = ball + NOISE_M * self.sphere.normal(size=3)
+        measured = ball + NOISE_M * self.sphere.normal(size=3) + self.sensor_off_m
         at_s = self.now_s - 0.12
         self.thermal.add(PointSample(self.ns(at_s), "sensor", "ball", measured))
         self.maintenance.measured(at_s)

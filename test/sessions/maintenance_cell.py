@@ -113,6 +113,7 @@ class Cell:
     config: MaintenanceConfig = field(default_factory=config_of)
     shelf: Shelf = field(default_factory=Shelf)
     services: dict[str, str] = field(default_factory=dict)
+    thermal: Answer = field(default_factory=lambda: Answer(Code.NO_SIGNIFICANT_GAIN, "warm"))
     check: Answer = field(default_factory=lambda: passed())
     full: Answer = field(default_factory=lambda: same_tool())
 
@@ -220,7 +221,7 @@ class Cell:
             case ask.Move() | ask.Stop():
                 self.coming.append((self.now_s + LAG_S, request.plan))
             case ask.BeginCycle() | ask.EndCycle():
-                self._answer("thermal", request.number, Answer(Code.NO_SIGNIFICANT_GAIN, "warm"))
+                self._answer("thermal", request.number, self.thermal)
                 if isinstance(request, ask.BeginCycle):
                     self._answer("thermal", request.number, Answer(Code.ACCEPT))
             case ask.Arm():

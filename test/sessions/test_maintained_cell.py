@@ -94,6 +94,17 @@ def test_what_is_beyond_the_bounds_waits(history, bounds, words):
         assert result.accepted == (result.thermal_id,)
 
 
+def test_a_tool_that_is_measured_after_something_moved_waits(history):
+    """A robot that was pushed shows its beams a bent tool."""
+    cell = maintained(history, automatic=True, tool_m=0.01, tool_rad=0.1)
+    cell.sensor_off_m = np.array([5e-3, 0.0, -4e-3])
+    result = cell.maintain("c1", GAP_S)
+    assert result.thermal_code is Code.SENSOR_OR_ROBOT_MOVED
+    assert result.tool_code is Code.ACCEPT
+    assert f"tool candidate {result.tool_id} waits" in result.message.replace("tool: ", "")
+    assert result.accepted == ()
+
+
 def test_small_steps_do_not_creep_past_the_bounds(history):
     """Each step is small against the one before, their sum is not: the last ones wait."""
     bounds = AcceptBounds(automatic=True, tool_m=2e-3, tool_rad=0.2)

@@ -17,6 +17,7 @@ from robocal_ros.core.proposals import Proposal
 from robocal_ros.core.samples import JointBlock, JointSample
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import CONFIGURE, Command
+from robocal_ros.sessions.found_cycles import automatic_commands, window_commands
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.observations import JOINTS, POINT, POSE
 from robocal_ros.sessions.records import (
@@ -28,12 +29,10 @@ from robocal_ros.sessions.records import (
     read_command,
 )
 from robocal_ros.sessions.replay import (
-    automatic_commands,
     feed,
     input_topics,
     read_events,
     replay,
-    window_commands,
 )
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -14,23 +14,29 @@ Array = NDArray[np.float64]
 class Housing:
     """What is solid at a station, seen from the laser frame: z up, the crossing as origin.
 
-    Solid is all that lies below ``top_m`` outside a cylinder about z, and all below ``floor_m``.
+    Solid is all that lies below ``top_m`` outside a cylinder about z, and all below ``floor_m``, as
+    far as the housing reaches.
 
     Attributes
     ----------
     clear_radius_m : of that cylinder, the opening.
     top_m, floor_m : heights above the beam plane; the floor's is negative.
     retract_m : height of the tool's tip on a way over the housing.
+    reach_m : radius about z beyond which nothing is solid; infinite: all around.
     """
 
     clear_radius_m: float
     top_m: float
     floor_m: float
     retract_m: float
+    reach_m: float = np.inf
 
     def __post_init__(self) -> None:
-        if not np.all(np.isfinite(list(vars(self).values()))):
+        sizes = [size for name, size in vars(self).items() if name != "reach_m"]
+        if not np.all(np.isfinite(sizes)):
             raise InputError(f"{self}: all sizes must be finite")
+        if not self.reach_m > self.clear_radius_m:
+            raise InputError(f"{self}: reach_m must be beyond the opening")
         if not (self.clear_radius_m > 0.0 > self.floor_m and self.top_m >= 0.0):
             raise InputError(f"{self}: clear_radius_m > 0, top_m >= 0 and floor_m < 0 are needed")
         if not self.retract_m > self.top_m:
@@ -61,7 +67,16 @@ class Housing:
         wall = self.clear_radius_m - radius_m - widest
         open_space = np.maximum(wall, low[:, 2] - brim)
         above_floor = low[:, 2] - radius_m - self.floor_m
-        return np.asarray(np.maximum(-np.minimum(open_space, above_floor), 0.0))
+        free = np.maximum(np.minimum(open_space, above_floor), self._beyond(start, end) - radius_m)
+        return np.asarray(np.maximum(-free, 0.0))
+
+    def _beyond(self, start: Array, end: Array) -> Array:
+        """How far beyond the housing's reach lines (m,) pass z, m."""
+        a, along = start[:, :2], end[:, :2] - start[:, :2]
+        length = np.maximum(np.sum(along**2, axis=1), 1e-300)
+        share = np.clip(-np.sum(a * along, axis=1) / length, 0.0, 1.0)
+        nearest = a + share[:, None] * along
+        return np.asarray(np.hypot(nearest[:, 0], nearest[:, 1]) - self.reach_m)
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,11 +196,12 @@ class RunProblem:
         )
 
     def linearise(self, state: ToolState) -> tuple[Array, Array]:
-        """Residual (m, 1) and Jacobian (m, 1, k); the flange's orientation is held in a step."""
-        T, velocity = self.path.at(self.time_s - state.latency_s)
+        """Residual (m, 1) and Jacobian (m, 1, k)."""
+        T, twist = self.path.at(self.time_s - state.latency_s)
         R = T[:, :3, :3]
-        tip = R @ state.tip + T[:, :3, 3] + state.shift[self.step]
-        touch = self.touch(tip, R @ state.axis, state.bend)
+        arm, axis = R @ state.tip, R @ state.axis
+        tip = arm + T[:, :3, 3] + state.shift[self.step]
+        touch = self.touch(tip, axis, state.bend)
         circle = self.circle >= 0
         own = np.maximum(self.circle, 0)
         radius = state.radius[own, self.beam] + self.taper * (touch.height - self.height[own])
@@ -214,7 +215,9 @@ class RunProblem:
         J = np.zeros((len(residual), len(self.names)))
         J[:, :3] = np.einsum("mi,mij->mj", by_tip, R)
         J[:, 3:5] = np.einsum("mi,mij->mj", by_axis, R) @ across(state.axis)
-        J[:, 5] = -np.sum(by_tip * velocity, axis=1)
+        velocity = twist[:, :3] + np.cross(twist[:, 3:], arm)
+        turning = np.cross(twist[:, 3:], axis)  # a held orientation shakes as its readings do
+        J[:, 5] = -np.sum(by_tip * velocity + by_axis * turning, axis=1)
         J[:, 6] = -self.way
         J[rows, radii + 2 * own + self.beam] = np.where(circle, -self.side, 0.0)
         for i in range(3):

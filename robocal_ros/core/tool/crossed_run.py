@@ -177,11 +177,11 @@ def _approach(
     circle: NDArray[np.int64],
 ) -> tuple[Touch, Array]:
     """How the taught tool lies to each edge's beam, and its speed (m,) towards it, m/s."""
-    T, velocity = path.at(time)
+    T, twist = path.at(time)
     tip, axis = T[:, :3, :3] @ start.tip + T[:, :3, 3], T[:, :3, :3] @ start.axis
     ends = laser.points[2 * beam], laser.points[2 * beam + 1]
     touch = touch_of(tip, axis, *ends, circle >= 0, beam)
-    return touch, np.sum(touch.normal * velocity, axis=1)
+    return touch, np.sum(touch.normal * twist[:, :3], axis=1)
 
 
 def _rows(steps: Sequence[BeamStep]) -> list[Row]:

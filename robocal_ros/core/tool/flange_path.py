@@ -20,7 +20,7 @@ class FlangePath(Protocol):
     """The flange over time."""
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
-        """T_base_flange (m, 4, 4) and velocity of the flange's origin (m, 3), base, m/s."""
+        """T_base_flange (m, 4, 4) and twist (m, 6): see `JointPath.at`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class JointPath:
         return CubicSpline(self.time_s, self.q)
 
     def at(self, time_s: Array) -> tuple[Array, Array]:
-        """T_base_flange (m, 4, 4) and velocity (m, 3) of the flange's origin, base, m/s.
+        """T_base_flange (m, 4, 4) and twist (m, 6): of its origin, m/s, and turning, rad/s, base.
 
         Raises
         ------
@@ -88,5 +88,4 @@ class JointPath:
                 "rate of joint_states"
             )
         q, rate = self._spline(time_s), self._spline(time_s, 1)
-        velocity = (self.arm.jacobian(q)[:, :3] @ rate[:, :, None])[:, :, 0]
-        return self.arm.fk(q), velocity
+        return self.arm.fk(q), (self.arm.jacobian(q) @ rate[:, :, None])[:, :, 0]

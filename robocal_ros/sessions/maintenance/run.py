@@ -34,7 +34,7 @@ class Run:
         self.result = CycleResult(cycle_id)
         self._hands, self._decider, self._decided = hands, decider, decided
         self._thermal = ThermalPart(hands, book)
-        self._tool = ToolPart(hands, decider, memory, decided)
+        self._tool = ToolPart(hands, book, decider, memory, decided)
         self.wall_ns = 0
         self._words: list[str] = []
 

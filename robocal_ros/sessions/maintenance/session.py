@@ -200,7 +200,7 @@ class MaintenanceSession:
     def worst_cases(self) -> dict[str, float]:
         """How long each step may take at the most, its way home included, s."""
         thermal = ThermalPart(self._hands, self._book)
-        tool = ToolPart(self._hands, self._decider, self._memory, self._decided)
+        tool = ToolPart(self._hands, self._book, self._decider, self._memory, self._decided)
         found = {"one measuring pose": thermal.worst_s()} if self.ways.count else {}
         if self.config.T_base_laser is not None:
             found |= {f"tool measurement ({mode})": tool.worst_s(mode) for mode in (QUICK, FULL)}

@@ -22,11 +22,13 @@ class CycleBook:
     id : empty: none.
     visited : poses that are done, from 1; measured or not.
     last_s : when the last one was.
+    moved : whether the last cycle that ended found that the sensor or the robot has moved.
     """
 
     id: str = ""
     visited: set[int] = field(default_factory=set)
     last_s: float = -np.inf
+    moved: bool = False
 
 
 class ThermalPart:
@@ -107,9 +109,11 @@ class ThermalPart:
         hands.doing = "thermal cycle ends"
         name, book.id, book.visited, book.last_s = book.id, "", set(), -np.inf
         try:
-            return (yield from hands.ask(self._times.solve_s, NODE, EndCycle, name))
+            answer = yield from hands.ask(self._times.solve_s, NODE, EndCycle, name)
         except SilentError as error:
             return Answer(Code.CONFLICT, str(error))
+        book.moved = answer.code is Code.SENSOR_OR_ROBOT_MOVED
+        return answer
 
     def _first_s(self, pose: int) -> float:
         ways, near = self._hands.ways, self._hands.config.home

@@ -10,10 +10,12 @@ from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.thermal_part import CycleBook
 from robocal_ros.sessions.tool_driving import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 NS = 1_000_000_000
+MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 
 
 @dataclass
@@ -47,9 +49,14 @@ class ToolPart:
     """
 
     def __init__(
-        self, hands: Hands, decider: Decider, memory: Memory, decided: Callable[[Outcome], None]
+        self,
+        hands: Hands,
+        book: CycleBook,
+        decider: Decider,
+        memory: Memory,
+        decided: Callable[[Outcome], None],
     ) -> None:
-        self._hands, self._decider, self._memory = hands, decider, memory
+        self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
         self._decided = decided
         self._times = hands.config.times
         self.wall_ns = 0
@@ -120,7 +127,7 @@ class ToolPart:
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
-        if why := self._decider.withheld(answer.candidate_id):
+        if why := MOVED * self._book.moved or self._decider.withheld(answer.candidate_id):
             outcome.told = f"tool candidate {answer.candidate_id} waits for a decision: {why}"
             return
         done = self._decider.decide(

@@ -1,0 +1,229 @@
+"""Make the golden shift: ``python bags/make_golden_shift.py``, ``out/golden_shift.mcap``.
+
+Simulated: eight hours of a KR 150 that warms up at its work and keeps itself accurate in 96 gaps,
+with a break at noon, a collision at 10:40 and a sphere sensor that is knocked at 13:15; all in
+closed loop (`bench.closed_loop`). The bag holds:
+
+- ``joint_states``, ``motor_temperatures``, ``sphere_cloud``, ``reference_sphere_center``,
+  ``beam_events``: what the cell says;
+- ``/thermal_node/session_events``, ``/tcf_node/session_events``: what the sessions made of it, for
+  ``robocal replay``; ``/maintenance_node/session_events``: what was run and decided;
+- ``/truth/state``: for judging only: warmth, faults, true error of the tool at the working poses.
+
+``--excerpt`` makes ``golden_excerpt.mcap`` beside this script instead: ten minutes of it, with the
+collision, two thermal cycles, the check that sees the bent tool and its measurement.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from session_events import EventLog
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))  # for the bench
+
+from bench.closed_loop import setting  # noqa: E402
+from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
+from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
+from robocal_ros.core.samples import (  # noqa: E402
+    REFERENCE_SPHERE,
+    SPHERE_CLOUD,
+    JointSample,
+    PointSample,
+    TemperatureSample,
+)
+from robocal_ros.core.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noqa: E402
+from robocal_ros.sessions import records, tool_recorded  # noqa: E402
+from robocal_ros.sessions.edge_log import EDGES  # noqa: E402
+from robocal_ros.sessions.events import Command, Outcome  # noqa: E402
+from robocal_ros.sessions.observations import JOINTS  # noqa: E402
+from robocal_ros.sessions.temperatures import TEMPERATURES  # noqa: E402
+from robocal_ros.sim.cell_outputs import Happened  # noqa: E402
+from robocal_ros.sim.cell_samples import Sample  # noqa: E402
+from robocal_ros.storage.bag_writer import BagWriter, ros_time  # noqa: E402
+
+FULL = ROOT / "out" / "golden_shift.mcap"
+EXCERPT = Path(__file__).with_name("golden_excerpt.mcap")
+SEED = 1
+WINDOW_S = (at(10, 38), at(10, 48))  # of the excerpt
+AHEAD_S = 2.0 * PASS_S  # the sessions hear every reading from so long before it on
+NODES = {"thermal": "thermal_node", "tool": "tcf_node", "maintenance": "maintenance_node"}
+THERMAL = {kind: f"/{kind}" for kind in (JOINTS, SPHERE_CLOUD, REFERENCE_SPHERE, TEMPERATURES)}
+TOOL = {kind: f"/{kind}" for kind in (JOINTS, EDGES)}
+TRUTH = "/truth/state"
+CLOUD_FIELDS = [
+    {"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate("xyz")
+]
+
+
+class Recorder:
+    """Writes what the plant hears and what its sessions do, within a window of the shift."""
+
+    def __init__(self, bag: BagWriter, window_s: tuple[float, float]) -> None:
+        self._bag, self._window_s = bag, window_s
+        self._logs = {
+            node: EventLog(bag, f"/{name}/session_events") for node, name in NODES.items()
+        }
+        self._plant: Plant | None = None
+        self._shown: dict[str, Any] = {}
+        self._second = -1
+
+    def watch(self, plant: Plant) -> None:
+        """Take the plant, before its commissioning."""
+        self._plant, plant.heard = plant, self.heard
+
+    @property
+    def plant(self) -> Plant:
+        """The one that is watched."""
+        if self._plant is None:
+            raise ValueError("watch a plant first")
+        return self._plant
+
+    def _inside(self, room_s: float = 0.0) -> bool:
+        begin_s, end_s = self._window_s
+        since = self.plant.now_s - self.plant.begin_s
+        return begin_s - room_s <= since < end_s
+
+    def heard(self, came: Happened, samples: Sequence[Sample]) -> None:
+        """Write what came, in the order of its stamps."""
+        self.plant.every_reading = self._inside(AHEAD_S)
+        if not self._inside():
+            return
+        self._show_in_force()
+        shots = {self.plant.samples.ns(shot.time_s): shot.points for shot in came.shots}
+        for sample in samples:
+            self._write_sample(sample, shots)
+        if int(self.plant.now_s) != self._second:
+            self._second = int(self.plant.now_s)
+            self._write(TRUTH, "std_msgs/msg/String", {"data": json.dumps(self._truth())})
+
+    def record(self, node: str, command: Command, outcome: Outcome | None) -> None:
+        """Write what a session was told, and what came of it."""
+        if not self._inside():
+            return
+        self._logs[node].write(command, outcome, self.plant.clock.now_ns)
+        self._show_in_force()
+
+    def _show_in_force(self) -> None:
+        """Write the sessions' configurations when what is in force has changed, as nodes do."""
+        suite = self.plant.suite
+        if suite is None:
+            return
+        thermal, tool = suite.thermal, suite.tool
+        follower, current = thermal.follower, tool.current
+        cycles = 0 if follower is None else follower.state.cycles
+        shown = {
+            "thermal": (thermal.in_force.revision, thermal.reference_id, cycles),
+            "tool": (current.head.revision, current.thermal.revision, current.healthy.revision),
+        }
+        made = {
+            "thermal": lambda: records.configuration(thermal, THERMAL),
+            "tool": lambda: tool_recorded.configuration(tool, TOOL),
+        }
+        for node, state in shown.items():
+            if self._shown.get(node) != state:
+                self._shown[node] = state
+                self._logs[node].write(made[node](), None, self.plant.clock.now_ns)
+
+    def _truth(self) -> dict[str, Any]:
+        cell = self.plant.cell
+        error = np.linalg.norm(cell.tcp_error(WORK), axis=1)
+        told = {
+            "simulated": True,
+            "cell_time_s": cell.now_s,
+            "faults": dict(cell.faults.sizes),
+            "motor_k": cell.warmth.motor.tolist(),
+            "link_k": cell.warmth.link.tolist(),
+            "tcp_error_rms_m": float(np.sqrt(np.mean(error**2))),
+            "T_flange_tool": cell.tool.T_flange_tool.tolist(),
+        }
+        if self.plant.commanded is not None:
+            off = np.linalg.norm(cell.tcp_error(self.plant.commanded), axis=1)
+            told["commanded_tcp_error_rms_m"] = float(np.sqrt(np.mean(off**2)))
+        return told
+
+    def _write_sample(self, sample: Sample, shots: Mapping[int, np.ndarray]) -> None:
+        header: dict[str, Any] = {"stamp": ros_time(sample.stamp_ns)}
+        match sample:
+            case JointSample():
+                message = {
+                    "header": header,
+                    "name": list(sample.names),
+                    "position": sample.position,
+                }
+                self._write(f"/{JOINTS}", "sensor_msgs/msg/JointState", message)
+            case EdgeSample():
+                edge = {
+                    "header": header | {"frame_id": sample.station},
+                    "beam": sample.beam,
+                    "edge": BREAK if sample.blocked else RESTORE,
+                    "stamp_sigma_s": sample.sigma_s,
+                }
+                self._write(f"/{EDGES}", "robocal_msgs/msg/BeamEvent", edge)
+            case TemperatureSample():
+                told = {
+                    "header": header | {"frame_id": sample.joint},
+                    "temperature": sample.celsius,
+                }
+                self._write(f"/{TEMPERATURES}", "sensor_msgs/msg/Temperature", told)
+            case PointSample():
+                header["frame_id"] = f"{sample.frame}/{sample.target}"
+                self._write_sphere(sample, header, shots)
+
+    def _write_sphere(
+        self, sample: PointSample, header: dict[str, Any], shots: Mapping[int, np.ndarray]
+    ) -> None:
+        if sample.topic == REFERENCE_SPHERE:
+            x, y, z = sample.position_m.tolist()
+            message = {"header": header, "point": {"x": x, "y": y, "z": z}}
+            self._write(f"/{REFERENCE_SPHERE}", "geometry_msgs/msg/PointStamped", message)
+            return
+        data = shots[sample.stamp_ns].astype("<f4")
+        cloud = {
+            "header": header,
+            "height": 1,
+            "width": len(data),
+            "fields": CLOUD_FIELDS,
+            "is_bigendian": False,
+            "point_step": 12,
+            "row_step": 12 * len(data),
+            "data": np.frombuffer(data.tobytes(), dtype=np.uint8),
+            "is_dense": True,
+        }
+        self._write(f"/{SPHERE_CLOUD}", "sensor_msgs/msg/PointCloud2", cloud)
+
+    def _write(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
+        self._bag.write(topic, kind, message, self.plant.clock.now_ns)
+
+
+@contextmanager
+def recorder(path: Path, window_s: tuple[float, float]) -> Iterator[Recorder]:
+    """Writes a bag of a window of a shift, s from its begin."""
+    latched = [f"/{name}/session_events" for name in NODES.values()]
+    with BagWriter(path, latched=latched) as bag:
+        yield Recorder(bag, window_s)
+
+
+def main() -> None:
+    """Write one of both."""
+    parser = argparse.ArgumentParser(description="make the golden shift, simulated")
+    parser.add_argument("--excerpt", action="store_true", help="ten minutes, beside this script")
+    path, plan, window_s = FULL, GOLDEN, (-np.inf, np.inf)
+    if parser.parse_args().excerpt:
+        hours = np.ceil(WINDOW_S[1] / GOLDEN.every_s) * GOLDEN.every_s / 3600.0
+        path, plan, window_s = EXCERPT, replace(GOLDEN, hours=float(hours)), WINDOW_S
+    path.parent.mkdir(exist_ok=True)
+    with recorder(path, window_s) as writes:
+        run_shift(plan, SEED, record=writes.record, watch=writes.watch)
+    print(f"{path.name} of {setting.SERIAL}: {path.stat().st_size / 1e6:.2f} MB, simulated")
+
+
+if __name__ == "__main__":
+    main()

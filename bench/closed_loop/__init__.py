@@ -1,0 +1,10 @@
+"""A cell that keeps itself accurate for a shift: simulated cell and sessions in one process.
+
+setting   settings of the sessions, as a configured cell has them
+suite     the sessions, joined as the nodes join them
+plant     robot, PLC and suite on one clock: commissioning, gaps, production
+shift     the golden shift and shorter ones, and what came of them
+judging   how accurate that was, against the same shift without the suite
+faults    what each fault costs, and from which size on it is reported
+tables    all of it as the tables of the bench
+"""

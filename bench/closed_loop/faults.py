@@ -1,0 +1,136 @@
+"""What each fault costs, who reports it, and from which size on. Simulated."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from bench.closed_loop.judging import Harm, harm
+from bench.closed_loop.plant import GapReport
+from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord
+from robocal_ros.core.codes import Code
+from robocal_ros.sim.cell_faults import FAULTS, SIZES, Fault
+
+EVERY_S = 160.0  # a gap, then one pass of the programme
+CLEAN, AFTER = 1, 2  # gaps before and after the fault
+POWER = 0.9
+WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
+HARMLESS: tuple[Fault, ...] = ("input_latency", "swapped_temperatures")
+"""Faults that no result depends on: the edges' latency is measured in each run, and motor
+temperatures are only used where the drift was learned with them."""
+
+SWEEP: Mapping[Fault, tuple[float, ...]] = {
+    "collision": (0.1, 0.2, 0.3, 0.5, 2.0),
+    "wrong_tool": (0.1, 0.2, 0.3, 1.0, 10.0),
+    "sensor_knocked": (0.05, 0.1, 0.2, 0.4, 1.0),
+    "sphere_knocked": (0.05, 0.1, 0.2, 0.4, 1.0),
+    "beam_dirty": (0.1, 0.2, 0.4, 0.6),
+    "input_latency": (1.0, 5.0, 20.0),
+    "lost_messages": (0.02, 0.05, 0.1, 0.2, 0.5),
+    "clock_jump": (0.01, 0.1, 1.0, 10.0),
+    "sensor_clock_jump": (0.01, 0.1, 1.0, 10.0),
+    "moved_by_hand": (0.05, 0.1, 0.2, 0.4, 1.0),
+}
+"""Sizes in the faults' own units; a fault that is not here is tried at its usual one."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A fault of a size in the cell of a seed; 0: the usual size, or none."""
+
+    fault: Fault
+    size: float
+    seed: int
+
+    @property
+    def plan(self) -> ShiftPlan:
+        """A short shift with the fault in its middle."""
+        return ShiftPlan(
+            hours=(CLEAN + AFTER) * EVERY_S / 3600.0,
+            every_s=EVERY_S,
+            incidents=(Incident(CLEAN * EVERY_S, self.fault, self.size),),
+        )
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a trial showed.
+
+    Attributes
+    ----------
+    who, code : who reported it first, and how; empty and NONE where nobody did.
+    gaps : after the fault until then.
+    stopped : passes that the correction refused: the robot stood.
+    over_s : the longest overrun of a gap.
+    """
+
+    trial: Trial
+    who: str
+    code: Code
+    gaps: float
+    harm: Harm
+    stopped: int
+    over_s: float
+
+    @property
+    def in_time(self) -> bool:
+        """Whether it was reported within one cycle."""
+        return self.gaps <= 1
+
+
+def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Report:
+    """Read the records of a trial."""
+    who, code, gaps = "", Code.NONE, np.inf
+    for number, gap in enumerate(with_suite.gaps[CLEAN:], start=1):
+        for name, found in _told(gap):
+            if not who:
+                who, code, gaps = name, found, float(number)
+    stopped = sum(one.error is None for one in with_suite.passes)
+    over_s = max(gap.over_s for gap in with_suite.gaps)
+    return Report(trial, who, code, gaps, harm(with_suite, without), stopped, over_s)
+
+
+def _told(gap: GapReport) -> list[tuple[str, Code]]:
+    result = gap.result
+    if result is None:
+        return [("run refused", gap.fault_code or Code.CONFLICT)]
+    told = [("thermal", result.thermal_code), ("tool", result.tool_code)]
+    told += [("maintenance", gap.fault_code), ("maintenance", result.code)]
+    return [(name, code) for name, code in told if code not in WELL]
+
+
+def usual(seed: int) -> list[Trial]:
+    """Each fault once, at its usual size."""
+    return [Trial(fault, 0.0, seed) for fault in FAULTS if fault != "none"]
+
+
+def sweep(seeds: Sequence[int]) -> list[Trial]:
+    """Each fault at all of its sizes."""
+    return [
+        Trial(fault, size, seed)
+        for fault in FAULTS
+        if fault != "none"
+        for size in SWEEP.get(fault, (0.0,))
+        for seed in seeds
+    ]
+
+
+def smallest_detected(reports: Sequence[Report]) -> float:
+    """The smallest size of one fault from which on it is reported in time with the wanted power.
+
+    Infinite where none is.
+    """
+    found = np.inf
+    for size in sorted({one.trial.size for one in reports}, reverse=True):
+        own = [one.in_time for one in reports if one.trial.size == size]
+        if np.mean(own) < POWER:
+            break
+        found = size
+    return found
+
+
+def named_size(trial: Trial) -> str:
+    """The size with its unit."""
+    usual_size, _, unit = SIZES.get(trial.fault, (0.0, 1.0, ""))
+    size = trial.size or usual_size
+    return f"{size:g} {unit}".strip() if size else ""

@@ -1,0 +1,107 @@
+"""How accurate the cell was, by the truth, against the same shift without its suite."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.closed_loop.shift import HOUR_S, ShiftRecord
+from robocal_ros.core.thermal.drift_history import THRESHOLD_M
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of many errors (..., 3), m; ``within``: share of directions below 0.1 mm."""
+
+    rms_m: float
+    p95_m: float
+    within: float
+
+    @classmethod
+    def of(cls, error: Array) -> "Figures":
+        """Take them all together; not a number where there are none."""
+        if not error.size:
+            return cls(np.nan, np.nan, np.nan)
+        length = np.linalg.norm(error, axis=-1)
+        rms = float(np.sqrt(np.mean(length**2)))
+        share = float(np.mean(np.abs(error) <= THRESHOLD_M))
+        return cls(rms, float(np.quantile(length, 0.95)), share)
+
+
+def per_hour(record: ShiftRecord) -> list[Figures]:
+    """One for each hour of the shift."""
+    time_s, error = record.errors()
+    hour = (time_s // HOUR_S).astype(int)
+    return [Figures.of(error[hour == h]) for h in range(round(record.plan.hours))]
+
+
+def below_bound(records: Sequence[ShiftRecord]) -> tuple[float, float]:
+    """Share of errors below the stated 95 % bound, and mean bound in m.
+
+    Every working pose of each pass counts for which the line was told a bound.
+    """
+    below, bounds = [], []
+    for record in records:
+        for one in record.passes:
+            if one.error is None or one.accuracy is None or one.accuracy.error is None:
+                continue
+            bound_m = one.accuracy.error.bound_m
+            below.append(np.linalg.norm(one.error, axis=1) < bound_m)
+            bounds.append(bound_m)
+    return float(np.mean(below)), float(np.mean(bounds))
+
+
+def cycle_rms(record: ShiftRecord) -> dict[int, float]:
+    """Rms error, m, of the production after each gap, where there was any."""
+    found: dict[int, list[Array]] = {}
+    for one in record.passes:
+        if one.error is not None:
+            found.setdefault(one.cycle, []).append(one.error)
+    return {cycle: Figures.of(np.array(errors)).rms_m for cycle, errors in found.items()}
+
+
+@dataclass(frozen=True)
+class Harm:
+    """How much worse the suite made it, m; negative where it did good.
+
+    Attributes
+    ----------
+    rms_m : over all working poses and passes; ``p99_m`` : their 99 % quantile.
+    cycle_m : rms of the worst cycle.
+    """
+
+    rms_m: float
+    p99_m: float
+    cycle_m: float
+
+
+def harm(with_suite: ShiftRecord, without: ShiftRecord) -> Harm:
+    """Compare two shifts of one seed, pass by pass where both produced."""
+    pairs = [
+        (a.error, b.error)
+        for a, b in zip(with_suite.passes, without.passes, strict=True)
+        if a.error is not None and b.error is not None
+    ]
+    if not pairs:
+        return Harm(0.0, 0.0, 0.0)
+    on, off = (np.linalg.norm(np.array(part), axis=-1) for part in zip(*pairs, strict=True))
+    cycles, others = cycle_rms(with_suite), cycle_rms(without)
+    return Harm(
+        float(np.sqrt(np.mean(on**2)) - np.sqrt(np.mean(off**2))),
+        float(np.quantile(on, 0.99) - np.quantile(off, 0.99)),
+        max(rms_m - others[cycle] for cycle, rms_m in cycles.items()),
+    )
+
+
+def gaps_to_recover(record: ShiftRecord, after_s: float, tolerance_m: float) -> float:
+    """Gaps from a time until 95 % of the errors of a pass are within tolerance again."""
+    before = int(after_s // record.plan.every_s)  # gaps that had begun by then, the first at 0
+    for one in record.passes:
+        if one.error is None or one.time_s <= after_s:
+            continue
+        if Figures.of(one.error).p95_m <= tolerance_m:
+            return one.cycle - before
+    return np.inf

@@ -1,0 +1,237 @@
+"""Robot, PLC and suite on one clock: commissioning, gaps, production."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.closed_loop import setting
+from bench.closed_loop.suite import Clock, Suite
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.joint_correction.refusals import RefusedError
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.motion.travel import joint_way
+from robocal_ros.sessions import events
+from robocal_ros.sessions.correction import TrajectoryCommand
+from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.maintenance import CycleResult
+from robocal_ros.sessions.maintenance.ways import STATION
+from robocal_ros.sessions.tool_results import REFERENCE
+from robocal_ros.sim.cell import SimulatedCell
+from robocal_ros.sim.cell_outputs import Happened
+from robocal_ros.sim.cell_samples import CellSamples, Sample
+from robocal_ros.sim.kr150_cell import poses
+from robocal_ros.sim.production import programme
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.016
+BEAT_S = 0.2  # of gap_open
+LISTEN_S = 0.5  # readings before a gap and before a programme
+ROUNDS = 3  # of the cold robot
+DWELL_S = 1.0  # at each of its poses
+REST_S = 0.2  # after a pass
+WITHIN_S = 120.0  # a commissioning step
+WORK, HOME, CYCLE = poses("work"), poses("home")[0], poses("cycle")
+PROGRAMME = programme(HOME, [*WORK, HOME])
+AT_WORK = slice(0, 2 * len(WORK), 2)  # its points where it arrives at the working poses
+PASS_S = float(PROGRAMME[0][-1])
+
+Heard = Callable[[Happened, list[Sample]], None]
+
+
+@dataclass(frozen=True)
+class GapReport:
+    """How a gap ended.
+
+    Attributes
+    ----------
+    result : of its maintenance; None without a suite, or where it was refused.
+    fault : what the maintenance says is wrong; NONE and empty without.
+    over_s : by how much the robot was moved, or the maintenance ran, beyond its end.
+    """
+
+    result: CycleResult | None = None
+    fault_code: Code = Code.NONE
+    fault: str = ""
+    over_s: float = 0.0
+
+
+@dataclass
+class Plant:
+    """The cell with or without its suite.
+
+    Attributes
+    ----------
+    every_reading : the sessions take all joint readings, also those of the production.
+    heard : takes everything that the cell tells, as it came and as samples for the sessions.
+    begin_s : of the shift, once it has begun.
+    commanded : joints (k, n) to which the last pass went for the working poses; None before.
+    refused : what the correction refused, with the times.
+    """
+
+    cell: SimulatedCell
+    suite: Suite | None
+    every_reading: bool = False
+    heard: Heard = lambda came, samples: None
+    refused: list[tuple[float, str]] = field(default_factory=list)
+    begin_s: float = np.inf
+    commanded: Array | None = None
+    _is_open: bool = False
+    _beat_s: float = -np.inf
+
+    def __post_init__(self) -> None:
+        self.samples = CellSamples(
+            self.cell.plan.arm.joint_names,
+            setting.THERMAL.sphere,
+            station=setting.STATION,
+            frame=setting.FRAME,
+        )
+
+    @property
+    def now_s(self) -> float:
+        """Of the cell."""
+        return self.cell.now_s
+
+    @property
+    def _q(self) -> Array:
+        return np.asarray(self.cell.motion.at([self.now_s])[0][0])
+
+    @property
+    def clock(self) -> Clock:
+        """Of the suite."""
+        return Clock(self.now_s, self.samples.ns(self.now_s))
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def send(self, plan: JointPlan) -> None:
+        """Let the robot follow a plan at once."""
+        self.cell.follow(self.now_s + plan.time_s, plan.q, plan.qd)
+
+    def step(self) -> None:
+        """A step of time with everything listening."""
+        came = self.cell.advance(self.now_s + STEP_S)
+        if self.suite is None:
+            return
+        if self.now_s >= self._beat_s + BEAT_S:
+            self._beat_s = self.now_s
+            self.suite.maintenance.gap(self._is_open, self.now_s)
+        self._take(self.suite, came)
+
+    def _take(self, suite: Suite, came: Happened) -> None:
+        samples = self.samples.of(came, self.cell.faults)
+        self.heard(came, samples)
+        suite.step(samples, self.clock)
+
+    def listen(self, until_s: float) -> None:
+        """Step until a time."""
+        while self.now_s < until_s - 1e-9:
+            self.step()
+
+    def work(self, until_s: float) -> None:
+        """Let time pass in which the robot produces; without readings where none are wanted."""
+        if self.suite is None:
+            self.cell.advance(until_s, readings=False)
+            return
+        if self.every_reading:
+            self.listen(until_s)
+        if until_s - LISTEN_S > self.now_s:
+            self._take(self.suite, self.cell.advance(until_s - LISTEN_S, readings=False))
+        self.listen(until_s)
+
+    # ---- commissioning --------------------------------------------------------------------------
+
+    def commission(self) -> None:
+        """Place the sensor, capture the cold reference, measure the healthy tool, enable.
+
+        Raises
+        ------
+        RobocalError
+            When a step is refused.
+        """
+        suite = self.suite
+        if suite is None:
+            return
+        self.listen(self.now_s + 1.0)
+        for pose in [*np.tile(CYCLE, (ROUNDS, 1)), HOME]:
+            self._go(suite, pose)
+            self.listen(self.now_s + DWELL_S)
+        for name in (events.CALIBRATE_SENSOR, events.CAPTURE_REFERENCE):
+            self._thermal(suite, Command(name, {"by": "commissioning"}))
+        suite.driver.arm(self.now_s)
+        arguments = {"mode": REFERENCE, "cycle_id": "commissioning", "by": "commissioning"}
+        suite.tool_command(Command(events.MEASURE_TOOL, arguments))
+        self._until(lambda: suite.last_tool is not None and not suite.driver.armed)
+        if suite.last_tool is None or not suite.last_tool.done:
+            raise RobocalError(f"commissioning of the tool: {suite.last_tool}")
+        self.listen(self.now_s + 1.0)
+        self.send(suite.maintenance.ways.home(STATION, self._q).plan)
+        self.listen(self.cell.motion.end_s + 1.0)
+        suite.enable()
+
+    def _go(self, suite: Suite, pose: Array) -> None:
+        self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))
+        self.listen(self.cell.motion.end_s)
+
+    def _thermal(self, suite: Suite, command: Command) -> None:
+        suite.thermal_command(command)
+        self._until(lambda: not suite.thermal.waiting)
+
+    def _until(self, done: Callable[[], bool]) -> None:
+        end_s = self.now_s + WITHIN_S
+        while not done():
+            self.step()
+            if self.now_s > end_s:
+                raise RobocalError(f"commissioning: not done within {WITHIN_S:g} s")
+
+    # ---- the PLC --------------------------------------------------------------------------------
+
+    def gap(self, cycle_id: str, gap_s: float) -> GapReport:
+        """Open a gap of a length, run the maintenance in it, close it at its end."""
+        end_s = self.now_s + gap_s
+        if self.suite is None:
+            self.work(end_s)
+            return GapReport()
+        maintenance, result = self.suite.maintenance, None
+        self._is_open = True
+        self.listen(self.now_s + LISTEN_S)
+        try:
+            left_s = end_s - self.now_s
+            result = maintenance.run(cycle_id, left_s, self.now_s, self.clock.now_ns)
+            while result is not None and result.code is Code.NONE:
+                self.step()
+                result = maintenance.result(cycle_id)
+        except RobocalError as error:
+            self.refused.append((self.now_s, f"{cycle_id}: {error}"))
+        over_s = max(self.now_s, self.cell.motion.end_s) - end_s
+        self._is_open = False
+        self.work(max(end_s, self.now_s))
+        said = maintenance.status(self.now_s)
+        return GapReport(result, said.fault_code, said.fault, max(over_s, 0.0))
+
+    def produce(self) -> Array | None:
+        """One pass of the programme, corrected where there is a suite.
+
+        Joints (k, n) at the working poses; None where the correction refuses: the robot stands.
+        """
+        time_s, q, qd, qdd = PROGRAMME
+        begin_s = self.now_s
+        end_s = begin_s + PASS_S + REST_S
+        if self.suite is not None and self.suite.correction is not None:
+            names = self.cell.plan.arm.joint_names
+            taught = TrajectoryCommand(names, q, time_s, qd, qdd)
+            try:
+                sent = self.suite.correction.trajectory(taught, begin_s)
+            except RefusedError as error:
+                self.refused.append((begin_s, str(error)))
+                self.work(end_s)
+                return None
+            self.cell.follow(begin_s + time_s, sent.position, sent.velocity, sent.acceleration)
+            q = sent.position
+        else:
+            self.cell.follow(begin_s + time_s, q, qd, qdd)
+        self.commanded = np.asarray(q[AT_WORK])
+        self.work(end_s)
+        return self.commanded

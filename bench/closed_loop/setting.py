@@ -1,0 +1,63 @@
+"""Settings of the sessions, as a configured KR 150 cell has them."""
+
+import numpy as np
+
+from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.limits import MotionLimits
+from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.sessions.maintenance import AcceptBounds, MaintenanceConfig, Times
+from robocal_ros.sessions.thermal_config import ThermalConfig
+from robocal_ros.sessions.tool_config import ToolConfig, rows_of
+from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
+from robocal_ros.sim.cell_plan import CellPlan, known_laser
+from robocal_ros.sim.kr150_cell import SPIN_RAD, T_BASE_LASER, TAUGHT, poses
+
+SERIAL = "SIM-KR150"
+STATION, FRAME, TARGET = "station", "sensor", "ball"
+FLANGE, TOOL = "tool0", "tool"
+TOLERANCE_M = 3e-4
+
+THERMAL = ThermalConfig(measuring_frame=FRAME, target=TARGET, tolerance_m=TOLERANCE_M)
+HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.10, reach_m=0.3)
+LIMITS = MotionLimits(tcp_speed_m_s=0.25)
+DRIVING = DrivingConfig(HOUSING, 0.1, 0.01, 0.06, LIMITS)  # pin, its radius with a bend, flange
+TRAVEL_M_S = 1.0
+TIMES = Times(check_s=20.0, full_s=35.0, tool_home_s=8.0)
+BOUNDS = AcceptBounds(automatic=True)
+HOME_NEAR_RAD = float(np.radians(2.0))  # the corrected home of a bent tool is as far from home
+
+
+def laser_of(plan: CellPlan) -> LaserFrame:
+    """The beams as this robot places them while it is cold."""
+    rng = np.random.default_rng([plan.seed, 1])
+    points = known_laser(plan, T_BASE_LASER, poses("tool")[0], rng)
+    return calibrate_laser(points, point_sigma(plan.station), CYLINDER_M)
+
+
+def tool_config(laser: LaserFrame) -> ToolConfig:
+    """Of the tool session."""
+    return ToolConfig(
+        points_m=rows_of(laser.points),
+        laser_sigma_m=laser.sigma_m,
+        reach_m=(float(laser.reach[0]), float(laser.reach[1])),
+        taught=rows_of(TAUGHT),
+        station=STATION,
+        spin_rad=SPIN_RAD,
+    )
+
+
+def maintenance_config(laser: LaserFrame) -> MaintenanceConfig:
+    """Of the maintenance."""
+    return MaintenanceConfig(
+        home=poses("home")[0],
+        poses=poses("cycle"),
+        T_flange_tool=TAUGHT,
+        driving=DRIVING,
+        T_base_laser=laser.T_base_laser,
+        travel_speed_m_s=TRAVEL_M_S,
+        home_near=HOME_NEAR_RAD,
+        tolerance_m=TOLERANCE_M,
+        times=TIMES,
+        bounds=BOUNDS,
+    )

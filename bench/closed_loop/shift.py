@@ -1,0 +1,184 @@
+"""Shifts of the cell, with and without its suite, and what came of them."""
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.closed_loop import setting
+from bench.closed_loop.plant import PASS_S, REST_S, GapReport, Plant
+from bench.closed_loop.suite import Record, Suite
+from robocal_ros.sessions.accuracy import Accuracy
+from robocal_ros.sim.cell import SimulatedCell
+from robocal_ros.sim.cell_faults import Fault
+from robocal_ros.sim.kr150_cell import kr150_cell
+from robocal_ros.sim.motion import JITTER_RAD
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+Array = NDArray[np.float64]
+
+HOUR_S = 3600.0
+ROBOT = "kr150_r3100"
+
+
+@dataclass(frozen=True)
+class Incident:
+    """Something goes wrong at a time since the shift's begin; ``size`` in the fault's own unit."""
+
+    at_s: float
+    fault: Fault
+    size: float = 0.0
+
+
+@dataclass(frozen=True)
+class ShiftPlan:
+    """A shift.
+
+    Attributes
+    ----------
+    work_s : production without gaps before the shift, after the commissioning of the cold robot.
+    every_s, gap_s : a gap of this length begins each so often.
+    pauses : from and to, in which nothing is produced.
+    incidents : in their order.
+    begins_h : o'clock.
+    points : of a sphere's cloud; 0: centres alone.
+    """
+
+    hours: float
+    work_s: float = 0.0
+    every_s: float = 300.0
+    gap_s: float = 90.0
+    pauses: tuple[tuple[float, float], ...] = ()
+    incidents: tuple[Incident, ...] = ()
+    begins_h: float = 8.0
+    points: int = 2000
+
+    @property
+    def cycles(self) -> int:
+        """Number of gaps."""
+        return round(self.hours * HOUR_S / self.every_s)
+
+
+def at(hour: int, minute: int = 0, begins_h: float = 8.0) -> float:
+    """Seconds since the shift's begin at a time of the day."""
+    return (hour + minute / 60.0 - begins_h) * HOUR_S
+
+
+GOLDEN = ShiftPlan(
+    hours=8.0,
+    pauses=((at(12), at(12, 30)),),
+    incidents=(
+        Incident(at(10, 40), "collision", 2.0),
+        Incident(at(13, 15), "sensor_knocked", 1.0),
+    ),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A pass of the programme as it was, by the truth.
+
+    Attributes
+    ----------
+    time_s : since the shift's begin; ``cycle`` : the gap before it, from 1.
+    error : (k, 3) of the tip at the working poses, base, m; None where it was not produced.
+    accuracy : what the line read then; None without a suite.
+    """
+
+    time_s: float
+    cycle: int
+    error: Array | None
+    accuracy: Accuracy | None
+
+
+@dataclass
+class ShiftRecord:
+    """What came of a shift."""
+
+    plan: ShiftPlan
+    seed: int
+    passes: list[Judged] = field(default_factory=list)
+    gaps: list[GapReport] = field(default_factory=list)
+    refused: list[tuple[float, str]] = field(default_factory=list)
+
+    def errors(self) -> tuple[Array, Array]:
+        """Times (p,) and errors (p, k, 3) of the passes that were produced."""
+        made = [one for one in self.passes if one.error is not None]
+        return np.array([one.time_s for one in made]), np.array([one.error for one in made])
+
+
+Watch = Callable[[Plant], None]
+
+
+def run_shift(
+    plan: ShiftPlan,
+    seed: int,
+    suite: bool = True,
+    record: Record = lambda node, command, outcome: None,
+    watch: Watch = lambda plant: None,
+) -> ShiftRecord:
+    """A whole shift; ``watch`` is given the plant before its commissioning."""
+    nominal = load_robot(ROBOT)
+    made = kr150_cell(nominal, seed, points=plan.points, reading_noise_rad=JITTER_RAD)
+    cell = SimulatedCell(made)
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        CalibrationHistory.open(
+            setting.SERIAL, model_hash=nominal.model_hash, state_dir=Path(folder)
+        ) as history,
+    ):
+        plant = Plant(cell, None)
+        if suite:
+            laser = setting.laser_of(cell.plan)
+            plant.suite = Suite(nominal, history, laser, plant.send, record)
+        watch(plant)
+        plant.commission()
+        return Worker(plan, seed, plant).run()
+
+
+class Worker:
+    """Works through a shift."""
+
+    def __init__(self, plan: ShiftPlan, seed: int, plant: Plant) -> None:
+        self._plan, self._plant = plan, plant
+        self._record = ShiftRecord(plan, seed, refused=plant.refused)
+        self._waiting = list(plan.incidents)
+
+    def run(self) -> ShiftRecord:
+        """The whole shift."""
+        plan, plant = self._plan, self._plant
+        worked_s = plant.now_s + plan.work_s
+        while plant.now_s + PASS_S + REST_S < worked_s:
+            plant.produce()
+        plant.begin_s = plant.now_s
+        for number in range(1, plan.cycles + 1):
+            self._happens()
+            self._record.gaps.append(plant.gap(f"cycle-{number}", plan.gap_s))
+            self._produce(number, plant.begin_s + number * plan.every_s)
+        return self._record
+
+    def _produce(self, cycle: int, until_s: float) -> None:
+        plant = self._plant
+        while plant.now_s + PASS_S + REST_S < until_s and not self._pauses():
+            self._happens()
+            made = plant.produce()
+            error = None if made is None else plant.cell.tcp_error(made)
+            accuracy = None if plant.suite is None else plant.suite.accuracy()
+            self._record.passes.append(Judged(self._now_s, cycle, error, accuracy))
+        plant.work(until_s)
+
+    @property
+    def _now_s(self) -> float:
+        return self._plant.now_s - self._plant.begin_s
+
+    def _pauses(self) -> bool:
+        return any(start <= self._now_s < end for start, end in self._plan.pauses)
+
+    def _happens(self) -> None:
+        while self._waiting and self._now_s >= self._waiting[0].at_s:
+            incident = self._waiting.pop(0)
+            self._plant.cell.set_fault(incident.fault, incident.size)

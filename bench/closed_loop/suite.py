@@ -1,0 +1,323 @@
+"""The sessions that keep a cell accurate, joined as their nodes join them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.closed_loop import setting
+from robocal_ros import __version__
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.samples import MEASURED_POINT, SPHERE_CLOUD, JointSample, PointSample
+from robocal_ros.core.tool.edge_samples import EdgeSample
+from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.sessions import events
+from robocal_ros.sessions.correction import (
+    CorrectionSession,
+    JointCommand,
+    OfferedModel,
+    OfferedTool,
+)
+from robocal_ros.sessions.edge_log import EDGES
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.maintenance import MaintenanceSession
+from robocal_ros.sessions.maintenance import requests as ask
+from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.observations import JOINTS
+from robocal_ros.sessions.thermal import ThermalSession
+from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_driving import ToolDriver
+from robocal_ros.sim.cell_samples import Sample
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+Array = NDArray[np.float64]
+
+NS = 1_000_000_000
+POLL_S = 0.1
+ENDS_RUN = (events.TOOL_STEP, events.BREAK_OFF)
+Record = Callable[[str, Command, Outcome | None], None]
+
+
+class Shelf:
+    """Keeps the maintenance's memory."""
+
+    def __init__(self) -> None:
+        self.document: Mapping[str, Any] | None = None
+
+    def load(self) -> Mapping[str, Any] | None:
+        """What was kept last."""
+        return self.document
+
+    def save(self, document: Mapping[str, Any]) -> None:
+        """Keep it."""
+        self.document = dict(document)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """The suite's clocks, s and ns: the steady one is the cell's."""
+
+    now_s: float
+    now_ns: int
+
+
+class Suite:
+    """Samples in, plans for the robot out.
+
+    Parameters
+    ----------
+    send : gives a plan to the robot's controller.
+    record : takes each command of a session (``thermal``, ``tool``, ``maintenance``) with its
+        outcome.
+
+    Attributes
+    ----------
+    correction : None until the cold reference is there, with which the program was taught.
+    """
+
+    def __init__(
+        self,
+        nominal: SerialArm,
+        history: CalibrationHistory,
+        laser: LaserFrame,
+        send: Callable[[JointPlan], None],
+        record: Record = lambda node, command, outcome: None,
+    ) -> None:
+        self._nominal, self._send, self._record = nominal, send, record
+        self.thermal = ThermalSession(nominal, history, setting.THERMAL, __version__)
+        self.tool = ToolSession(nominal, history, setting.tool_config(laser), __version__)
+        self.driver = ToolDriver(self.tool, setting.DRIVING, send, self.tool_command)
+        self.maintenance = MaintenanceSession(
+            nominal,
+            history,
+            setting.maintenance_config(laser),
+            Shelf(),
+            lambda command, outcome: record("maintenance", command, outcome),
+        )
+        self.correction: CorrectionSession | None = None
+        self.last_tool: Outcome | None = None  # of a run that has ended
+        self._names = nominal.joint_names
+        self._clock = Clock(0.0, 0)
+        self._ending: dict[str, int] = {}  # request that a thermal command answers
+        self._measuring = 0  # request that the open run answers
+        self._polled_s = -np.inf
+        self._offered: tuple[int, int] = (-1, -1)
+
+    # ---- samples --------------------------------------------------------------------------------
+
+    def step(self, samples: list[Sample], clock: Clock) -> None:
+        """Take what has happened, and carry out what follows."""
+        self._clock = clock
+        newest = None
+        for sample in samples:
+            self._take(sample)
+            newest = sample if isinstance(sample, JointSample) else newest
+        if self.correction is not None:
+            if newest is not None:
+                age_s = (clock.now_ns - newest.stamp_ns) / NS
+                state = JointCommand(newest.names, newest.position, None, newest.stamp_ns)
+                self.correction.reading(state, clock.now_s, max(age_s, 0.0))
+            self.correction.look(clock.now_s, clock.now_ns)
+        self._thermal_goes_on()
+        self.driver.tick(clock.now_s)
+        if clock.now_s >= self._polled_s + POLL_S:
+            self.poll()
+        for request in self.maintenance.tick(clock.now_s, clock.now_ns):
+            self._carry_out(request)
+
+    def _take(self, sample: Sample) -> None:
+        now_s = self._clock.now_s
+        if isinstance(sample, JointSample):
+            stamp_s = sample.stamp_ns / NS
+            self.driver.reading(stamp_s, sample.position, now_s)
+            self.maintenance.reading(stamp_s, sample.position, now_s)
+            self.thermal.add(sample)
+            self._to_tool(sample)
+        elif isinstance(sample, EdgeSample):
+            self.driver.beam(sample.blocked)
+            self._to_tool(sample)
+        else:
+            self.thermal.add(sample)
+            if isinstance(sample, PointSample) and sample.topic in (MEASURED_POINT, SPHERE_CLOUD):
+                self.maintenance.measured(sample.stamp_ns / NS)
+
+    def _to_tool(self, sample: JointSample | EdgeSample) -> None:
+        try:
+            self.tool.add(sample)
+        except RobocalError as error:
+            kind = JOINTS if isinstance(sample, JointSample) else EDGES
+            self.tool.ignored.add(kind, str(error))
+        if (command := self.tool.recognised()) is not None:
+            self.tool_command(command)
+
+    # ---- commands -------------------------------------------------------------------------------
+
+    def thermal_command(self, command: Command) -> None:
+        """Ask the thermal session; carried out once its measurements are complete."""
+        self.thermal.submit(command, self._clock.now_ns)
+
+    def _thermal_goes_on(self) -> None:
+        for outcome in self.thermal.advance(wall_ns=self._clock.now_ns):
+            self._record("thermal", outcome.command, outcome)
+            if (number := self._ending.pop(outcome.command.name, 0)) != 0:
+                document = outcome.document or {}
+                missing = tuple(document.get("poses", {}).get("missing", ()))
+                code = outcome.status
+                answer = Answer(code, outcome.message, outcome.calibration_id, missing)
+                self.maintenance.answered(number, answer)
+
+    def tool_command(self, command: Command) -> Outcome | None:
+        """Ask the tool session, at once."""
+        self.tool.submit(command)
+        last = None
+        for outcome in self.tool.step(wall_ns=self._clock.now_ns):
+            self._record("tool", outcome.command, outcome)
+            last = outcome
+        if last is not None and last.command.name in ENDS_RUN and self.tool.run is None:
+            self._tool_ended(last)
+        return last
+
+    def _tool_ended(self, outcome: Outcome) -> None:
+        self.last_tool = outcome
+        number, self._measuring = self._measuring, 0
+        if outcome.document is None:
+            self.driver.run_failed(outcome.message, self._clock.now_s)
+        if number:
+            self.maintenance.answered(number, tool_answer(outcome))
+
+    # ---- requests of the maintenance ------------------------------------------------------------
+
+    def _carry_out(self, request: ask.Request) -> None:
+        now_s = self._clock.now_s
+        match request:
+            case ask.Move() | ask.Stop():
+                self._send(request.plan)
+            case ask.BeginCycle():
+                self._ending[events.BEGIN_CYCLE] = request.number
+                self.thermal_command(Command(events.BEGIN_CYCLE, {"cycle_id": request.cycle_id}))
+            case ask.EndCycle():
+                self._ending[events.END_CYCLE] = request.number
+                self.thermal_command(Command(events.END_CYCLE, {"cycle_id": request.cycle_id}))
+            case ask.Arm():
+                self._answer(request.number, lambda: self.driver.arm(now_s))
+            case ask.Disarm():
+                self._answer(request.number, lambda: self.driver.disarm("maintenance", now_s))
+            case ask.Measure():
+                self._measure(request)
+            case ask.CancelMeasure():
+                if self.tool.run is not None:
+                    reason = {"code": int(Code.CONFLICT), "reason": "cancelled"}
+                    self.tool_command(Command(events.BREAK_OFF, reason))
+
+    def _answer(self, number: int, act: Callable[[], None]) -> None:
+        try:
+            act()
+            self.maintenance.answered(number, Answer(Code.ACCEPT))
+        except RobocalError as error:
+            self.maintenance.answered(number, Answer(error.code, str(error)))
+
+    def _measure(self, request: ask.Measure) -> None:
+        try:
+            self.driver.require_ready()
+        except RobocalError as error:
+            self.maintenance.answered(request.number, Answer(error.code, str(error)))
+            return
+        arguments = {"mode": request.mode, "cycle_id": request.cycle_id, "by": "maintenance"}
+        begun = self.tool_command(Command(events.MEASURE_TOOL, arguments))
+        if begun is not None and begun.done and not begun.repeated:
+            self._measuring = request.number
+        elif begun is not None:
+            self.maintenance.answered(request.number, tool_answer(begun))
+
+    # ---- what is in force -----------------------------------------------------------------------
+
+    def poll(self) -> None:
+        """Take over what was decided, and offer what is in force to the correction."""
+        self._polled_s = self._clock.now_s
+        for node, session in (("thermal", self.thermal), ("tool", self.tool)):
+            for outcome in session.poll():
+                self._record(node, outcome.command, outcome)
+        if self.correction is None:
+            return
+        heads = self.thermal.in_force.revision, self.tool.in_force.revision
+        if heads[0] != self._offered[0]:
+            self.correction.offer_model(self._model())
+        if heads[1] != self._offered[1]:
+            self.correction.offer_tool(self._tool())
+        self._offered = heads
+
+    def enable(self) -> None:
+        """Correct from now on; the program was taught with the robot as the cold reference has it.
+
+        Raises
+        ------
+        ValueError
+            Before there is a cold reference.
+        """
+        if self.thermal.reference is None:
+            raise ValueError("capture the cold reference first")
+        taught = replace(
+            self.thermal.reference.cell.arm, T_flange_tool=self.tool.config.T_flange_taught
+        )
+        self.correction = CorrectionSession(self._nominal, taught, setting.SERIAL)
+        self.poll()
+        self.correction.enable(True)
+
+    def _model(self) -> OfferedModel:
+        arm, nominal = self.thermal.arm, self._nominal
+        return OfferedModel(
+            nominal.name,
+            setting.SERIAL,
+            nominal.model_hash,
+            self.thermal.in_force.revision,
+            True,
+            self._names,
+            arm.mdh,
+            arm.T_base_root,
+            self._clock.now_ns,
+        )
+
+    def _tool(self) -> OfferedTool:
+        head, nominal = self.tool.in_force, self._nominal
+        T = None if head.model is None else self.tool.current.tool.T_flange_tool
+        return OfferedTool(
+            setting.FLANGE,
+            T,
+            setting.TOOL,
+            nominal.name,
+            setting.SERIAL,
+            nominal.model_hash,
+            head.revision,
+            True,
+            self._clock.now_ns,
+        )
+
+    def accuracy(self) -> Accuracy:
+        """What the line reads now."""
+        now_s, now_ns = self._clock.now_s, self._clock.now_ns
+        found = self.thermal.accuracy(now_ns)
+        drift = Drift(found.level, found.reason, found.error, found.due_in_s)
+        self.maintenance.drift(drift, now_s)
+        return self.maintenance.accuracy(now_s, now_ns)
+
+
+def tool_answer(outcome: Outcome) -> Answer:
+    """What a tool measurement tells the maintenance."""
+    document = outcome.document
+    if document is None:
+        return Answer(outcome.status, outcome.message)
+    return Answer(
+        outcome.status,
+        outcome.message,
+        outcome.calibration_id,
+        has_result=True,
+        answer=str(document.get("answer", "")),
+        deviation_mm=float(document["change"]["tip_mm"]),
+        sigma_mm=float(np.max(document["sigma_mm"])),
+    )
