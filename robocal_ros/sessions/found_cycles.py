@@ -1,4 +1,4 @@
-"""Commands for a recording that has none: its cycles, named by their times or found by their poses."""
+"""Commands for a recording that has none: its cycles, by their times or found by their poses."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
