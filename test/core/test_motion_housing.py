@@ -108,5 +108,5 @@ def test_beyond_the_reach_of_the_housing_nothing_is_solid():
     assert (cut > 0.0).tolist() == [True, True, True, False, False]
     assert cut[2] == pytest.approx(0.001, abs=1e-12)
     np.testing.assert_allclose(cut[:1], HOUSING.cut_by(start, end, 0.005)[:1])
-    aside = start + [0.0, 0.9, 0.0]  # the line would pass at 0.1 m, but it ends before
-    assert housing.cut_by(aside[:1], aside[:1] + [0.0, 0.5, 0.0], 0.005)[0] == 0.0
+    aside = start + np.array([0.0, 0.9, 0.0])  # the line would pass at 0.1 m, but it ends before
+    assert housing.cut_by(aside[:1], aside[:1] + np.array([0.0, 0.5, 0.0]), 0.005)[0] == 0.0
