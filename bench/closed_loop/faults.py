@@ -14,7 +14,7 @@ from robocal_ros.sim.cell_faults import FAULTS, SIZES, Fault
 EVERY_S = 160.0  # a gap, then one pass of the programme
 CLEAN, AFTER = 1, 2  # gaps before and after the fault
 POWER = 0.9
-WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
+WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 HARMLESS: tuple[Fault, ...] = ("input_latency", "swapped_temperatures")
 """Faults that no result depends on: the edges' latency is measured in each run, and motor
 temperatures are only used where the drift was learned with them."""
