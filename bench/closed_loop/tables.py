@@ -37,7 +37,7 @@ class Amount:
     trials: Sequence[Trial]
 
 
-SHORT = Amount(golden=(1,), quiet=(2,), trials=usual(3))
+SHORT = Amount(golden=(1, 2), quiet=(2,), trials=usual(3))
 LONG = Amount(golden=range(1, 13), quiet=range(21, 31), trials=sweep(range(41, 51)))
 Job = tuple[ShiftPlan, int, bool]
 Pair = tuple[ShiftRecord, ShiftRecord]  # with and without the suite
