@@ -14,7 +14,7 @@ from robocal_ros.sim.cell_faults import FAULTS, SIZES, Fault
 EVERY_S = 160.0  # a gap, then one pass of the programme
 CLEAN, AFTER = 1, 2  # gaps before and after the fault
 POWER = 0.9
-WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
+WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 HARMLESS: tuple[Fault, ...] = ("input_latency", "swapped_temperatures")
 """Faults that no result depends on: the edges' latency is measured in each run, and motor
 temperatures are only used where the drift was learned with them."""
@@ -59,7 +59,7 @@ class Report:
     Attributes
     ----------
     who, code : who reported it first, and how; empty and NONE where nobody did.
-    gaps : after the fault until then.
+    gaps : after the fault until then; one more than there were where nobody did.
     stopped : passes that the correction refused: the robot stood.
     over_s : the longest overrun of a gap.
     """
@@ -80,7 +80,7 @@ class Report:
 
 def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Report:
     """Read the records of a trial."""
-    who, code, gaps = "", Code.NONE, np.inf
+    who, code, gaps = "", Code.NONE, AFTER + 1.0
     for number, gap in enumerate(with_suite.gaps[CLEAN:], start=1):
         for name, found in _told(gap):
             if not who:

@@ -96,12 +96,15 @@ def harm(with_suite: ShiftRecord, without: ShiftRecord) -> Harm:
     )
 
 
-def gaps_to_recover(record: ShiftRecord, after_s: float, tolerance_m: float) -> float:
-    """Gaps from a time until 95 % of the errors of a pass are within tolerance again."""
+def gaps_to_recover(record: ShiftRecord, after_s: float, tolerance_m: float) -> int:
+    """Gaps from a time until 95 % of the errors of a pass are within tolerance again.
+
+    All gaps of the shift where they never are.
+    """
     before = int(after_s // record.plan.every_s)  # gaps that had begun by then, the first at 0
     for one in record.passes:
         if one.error is None or one.time_s <= after_s:
             continue
         if Figures.of(one.error).p95_m <= tolerance_m:
             return one.cycle - before
-    return np.inf
+    return record.plan.cycles

@@ -35,8 +35,9 @@ DWELL_S = 1.0  # at each of its poses
 REST_S = 0.2  # after a pass
 WITHIN_S = 120.0  # a commissioning step
 WORK, HOME, CYCLE = poses("work"), poses("home")[0], poses("cycle")
-PROGRAMME = programme(HOME, [*WORK, HOME])
-AT_WORK = slice(0, 2 * len(WORK), 2)  # its points where it arrives at the working poses
+LEAD = 2  # rests at home, a second each: the correction begins anew after a gap and blends in
+PROGRAMME = programme(HOME, [*[HOME] * LEAD, *WORK, HOME])
+AT_WORK = slice(2 * LEAD, 2 * (LEAD + len(WORK)), 2)  # where it arrives at the working poses
 PASS_S = float(PROGRAMME[0][-1])
 
 Heard = Callable[[Happened, list[Sample]], None]

@@ -65,11 +65,12 @@ class ShiftPlan:
 
 def at(hour: int, minute: int = 0, begins_h: float = 8.0) -> float:
     """Seconds since the shift's begin at a time of the day."""
-    return (hour + minute / 60.0 - begins_h) * HOUR_S
+    return round((hour + minute / 60.0 - begins_h) * HOUR_S)
 
 
 GOLDEN = ShiftPlan(
     hours=8.0,
+    gap_s=120.0,
     pauses=((at(12), at(12, 30)),),
     incidents=(
         Incident(at(10, 40), "collision", 2.0),

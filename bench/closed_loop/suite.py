@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.closed_loop import setting
+from bench.closed_loop.words import model_of, tool_answer, tool_of
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -20,8 +21,6 @@ from robocal_ros.sessions import events
 from robocal_ros.sessions.correction import (
     CorrectionSession,
     JointCommand,
-    OfferedModel,
-    OfferedTool,
 )
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
@@ -247,9 +246,9 @@ class Suite:
             return
         heads = self.thermal.in_force.revision, self.tool.in_force.revision
         if heads[0] != self._offered[0]:
-            self.correction.offer_model(self._model())
+            self.correction.offer_model(model_of(self.thermal, self._clock.now_ns))
         if heads[1] != self._offered[1]:
-            self.correction.offer_tool(self._tool())
+            self.correction.offer_tool(tool_of(self.tool, self._clock.now_ns))
         self._offered = heads
 
     def enable(self) -> None:
@@ -269,35 +268,6 @@ class Suite:
         self.poll()
         self.correction.enable(True)
 
-    def _model(self) -> OfferedModel:
-        arm, nominal = self.thermal.arm, self._nominal
-        return OfferedModel(
-            nominal.name,
-            setting.SERIAL,
-            nominal.model_hash,
-            self.thermal.in_force.revision,
-            True,
-            self._names,
-            arm.mdh,
-            arm.T_base_root,
-            self._clock.now_ns,
-        )
-
-    def _tool(self) -> OfferedTool:
-        head, nominal = self.tool.in_force, self._nominal
-        T = None if head.model is None else self.tool.current.tool.T_flange_tool
-        return OfferedTool(
-            setting.FLANGE,
-            T,
-            setting.TOOL,
-            nominal.name,
-            setting.SERIAL,
-            nominal.model_hash,
-            head.revision,
-            True,
-            self._clock.now_ns,
-        )
-
     def accuracy(self) -> Accuracy:
         """What the line reads now."""
         now_s, now_ns = self._clock.now_s, self._clock.now_ns
@@ -305,19 +275,3 @@ class Suite:
         drift = Drift(found.level, found.reason, found.error, found.due_in_s)
         self.maintenance.drift(drift, now_s)
         return self.maintenance.accuracy(now_s, now_ns)
-
-
-def tool_answer(outcome: Outcome) -> Answer:
-    """What a tool measurement tells the maintenance."""
-    document = outcome.document
-    if document is None:
-        return Answer(outcome.status, outcome.message)
-    return Answer(
-        outcome.status,
-        outcome.message,
-        outcome.calibration_id,
-        has_result=True,
-        answer=str(document.get("answer", "")),
-        deviation_mm=float(document["change"]["tip_mm"]),
-        sigma_mm=float(np.max(document["sigma_mm"])),
-    )

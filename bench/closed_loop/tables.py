@@ -37,7 +37,7 @@ class Amount:
     trials: Sequence[Trial]
 
 
-SHORT = Amount(golden=(1,), quiet=(2,), trials=usual(3))
+SHORT = Amount(golden=(1, 2), quiet=(2,), trials=usual(3))
 LONG = Amount(golden=range(1, 13), quiet=range(21, 31), trials=sweep(range(41, 51)))
 Job = tuple[ShiftPlan, int, bool]
 Pair = tuple[ShiftRecord, ShiftRecord]  # with and without the suite
@@ -62,7 +62,7 @@ def hours_table(pairs: Sequence[Pair]) -> Table:
         "A golden shift in closed loop: true error of the tool at 27 working poses",
         ("seed", "hour", "rms without, mm", "rms with, mm", "p95 without, mm", "p95 with, mm",
          "share below 0.1 mm without, %", "with, %", "goal"),
-        "Simulated: from cold, a gap of 90 s every five minutes, a break at noon, a collision of "
+        "Simulated: from cold, a gap of 120 s every five minutes, a break at noon, a collision of "
         "2 mm at 10:40 (the third hour), the sphere sensor knocked by 1 mm at 13:15 (the sixth). "
         "Without: the same robot and shift, as taught. Share: of the coordinates of all errors.",
     )  # fmt: skip

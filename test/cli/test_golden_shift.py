@@ -52,9 +52,10 @@ def test_a_bent_tool_is_seen_in_the_first_gap_and_right_after_the_second(shift):
         assert np.linalg.norm(one.error, axis=1).min() > 1.5e-3
         assert one.accuracy.level is AccuracyLevel.DEGRADED
         assert one.accuracy.error.bound_m > 1.5e-3
-    for one in after:  # at the first two poses the new tool still blends in, at 0.5 deg/s
-        assert np.linalg.norm(one.error[2:], axis=1).max() < setting.TOLERANCE_M
-        assert one.accuracy.level is AccuracyLevel.DUE  # the new tool waits for its check
+    for one in after:
+        assert np.linalg.norm(one.error, axis=1).max() < setting.TOLERANCE_M
+        assert one.accuracy.level is AccuracyLevel.OK
+        assert np.linalg.norm(one.error, axis=1).max() < one.accuracy.error.bound_m
     assert len(before) == len(after) == 1
 
 

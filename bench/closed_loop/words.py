@@ -1,0 +1,58 @@
+"""What the sessions tell each other, as their nodes put it."""
+
+import numpy as np
+
+from bench.closed_loop import setting
+from robocal_ros.sessions.correction import OfferedModel, OfferedTool
+from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.thermal import ThermalSession
+from robocal_ros.sessions.tool import ToolSession
+
+
+def model_of(session: ThermalSession, now_ns: int) -> OfferedModel:
+    """The model in force."""
+    arm, nominal = session.arm, session.nominal
+    return OfferedModel(
+        nominal.name,
+        setting.SERIAL,
+        nominal.model_hash,
+        session.in_force.revision,
+        True,
+        nominal.joint_names,
+        arm.mdh,
+        arm.T_base_root,
+        now_ns,
+    )
+
+
+def tool_of(session: ToolSession, now_ns: int) -> OfferedTool:
+    """The tool in force; without a transform where that is the taught one."""
+    head, nominal = session.in_force, session.nominal
+    return OfferedTool(
+        setting.FLANGE,
+        None if head.model is None else session.current.tool.T_flange_tool,
+        setting.TOOL,
+        nominal.name,
+        setting.SERIAL,
+        nominal.model_hash,
+        head.revision,
+        True,
+        now_ns,
+    )
+
+
+def tool_answer(outcome: Outcome) -> Answer:
+    """What a tool measurement tells the maintenance."""
+    document = outcome.document
+    if document is None:
+        return Answer(outcome.status, outcome.message)
+    return Answer(
+        outcome.status,
+        outcome.message,
+        outcome.calibration_id,
+        has_result=True,
+        answer=str(document.get("answer", "")),
+        deviation_mm=float(document["change"]["tip_mm"]),
+        sigma_mm=float(np.max(document["sigma_mm"])),
+    )
