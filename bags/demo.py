@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-from demo_graph import ROOT, CellController, DemoError
+from demo_graph import READINGS, ROOT, CellController, DemoError
 from demo_output import commit, show, write
 from make_demo_shift import BAG, ROBOT, SERIAL, DemoCell, build
 from make_demo_shift import write as write_bag
@@ -76,7 +76,7 @@ class Demo:
         controller.start(
             folder,
             "joint_correction_node",
-            {"kinematic_model": "/thermal_node/model"},
+            {"kinematic_model": "/thermal_node/model", "joint_states": READINGS},
             taught_tool=f"[{', '.join(map(str, kr150.TOOL))}, 0.0, 0.0, 0.0, 1.0]",
             **common,
         )

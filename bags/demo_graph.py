@@ -22,6 +22,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from robocal_msgs.msg import CalibrationQuality, KinematicModel
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -34,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 PATIENCE_S = 30.0
 END_S = 5.0
+READINGS = "/demo_robot/joint_states"
 POINT_S = 4.0  # between two check poses
 
 
@@ -114,6 +116,8 @@ class CellController:
         self._targets = self._node.create_publisher(
             JointTrajectory, "joint_trajectory", qos.own(reliable)
         )
+        self._readings = self._node.create_publisher(JointState, READINGS, qos.own(reliable))
+        self._way: tuple[float, Array, Array] | None = None  # begin, times, joints of the robot
 
     def listen(self, kind: type, topic: str, inbox: deque[Any], profile: Any) -> None:
         """Gather what comes on a topic in ``inbox``."""
@@ -181,7 +185,10 @@ class CellController:
 
     def correct(self, names: list[str], q: Array) -> Array:
         """Send taught joints (m, n) through the correction node and return what comes out."""
-        self.wait(lambda: self._targets.get_subscription_count() > 0, "the correction node")
+        for publisher in (self._targets, self._readings):
+            self.wait(lambda p=publisher: p.get_subscription_count() > 0, "the correction node")
+        here = self._place(q[0])
+        self._readings.publish(self._reading(names, here))
         message = JointTrajectory(joint_names=names)
         for i, joints in enumerate(q):
             point = JointTrajectoryPoint(positions=joints.tolist())
@@ -195,7 +202,22 @@ class CellController:
         answer = self.corrected[-1]
         if list(answer.joint_names) != names or len(answer.points) != len(q):
             raise DemoError("the corrected trajectory has other joints or points than the taught")
-        return np.array([point.positions for point in answer.points])
+        corrected = np.array([point.positions for point in answer.points])
+        times = POINT_S * np.arange(len(q) + 1)
+        self._way = time.monotonic(), times, np.vstack([here, corrected])
+        return corrected
+
+    def _place(self, first: Array) -> Array:
+        """Where (n,) the simulated robot is: it stands at ``first``, then drives what comes out."""
+        if self._way is None:
+            return first
+        begin, times, joints = self._way
+        return np.array([np.interp(time.monotonic() - begin, times, row) for row in joints.T])
+
+    def _reading(self, names: list[str], q: Array) -> JointState:
+        message = JointState(name=names, position=q.tolist())
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        return message
 
     def close(self) -> None:
         """End every process and leave the graph."""

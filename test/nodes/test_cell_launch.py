@@ -95,11 +95,17 @@ def test_a_cell_of_one_robot_in_its_namespace(graph, tmp_path):
     # Without a laser file, measuring poses or a hand-eye target some wait for their set-up.
     ready = {f"robot_1/{n}" for n in ("thermal_node", "joint_correction_node", "recorder_node")}
     graph.spin_until(lambda: active() >= ready, "they are active, for this robot", 30.0)
-    senders = {i.node_name for i in graph.probe.get_publishers_info_by_topic(CONTROLLER)}
-    assert senders >= {"joint_correction_node"}
-    takers = {i.node_name for i in graph.probe.get_subscriptions_info_by_topic(CONTROLLER)}
-    assert takers == {"cell_sim_node"}
-    models = graph.probe.get_subscriptions_info_by_topic("/robot_1/thermal_node/model")
-    assert {i.node_name for i in models} >= {"joint_correction_node", "recorder_node"}
+
+    def senders(topic: str) -> set[str]:
+        return {info.node_name for info in graph.probe.get_publishers_info_by_topic(topic)}
+
+    def takers(topic: str) -> set[str]:
+        return {info.node_name for info in graph.probe.get_subscriptions_info_by_topic(topic)}
+
+    movers = {"joint_correction_node"}
+    graph.spin_until(lambda: senders(CONTROLLER) >= movers, "who moves the robot", 30.0)
+    graph.spin_until(lambda: takers(CONTROLLER) == {"cell_sim_node"}, "the robot", 30.0)
+    users = {"joint_correction_node", "recorder_node"}
+    graph.spin_until(lambda: takers("/robot_1/thermal_node/model") >= users, "users of the model")
     types = dict(graph.probe.get_topic_names_and_types())
     assert types[CONTROLLER] == [f"trajectory_msgs/msg/{JointTrajectory.__name__}"]
