@@ -75,6 +75,9 @@ def endurance(amount: Amount) -> Table:
     kills = ("test/nodes/test_thermal_node.py", "-k", "kill_during_accept")
     add("thermal_node killed during ~/accept, kill -9", rounds * ROBOTS,
         lambda: not _pytest(*kills, ROBOCAL_KILL_ROUNDS=str(rounds)))  # fmt: skip
+    restarts = "test/nodes/test_joint_correction_restarts.py"
+    add("all nodes of a correction killed together, in each order", 6,
+        lambda: not _pytest(restarts, ROBOCAL_RESTARTS="6"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test/core", "test/storage", "test/sessions")
