@@ -235,8 +235,13 @@ class JointCorrectionNode(HouseNode):
             if held_back or not self._shadow:
                 raise
             return trajectory, None
-        out = trajectory if command is came else message.changed(command)
-        return out, self._session.course
+        course = self._session.course
+        try:
+            return trajectory if command is came else message.changed(command), course
+        except Exception:
+            if course is not None:  # it never goes out
+                course.reject()
+            raise
 
     def _taught(self, names: Any, position: Any, velocity: Any) -> Any:
         return self._session.taught(names, position, velocity, time.monotonic())

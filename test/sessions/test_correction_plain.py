@@ -20,6 +20,7 @@ from robocal_ros.sessions.correction import (
     RefusedError,
     TrajectoryCommand,
 )
+from robocal_ros.sessions.correction.incoming import MOST_STAMPS
 from robocal_ros.sessions.correction.wire import JointWire
 
 DT = 0.002
@@ -132,6 +133,8 @@ class Both:
         assert (one.revision, one.s) == (other.revision, other.s)
         assert a._block.tobytes() == b._block.tobytes()
         assert a._starts.under_way(self.now) == b._starts.under_way(self.now)
+        known = [{key: int(v[0]) for key, v in s._guard._stamps.items() if v[0]} for s in (a, b)]
+        assert known[0] == known[1]
 
     def target(self, data: bytes) -> bytes | str:
         answer = self.do(lambda desk: desk.target(data, self.now))
@@ -408,3 +411,46 @@ def test_whatever_comes_both_ways_do_the_same(
     for kind, seed, count in events:
         both.drive(kind, np.random.default_rng(seed), count)
         both.on_stream(np.random.default_rng(seed + 1), 3)
+
+
+def old(both: Both, names: Sequence[str], q: np.ndarray) -> bytes:
+    """A target 10 ms older than the last one."""
+    both.now += DT
+    return serialized(tuple(names), [q, [], []], both.stamp - 10_000_000)
+
+
+def running() -> Both:
+    """A corrected stream that has settled."""
+    both = Both()
+    both.model(3.0)
+    both.enable(True)
+    both.settle()
+    both.stream(5)
+    return both
+
+
+def test_many_drivers_do_not_wear_out_the_order_of_targets() -> None:
+    both = running()
+    for i in range(200):
+        both.now += 1e-5
+        other = serialized((f"x{i}",), [np.array([0.1]), [], []], both.stamp)
+        both.do(lambda desk, data=other: desk.reading(data, both.now, both.stamp))
+    answer = both.target(old(both, NAMES, both.q))
+    assert "time goes backwards" in str(answer)
+    stamps = both.short.session._guard._stamps
+    assert len(stamps) <= MOST_STAMPS + 2  # one more for each kind: what is shared
+
+
+def test_an_old_target_is_refused_in_any_order_of_its_joints() -> None:
+    both = running()
+    answer = both.target(old(both, NAMES[::-1], both.q[::-1]))
+    assert "time goes backwards" in str(answer)
+
+
+def test_unstamped_readings_leave_nothing_behind() -> None:
+    both = running()
+    for i in range(3 * MOST_STAMPS):
+        both.now += 1e-5
+        data = serialized((*NAMES, f"x{i}"), [np.append(both.q, 0.1), [], []], 0)
+        both.do(lambda desk, data=data: desk.reading(data, both.now, both.stamp))
+    assert len(both.short.session._guard._stamps) <= MOST_STAMPS + 2

@@ -48,7 +48,7 @@ def is_whole(q: Array, found: Array, limits: Array, bounds: Array) -> bool:
         bound = limits[ARM, i] + limits[TOOL, i]
         size = max(size, abs(found[k - 1, i] - q[i]) / bound)
         room = min(room, min(q[i] - limits[LOWER, i], limits[UPPER, i] - q[i]) / bound)
-    return whole and room >= FADES_WITHIN * size
+    return whole and room > 0.0 and room >= FADES_WITHIN * size  # at a limit the session clamps
 
 
 @lean

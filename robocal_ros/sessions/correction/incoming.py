@@ -27,8 +27,7 @@ TRAJECTORY = "trajectory"
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
-MOST_STAMPS = 64  # of so many drivers, or planners, the order in time is watched
-NEVER = 2**63 - 1  # a stamp that none follows
+MOST_STAMPS = 64  # of so many drivers the order in time is watched one by one
 
 
 class JointBook:
@@ -202,14 +201,14 @@ class CorrectionGuard:
     ) -> None:
         """Refuse what carries a mark of a correction, or is older than the one before.
 
-        That is the one of the same joints: drivers of others have clocks of their own.
+        Drivers of other joints have clocks of their own.
         """
         if mark == CORRECTED or (mark == TAUGHT and kind == READING):
             raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
         clock_s = float(self._times[of.CLOCK])
         if not now_s >= clock_s:
             raise RefusedError(Reason.TIME_BACKWARDS, f"clock at {now_s} after {clock_s}")
-        last = int(self._stamps[kind, names][0]) if (kind, names) in self._stamps else 0
+        last = int(self.last_stamp(kind, names)[0])
         reset = last - stamp > CLOCK_RESET_NS
         if stamp and stamp < last and not reset:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
@@ -226,15 +225,18 @@ class CorrectionGuard:
         """Remember the time of what was acted on."""
         self._times[of.CLOCK] = now_s
         if stamp:
-            last = self.last_stamp(kind, names)
-            last[0] = stamp
-            self._stamps[kind, names] = self._stamps.pop((kind, names))  # the oldest goes first
-            if len(self._stamps) > MOST_STAMPS:
-                self._stamps.pop(next(iter(self._stamps)))[0] = NEVER
+            self.last_stamp(kind, names)[0] = stamp
 
     def last_stamp(self, kind: str, names: tuple[str, ...]) -> Index:
-        """Stamp (1,) of the last message of these joints, to go on with; 0: none."""
-        return self._stamps.setdefault((kind, names), np.zeros(1, dtype=np.int64))
+        """Stamp (1,) of the last message in the same order of time, to go on with; 0: none.
+
+        Readings have one for each driver, known by its joints; beyond so many they share one, as
+        all targets do.
+        """
+        key = kind, tuple(sorted(names)) if kind == READING else ()
+        if key not in self._stamps and len(self._stamps) >= MOST_STAMPS:
+            key = kind, ()
+        return self._stamps.setdefault(key, np.zeros(1, dtype=np.int64))
 
     def forget_stamps(self) -> None:
         """Start afresh with any source stamp."""
