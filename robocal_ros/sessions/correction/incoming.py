@@ -230,8 +230,7 @@ class CorrectionGuard:
     def last_stamp(self, kind: str, names: tuple[str, ...]) -> Index:
         """Stamp (1,) of the last message in the same order of time, to go on with; 0: none.
 
-        Readings have one for each driver, known by its joints; beyond so many they share one, as
-        all targets do.
+        Readings have one for each driver, by its joints; beyond so many they share one.
         """
         key = kind, tuple(sorted(names)) if kind == READING else ()
         if key not in self._stamps and len(self._stamps) >= MOST_STAMPS:
