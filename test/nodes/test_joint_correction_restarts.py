@@ -7,6 +7,7 @@ what it is told; the planner waits while nothing comes back.
 import itertools
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from std_srvs.srv import SetBool
 from tool_driver import noisy_cell
 
 from robocal_ros.core.documents import model_document
+from robocal_ros.core.joint_correction import JointCorrection
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.nodes import qos
@@ -32,6 +35,14 @@ BLEND_RAD_S = np.radians(0.5)  # as the node has it by default
 START_RAD = np.radians(0.02)  # how far from where it stands a command may begin
 LONGEST_S = 0.1  # what a pause counts for at most, in a stream that goes on
 TAUGHT_M = [0.01, 0.0, 0.25]
+BENT_M = 0.005
+
+
+def with_tool(arm: SerialArm, shift_m: float) -> SerialArm:
+    """The arm with the taught tool, or with one that is bent along the flange's x."""
+    tool = np.eye(4)
+    tool[:3, 3] = [TAUGHT_M[0] + shift_m, *TAUGHT_M[1:]]
+    return replace(arm, T_flange_tool=tool)
 
 
 class Cell:
@@ -62,9 +73,9 @@ class Cell:
         probe.create_timer(PERIOD_S, self._tick)
 
     def _seed(self) -> None:
-        tool = np.eye(4)
-        tool[:3, 3] = [TAUGHT_M[0] + 0.005, *TAUGHT_M[1:]]
-        found = KnownTool(tool).document() | {"thermal_revision": 0}
+        found = KnownTool(with_tool(NOMINAL, BENT_M).T_flange_tool).document() | {
+            "thermal_revision": 0
+        }
         with CalibrationHistory.open(
             "s1", model_hash=NOMINAL.model_hash, state_dir=self.graph.state
         ) as history:
@@ -186,5 +197,6 @@ def test_no_step_whoever_is_killed(graph: Any, tmp_path: Path) -> None:
         cell.goes_on()
         cell.enable()
     assert cell.largest_step() < START_RAD
-    after = cell.sent[-1][2] - cell.sent[-1][1]
-    assert np.abs(after - offset).max() < 0.1 * np.abs(offset).max()  # what was, is again
+    _, taught, out = cell.sent[-1]
+    whole = JointCorrection.between(with_tool(NOMINAL, 0.0), with_tool(drifted(), BENT_M))
+    assert out == pytest.approx(whole.correct(taught[None]).q[0], abs=1e-9)  # what was, is again
