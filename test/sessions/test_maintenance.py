@@ -244,6 +244,52 @@ def test_a_robot_off_its_plan_is_stopped(cell):
     assert "away from its plan" in cell.session.status(cell.now_s).fault
 
 
+def until_measuring(cell: Cell, pose: int) -> None:
+    cell.run("c1", LONG_S)
+    while not cell.session.status(cell.now_s).doing.startswith(f"measuring pose {pose}"):
+        cell.step()
+
+
+def pushed(cell: Cell, joint: int = 1, by_deg: float = 25.0) -> None:
+    """Somebody else has moved the robot; it rests."""
+    q = cell.q.copy()
+    q[joint] += np.radians(by_deg)
+    cell.motion = JointMotion(q)
+
+
+@pytest.mark.parametrize("by_deg", [3.0, 25.0])
+def test_a_robot_pushed_while_it_measures_is_not_driven(cell, by_deg):
+    until_measuring(cell, 2)
+    pushed(cell, by_deg=by_deg)
+    moves = kinds(cell).count("Move")
+    cell.pass_time(3.0)
+    assert kinds(cell).count("Move") == moves
+    over(cell, fault=True)
+    joint = ARM.joint_names[1]
+    words = f"not where it came to rest: {joint} is {by_deg:.2f} deg off"
+    assert words in cell.session.status(cell.now_s).fault
+
+
+def test_a_robot_pushed_while_a_run_is_broken_off_is_not_driven_home(cell):
+    until_measuring(cell, 2)
+    cell.session.cancel("by the PLC")
+    pushed(cell)
+    moves = kinds(cell).count("Move")
+    cell.pass_time(3.0)
+    assert kinds(cell).count("Move") == moves
+    over(cell, fault=True)
+    assert "robot is not on its taught way: " in cell.session.status(cell.now_s).fault
+
+
+def test_silent_joint_states_while_the_robot_measures_are_a_fault(cell):
+    until_measuring(cell, 2)
+    cell.silent = True
+    cell.services["sensor"] = SILENT
+    cell.pass_time(0.3)
+    assert cell.state is State.FAULT
+    assert "stands away from home" in cell.session.status(cell.now_s).fault
+
+
 def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     cell.offset[2] = np.radians(5.3)
     cell.pass_time(0.5)

@@ -194,7 +194,18 @@ class Hands:
         return q
 
     def drive(self, route: Route, worst_s: float) -> Script[None]:
-        """Send a route and wait until it is over; supervised by the session."""
+        """Send a route and wait until it is over; supervised by the session.
+
+        Raises
+        ------
+        FaultError
+            When the robot does not rest where the route begins, on a taught way.
+        """
+        q = self.robot.resting(SETTLED_S)
+        if q is None:
+            raise FaultError(Code.CONFLICT, "the robot does not rest where its way begins")
+        self.robot.require_at(route.plan.q[0])
+        self.robot.require_taught(q)
         self.robot.start(route, self.now_s)
         self.request(Move, route.plan, worst_s)
         while not self.robot.arrived(self.now_s):
