@@ -43,6 +43,8 @@ def history(tmp_path):
 def cell(history) -> Cell:
     made = Cell(history)
     made.open_gap()
+    assert kinds(made) == ["Disarm"]  # whatever the node before it left
+    made.log.clear()
     return made
 
 
@@ -65,6 +67,7 @@ def test_a_long_gap_takes_everything_in_its_order(cell):
     assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
     assert (result.thermal_code, result.tool_answer) == (Code.NO_SIGNIFICANT_GAIN, "pass")
     assert kinds(cell) == [
+        "Disarm",
         "BeginCycle",
         *(["Move"] * 4),
         "EndCycle",
@@ -313,7 +316,7 @@ def test_nothing_runs_twice_not_after_a_restart_either(cell):
     cell.pass_time(0.3)
     assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
     cell.pass_time(1.0)
-    assert len(cell.log) == count
+    assert kinds(cell)[count:] == ["Disarm"]  # of the start
 
 
 def test_a_restart_in_the_middle_of_a_run_is_a_fault(cell):
@@ -336,6 +339,63 @@ def test_after_a_restart_the_tool_node_is_disarmed_before_anything_else(cell):
     cell.pass_time(0.5)
     assert cell.session.status(cell.now_s).disarmed
     assert not cell.tool.armed
+
+
+def test_a_disarm_that_is_not_confirmed_outlives_a_restart(cell):
+    until_moving(cell, "tool")
+    cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    cell.is_open = False
+    cell.pass_time(1.0)
+    assert cell.state is State.FAULT
+    cell.restart()
+    cell.pass_time(0.3)
+    assert not cell.session.status(cell.now_s).disarmed
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
+    cell.services.clear()
+    cell.pass_time(1.0)
+    assert cell.session.status(cell.now_s).disarmed
+    assert not cell.tool.armed
+
+
+def test_an_idle_cell_that_restarts_does_not_begin_before_a_disarm(cell):
+    cell.tool.armed = True  # by an operator
+    cell.services["disarm"] = SILENT
+    cell.restart()
+    cell.pass_time(0.3)
+    assert cell.run("c1", LONG_S) is Code.CONFLICT
+    cell.services.clear()
+    cell.pass_time(1.0)
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    assert cell.finish().complete
+
+
+def test_what_an_operator_armed_is_disarmed_before_anything_moves(cell):
+    cell.tool.armed = True
+    cell.run("c1", LONG_S)
+    assert cell.finish().complete
+    assert kinds(cell)[:3] == ["Disarm", "BeginCycle", "Move"]
+    over(cell)
+
+
+def test_a_cycle_moves_nothing_before_the_disarm_is_confirmed(cell):
+    cell.tool.armed = True
+    cell.services["disarm"] = SILENT
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert "does not confirm" in result.message
+    assert not {"Move", "BeginCycle", "Arm"} & set(kinds(cell))
+    assert cell.state is State.FAULT
+
+
+def test_a_tool_node_that_turns_deaf_at_the_station_is_a_fault(cell):
+    until_moving(cell, "tool")
+    cell.services["disarm"] = SILENT
+    count = kinds(cell).count("Move")
+    assert "does not confirm" in cell.finish().message
+    assert kinds(cell).count("Move") == count
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
 
 
 def test_calls_that_make_no_sense_are_refused(cell):
@@ -418,7 +478,7 @@ def test_without_a_station_only_the_drift_is_measured(history):
     cell.open_gap()
     cell.run("c1", LONG_S)
     assert cell.finish().complete
-    assert "Arm" not in kinds(cell)
+    assert not {"Arm", "Disarm"} & set(kinds(cell))
     assert accuracy(cell).level is AccuracyLevel.OK
 
 
@@ -427,4 +487,4 @@ def test_without_poses_only_the_tool_is_measured(history):
     cell.open_gap()
     cell.run("c1", LONG_S)
     assert cell.finish().complete
-    assert kinds(cell) == ["Arm", "Measure", "Disarm", "Move"]
+    assert kinds(cell) == ["Disarm", "Disarm", "Arm", "Measure", "Disarm", "Move"]

@@ -124,10 +124,15 @@ class Hands:
 
     # ---- the tool's driver ----------------------------------------------------------------------
 
+    def doubt(self) -> None:
+        """Nobody knows whether the tool's driver is armed; without a station there is none."""
+        self.engaged = self.config.T_base_laser is not None
+        self._disarms.clear()  # what is still to come of them was carried out before this
+
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
-        self.engaged, self.robot.place = True, STATION
-        self._disarms.clear()  # what is still to come of them was carried out before this
+        self.doubt()
+        self.robot.place = STATION
         return (yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm))
 
     def disengage(self) -> None:

@@ -88,7 +88,6 @@ class Memory:
     ----------
     fault_code, fault : what stopped the maintenance until it is acknowledged; empty: nothing.
     running : the cycle that is open.
-    crashed : a cycle was open when it was read.
     """
 
     keeper: Keeper
@@ -97,7 +96,6 @@ class Memory:
     fault_code: Code = Code.NONE
     fault: str = ""
     running: str = ""
-    crashed: bool = False
 
     @classmethod
     def load(cls, keeper: Keeper) -> "Memory":
@@ -121,7 +119,6 @@ class Memory:
             str(document["running"]),
         )
         if memory.running:
-            memory.crashed = True
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
             result = CycleResult(memory.running, Code.CONFLICT, words)
             memory.end(result, Code.CONFLICT, words)

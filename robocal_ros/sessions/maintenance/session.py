@@ -60,8 +60,7 @@ class MaintenanceSession:
         self._memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
         self._hands = Hands(config, self.ways)
-        # A cycle that was open may have left the tool's driver armed.
-        self._hands.engaged = self._memory.crashed and config.T_base_laser is not None
+        self._hands.doubt()  # whoever ran before may have left the tool's driver armed
         self._book = CycleBook()
         self._record = record
         self._conductor = Conductor(self._hands, self._memory, self._tell)
