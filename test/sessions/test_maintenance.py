@@ -307,6 +307,45 @@ def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     assert cell.log == []
 
 
+def test_a_fault_away_from_home_is_not_acknowledged(cell):
+    until_moving(cell, "tool")
+    cell.is_open = False
+    over(cell, fault=True)
+    fault = cell.session.status(cell.now_s).fault
+    with pytest.raises(LimitError, match=r"not at home: .* is .* deg off .*bring it home"):
+        cell.session.acknowledge("me")
+    cell.silent = True
+    cell.pass_time(0.5)
+    with pytest.raises(LimitError, match="joint states are missing"):
+        cell.session.acknowledge("me")
+    assert cell.session.status(cell.now_s).fault == fault
+    cell.silent, cell.motion = False, JointMotion(HOME)
+    cell.pass_time(0.5)
+    cell.session.acknowledge("me")
+    assert cell.state is State.IDLE
+
+
+def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):
+    cell.offset[2] = np.radians(5.3)
+    cell.pass_time(0.5)
+    assert cell.run("c1", LONG_S) is Code.LIMIT_EXCEEDED
+    cell.offset[2] = 0.0
+    cell.pass_time(0.5)
+    before = cell.session.status(cell.now_s)
+
+    def full(document):
+        raise StorageError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cell.shelf, "save", full)
+        with pytest.raises(StorageError):
+            cell.session.acknowledge("me")
+    after = cell.session.status(cell.now_s)
+    assert (after.state, after.fault) == (State.FAULT, before.fault)
+    assert after.fault_code is Code.LIMIT_EXCEEDED
+    assert cell.run("c1", LONG_S) is Code.CONFLICT
+
+
 def test_nothing_runs_twice_not_after_a_restart_either(cell):
     cell.run("c1", LONG_S)
     first = cell.finish()

@@ -149,9 +149,19 @@ class Memory:
         self.save()
 
     def set_fault(self, code: Code, words: str) -> None:
-        """A fault, or with NONE and no words its end."""
+        """A fault."""
         self.fault_code, self.fault = code, words
         self.save()
+
+    def clear_fault(self) -> None:
+        """Its end; it stays where that cannot be kept."""
+        before = self.fault_code, self.fault
+        self.fault_code, self.fault = Code.NONE, ""
+        try:
+            self.save()
+        except Exception:
+            self.fault_code, self.fault = before
+            raise
 
     def save(self) -> None:
         """Keep all of it."""
