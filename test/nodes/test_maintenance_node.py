@@ -84,10 +84,10 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Pat
     cell.start_maintenance()  # a fault outlives its node
     assert cell.statuses[-1].state == MaintenanceStatus.FAULT
     answer = graph.call(Acknowledge, "/maintenance_node/acknowledge", by="me")
-    assert answer.success, answer.message
+    assert (answer.success, answer.status) == (False, Code.LIMIT_EXCEEDED), answer.message
+    assert "robot is not at home: " in answer.message
     away = graph.call(RunMaintenanceCycle, "/maintenance_node/run", cycle_id="c2", gap_s=GAP_S)
-    assert away.status == Code.LIMIT_EXCEEDED
-    assert "robot is not at home: " in away.message
+    assert away.status == Code.CONFLICT
     assert len(cell.sent) == 3
 
 

@@ -43,6 +43,8 @@ def history(tmp_path):
 def cell(history) -> Cell:
     made = Cell(history)
     made.open_gap()
+    assert kinds(made) == ["Disarm"]  # whatever the node before it left
+    made.log.clear()
     return made
 
 
@@ -65,6 +67,7 @@ def test_a_long_gap_takes_everything_in_its_order(cell):
     assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
     assert (result.thermal_code, result.tool_answer) == (Code.NO_SIGNIFICANT_GAIN, "pass")
     assert kinds(cell) == [
+        "Disarm",
         "BeginCycle",
         *(["Move"] * 4),
         "EndCycle",
@@ -244,6 +247,52 @@ def test_a_robot_off_its_plan_is_stopped(cell):
     assert "away from its plan" in cell.session.status(cell.now_s).fault
 
 
+def until_measuring(cell: Cell, pose: int) -> None:
+    cell.run("c1", LONG_S)
+    while not cell.session.status(cell.now_s).doing.startswith(f"measuring pose {pose}"):
+        cell.step()
+
+
+def pushed(cell: Cell, joint: int = 1, by_deg: float = 25.0) -> None:
+    """Somebody else has moved the robot; it rests."""
+    q = cell.q.copy()
+    q[joint] += np.radians(by_deg)
+    cell.motion = JointMotion(q)
+
+
+@pytest.mark.parametrize("by_deg", [3.0, 25.0])
+def test_a_robot_pushed_while_it_measures_is_not_driven(cell, by_deg):
+    until_measuring(cell, 2)
+    pushed(cell, by_deg=by_deg)
+    moves = kinds(cell).count("Move")
+    cell.pass_time(3.0)
+    assert kinds(cell).count("Move") == moves
+    over(cell, fault=True)
+    joint = ARM.joint_names[1]
+    words = f"not where it came to rest: {joint} is {by_deg:.2f} deg off"
+    assert words in cell.session.status(cell.now_s).fault
+
+
+def test_a_robot_pushed_while_a_run_is_broken_off_is_not_driven_home(cell):
+    until_measuring(cell, 2)
+    cell.session.cancel("by the PLC")
+    pushed(cell)
+    moves = kinds(cell).count("Move")
+    cell.pass_time(3.0)
+    assert kinds(cell).count("Move") == moves
+    over(cell, fault=True)
+    assert "robot is not on its taught way: " in cell.session.status(cell.now_s).fault
+
+
+def test_silent_joint_states_while_the_robot_measures_are_a_fault(cell):
+    until_measuring(cell, 2)
+    cell.silent = True
+    cell.services["sensor"] = SILENT
+    cell.pass_time(0.3)
+    assert cell.state is State.FAULT
+    assert "stands away from home" in cell.session.status(cell.now_s).fault
+
+
 def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     cell.offset[2] = np.radians(5.3)
     cell.pass_time(0.5)
@@ -258,6 +307,45 @@ def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     assert cell.log == []
 
 
+def test_a_fault_away_from_home_is_not_acknowledged(cell):
+    until_moving(cell, "tool")
+    cell.is_open = False
+    over(cell, fault=True)
+    fault = cell.session.status(cell.now_s).fault
+    with pytest.raises(LimitError, match=r"not at home: .* is .* deg off .*bring it home"):
+        cell.session.acknowledge("me")
+    cell.silent = True
+    cell.pass_time(0.5)
+    with pytest.raises(LimitError, match="joint states are missing"):
+        cell.session.acknowledge("me")
+    assert cell.session.status(cell.now_s).fault == fault
+    cell.silent, cell.motion = False, JointMotion(HOME)
+    cell.pass_time(0.5)
+    cell.session.acknowledge("me")
+    assert cell.state is State.IDLE
+
+
+def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):
+    cell.offset[2] = np.radians(5.3)
+    cell.pass_time(0.5)
+    assert cell.run("c1", LONG_S) is Code.LIMIT_EXCEEDED
+    cell.offset[2] = 0.0
+    cell.pass_time(0.5)
+    before = cell.session.status(cell.now_s)
+
+    def full(document):
+        raise StorageError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cell.shelf, "save", full)
+        with pytest.raises(StorageError):
+            cell.session.acknowledge("me")
+    after = cell.session.status(cell.now_s)
+    assert (after.state, after.fault) == (State.FAULT, before.fault)
+    assert after.fault_code is Code.LIMIT_EXCEEDED
+    assert cell.run("c1", LONG_S) is Code.CONFLICT
+
+
 def test_nothing_runs_twice_not_after_a_restart_either(cell):
     cell.run("c1", LONG_S)
     first = cell.finish()
@@ -267,7 +355,7 @@ def test_nothing_runs_twice_not_after_a_restart_either(cell):
     cell.pass_time(0.3)
     assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
     cell.pass_time(1.0)
-    assert len(cell.log) == count
+    assert kinds(cell)[count:] == ["Disarm"]  # of the start
 
 
 def test_a_restart_in_the_middle_of_a_run_is_a_fault(cell):
@@ -290,6 +378,63 @@ def test_after_a_restart_the_tool_node_is_disarmed_before_anything_else(cell):
     cell.pass_time(0.5)
     assert cell.session.status(cell.now_s).disarmed
     assert not cell.tool.armed
+
+
+def test_a_disarm_that_is_not_confirmed_outlives_a_restart(cell):
+    until_moving(cell, "tool")
+    cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    cell.is_open = False
+    cell.pass_time(1.0)
+    assert cell.state is State.FAULT
+    cell.restart()
+    cell.pass_time(0.3)
+    assert not cell.session.status(cell.now_s).disarmed
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
+    cell.services.clear()
+    cell.pass_time(1.0)
+    assert cell.session.status(cell.now_s).disarmed
+    assert not cell.tool.armed
+
+
+def test_an_idle_cell_that_restarts_does_not_begin_before_a_disarm(cell):
+    cell.tool.armed = True  # by an operator
+    cell.services["disarm"] = SILENT
+    cell.restart()
+    cell.pass_time(0.3)
+    assert cell.run("c1", LONG_S) is Code.CONFLICT
+    cell.services.clear()
+    cell.pass_time(1.0)
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    assert cell.finish().complete
+
+
+def test_what_an_operator_armed_is_disarmed_before_anything_moves(cell):
+    cell.tool.armed = True
+    cell.run("c1", LONG_S)
+    assert cell.finish().complete
+    assert kinds(cell)[:3] == ["Disarm", "BeginCycle", "Move"]
+    over(cell)
+
+
+def test_a_cycle_moves_nothing_before_the_disarm_is_confirmed(cell):
+    cell.tool.armed = True
+    cell.services["disarm"] = SILENT
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert "does not confirm" in result.message
+    assert not {"Move", "BeginCycle", "Arm"} & set(kinds(cell))
+    assert cell.state is State.FAULT
+
+
+def test_a_tool_node_that_turns_deaf_at_the_station_is_a_fault(cell):
+    until_moving(cell, "tool")
+    cell.services["disarm"] = SILENT
+    count = kinds(cell).count("Move")
+    assert "does not confirm" in cell.finish().message
+    assert kinds(cell).count("Move") == count
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
 
 
 def test_calls_that_make_no_sense_are_refused(cell):
@@ -372,7 +517,7 @@ def test_without_a_station_only_the_drift_is_measured(history):
     cell.open_gap()
     cell.run("c1", LONG_S)
     assert cell.finish().complete
-    assert "Arm" not in kinds(cell)
+    assert not {"Arm", "Disarm"} & set(kinds(cell))
     assert accuracy(cell).level is AccuracyLevel.OK
 
 
@@ -381,4 +526,4 @@ def test_without_poses_only_the_tool_is_measured(history):
     cell.open_gap()
     cell.run("c1", LONG_S)
     assert cell.finish().complete
-    assert kinds(cell) == ["Arm", "Measure", "Disarm", "Move"]
+    assert kinds(cell) == ["Disarm", "Disarm", "Arm", "Measure", "Disarm", "Move"]

@@ -96,7 +96,10 @@ class Watched:
                 try:
                     cell.session.acknowledge("me")
                 except RobocalError:
-                    assert not cell.session.status(cell.now_s).disarmed
+                    status = cell.session.status(cell.now_s)
+                    assert not status.disarmed or not status.at_home
+                else:
+                    assert cell.session.status(cell.now_s).state is not State.FAULT
             case ("restart",) if cell.state not in BUSY:
                 cell.restart()
 

@@ -33,8 +33,9 @@ class Conductor:
         self._script: Script[None] | None = None
 
     def begin(self, run: Run) -> None:
-        """A run begins at the next tick."""
-        self.run, self._script, self.broken = run, run.script(), None
+        """A run begins at the next tick; nothing moves before the tool's driver is disarmed."""
+        self._hands.doubt()
+        self.run, self._script, self.broken = run, self._whole(run), None
         self._hands.doing = "begins"
 
     def tick(self, wall_ns: int) -> None:
@@ -85,6 +86,11 @@ class Conductor:
             self.fault(Code.CONFLICT, f"{why}, and the robot is not handed over at home")
         else:
             self._end(Code.CONFLICT, why)
+
+    def _whole(self, run: Run) -> Script[None]:
+        if self._hands.engaged:
+            yield from self._hands.disarmed()
+        yield from run.script()
 
     def _script_ended(self, run: Run) -> None:
         if away := self._hands.robot.beside_home():

@@ -124,10 +124,15 @@ class Hands:
 
     # ---- the tool's driver ----------------------------------------------------------------------
 
+    def doubt(self) -> None:
+        """Nobody knows whether the tool's driver is armed; without a station there is none."""
+        self.engaged = self.config.T_base_laser is not None
+        self._disarms.clear()  # what is still to come of them was carried out before this
+
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
-        self.engaged, self.robot.place = True, STATION
-        self._disarms.clear()  # what is still to come of them was carried out before this
+        self.doubt()
+        self.robot.place = STATION
         return (yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm))
 
     def disengage(self) -> None:
@@ -194,7 +199,18 @@ class Hands:
         return q
 
     def drive(self, route: Route, worst_s: float) -> Script[None]:
-        """Send a route and wait until it is over; supervised by the session."""
+        """Send a route and wait until it is over; supervised by the session.
+
+        Raises
+        ------
+        FaultError
+            When the robot does not rest where the route begins, on a taught way.
+        """
+        q = self.robot.resting(SETTLED_S)
+        if q is None:
+            raise FaultError(Code.CONFLICT, "the robot does not rest where its way begins")
+        self.robot.require_at(route.plan.q[0])
+        self.robot.require_taught(q)
         self.robot.start(route, self.now_s)
         self.request(Move, route.plan, worst_s)
         while not self.robot.arrived(self.now_s):

@@ -88,7 +88,6 @@ class Memory:
     ----------
     fault_code, fault : what stopped the maintenance until it is acknowledged; empty: nothing.
     running : the cycle that is open.
-    crashed : a cycle was open when it was read.
     """
 
     keeper: Keeper
@@ -97,7 +96,6 @@ class Memory:
     fault_code: Code = Code.NONE
     fault: str = ""
     running: str = ""
-    crashed: bool = False
 
     @classmethod
     def load(cls, keeper: Keeper) -> "Memory":
@@ -121,7 +119,6 @@ class Memory:
             str(document["running"]),
         )
         if memory.running:
-            memory.crashed = True
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
             result = CycleResult(memory.running, Code.CONFLICT, words)
             memory.end(result, Code.CONFLICT, words)
@@ -152,9 +149,19 @@ class Memory:
         self.save()
 
     def set_fault(self, code: Code, words: str) -> None:
-        """A fault, or with NONE and no words its end."""
+        """A fault."""
         self.fault_code, self.fault = code, words
         self.save()
+
+    def clear_fault(self) -> None:
+        """Its end; it stays where that cannot be kept."""
+        before = self.fault_code, self.fault
+        self.fault_code, self.fault = Code.NONE, ""
+        try:
+            self.save()
+        except Exception:
+            self.fault_code, self.fault = before
+            raise
 
     def save(self) -> None:
         """Keep all of it."""

@@ -64,7 +64,10 @@ class Mover:
         if self._q is None or self.silent:
             return "joint states are missing"
         away = np.abs(self._q - self._config.home)
-        near = np.broadcast_to(self._config.home_near, away.shape)
+        return self._off(away, np.broadcast_to(self._config.home_near, away.shape))
+
+    def _off(self, away: Array, near: Array) -> str:
+        """Which joint is off the furthest, in words; empty where all are near enough."""
         joint = int(np.argmax(away / near))
         if away[joint] <= near[joint]:
             return ""
@@ -77,6 +80,38 @@ class Mover:
     def resting(self, span_s: float) -> Array | None:
         """The joints where the robot has rested for so long; None while it moves, or is silent."""
         return None if self.silent else self._watch.resting(span_s)
+
+    def require_at(self, q: Array) -> None:
+        """Look after a robot that is to stand at joints (n,).
+
+        Raises
+        ------
+        FaultError
+            When joint states are silent, or it is not there any more.
+        """
+        if self.silent or self._q is None:
+            words = f"joint states are silent for {self._watch.silent_s:.2f} s"
+            raise FaultError(Code.TOO_FEW_SAMPLES, f"{words} while the robot stands away from home")
+        away = np.abs(self._q - q)
+        self._require_near(away, self._allowed(), "where it came to rest")
+
+    def require_taught(self, q: Array) -> None:
+        """Let the robot move from joints (n,) where it rests on its taught line; else FaultError.
+
+        At the station there is no line: the tool's driver may have left it anywhere.
+        """
+        if self.place != STATION:
+            allowed = np.maximum(self._allowed(), self._config.home_near)
+            away = self._ways.beside(self.place, q)
+            self._require_near(away, allowed, "on its taught way")
+
+    def _allowed(self) -> Array:
+        driving = self._config.driving
+        return np.where(self._arm.prismatic, driving.deviation_m, driving.deviation_rad)
+
+    def _require_near(self, away: Array, allowed: Array, what: str) -> None:
+        if words := self._off(away, allowed):
+            raise FaultError(Code.LIMIT_EXCEEDED, f"robot is not {what}: {words}")
 
     # ---- motions --------------------------------------------------------------------------------
 

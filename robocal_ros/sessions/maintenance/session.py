@@ -60,8 +60,7 @@ class MaintenanceSession:
         self._memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
         self._hands = Hands(config, self.ways)
-        # A cycle that was open may have left the tool's driver armed.
-        self._hands.engaged = self._memory.crashed and config.T_base_laser is not None
+        self._hands.doubt()  # whoever ran before may have left the tool's driver armed
         self._book = CycleBook()
         self._record = record
         self._conductor = Conductor(self._hands, self._memory, self._tell)
@@ -170,13 +169,19 @@ class MaintenanceSession:
         ------
         ConflictError
             While the tool node has not confirmed that it is disarmed.
+        LimitError
+            While the robot is not at home.
+        StorageError
+            When it cannot be kept; the fault stays.
         """
         if not self._memory.fault:
             return "there is no fault"
         if self._hands.engaged:
             raise ConflictError("the tool node has not confirmed that it is disarmed: wait for it")
+        if away := self._hands.robot.beside_home():
+            raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
         words = f"acknowledged: {self._memory.fault}"
-        self._memory.set_fault(Code.NONE, "")
+        self._memory.clear_fault()
         self._hands.doing = ""
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words

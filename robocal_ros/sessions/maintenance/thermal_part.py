@@ -3,12 +3,15 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.requests import Answer, BeginCycle, EndCycle
 from robocal_ros.sessions.maintenance.ways import HOME
 from robocal_ros.sessions.tool_driving import STANDS_S
+
+Array = NDArray[np.float64]
 
 NODE = "thermal node"
 
@@ -76,8 +79,9 @@ class ThermalPart:
     def _visit(self, todo: list[int]) -> Script[int]:
         """How many poses did not fit."""
         hands = self._hands
-        q = yield from hands.stand(STANDS_S)
+        yield from hands.stand(STANDS_S)
         for done, pose in enumerate(todo):
+            q = yield from hands.stand()
             route = hands.ways.to(hands.robot.place, q, pose)
             worst_s = self._step_s(route.plan.duration_s, hands.ways.home_s(pose))
             if not hands.fits(worst_s):
@@ -86,18 +90,19 @@ class ThermalPart:
             yield from hands.drive(route, worst_s)
             q = yield from hands.stand()
             hands.doing = f"measuring pose {pose} of {hands.ways.count}"
-            yield from self._measured()
+            yield from self._measured(q)
             self._book.visited.add(pose)
             self._book.last_s = hands.now_s
         return 0
 
-    def _measured(self) -> Script[None]:
-        """Stand until the measurements are there, or their time is over."""
+    def _measured(self, q: Array) -> Script[None]:
+        """Stand at joints (n,) until the measurements are there, or their time is over."""
         hands, times = self._hands, self._times
         from_s = hands.robot.newest_s + times.settle_s
         until_s = hands.now_s + times.measure_s
         hands.measured.clear()
         while hands.now_s < until_s:
+            hands.robot.require_at(q)
             fresh = [stamp for stamp in hands.measured if stamp >= from_s]
             enough = len(fresh) >= hands.config.measurements
             if enough and hands.robot.newest_s >= max(fresh) + times.stay_s:

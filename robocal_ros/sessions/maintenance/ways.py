@@ -97,6 +97,14 @@ class Ways:
         """Duration of the longest taught line."""
         return max(self._line_s)
 
+    def beside(self, place: Line, q: Array) -> Array:
+        """How far each joint (n,) is from a taught line, or from a point of the ring, rad (m)."""
+        start, end = self._points[place[0]], self._points[place[1]]
+        way = end - start
+        share = np.clip((q - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        away: Array = np.abs(start + share * way - q)
+        return away
+
     def to(self, place: Line, q: Array, goal: int) -> Route:
         """The shortest way from a place, where the robot stands at joints (n,), to a point."""
         routes = []
