@@ -79,6 +79,8 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, revision: int, wall_ns:
     due_in_s = config.tool_due_s - age_s
     if not record.answer:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
+    if age_s < 0.0:  # the clock was set back: nobody knows how old it is
+        return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM)
     when = f"checked {age_s / 60.0:.0f} min ago"
     if record.revision != revision:

@@ -73,7 +73,8 @@ class ToolPart:
         record, config = self._memory.tool, self._hands.config
         if config.T_base_laser is None or self._decider.pending(TOOL):
             return ""
-        known = record.wall_ns > 0 and record.revision == self._decider.revision(TOOL)
+        known = 0 < record.wall_ns <= self.wall_ns
+        known = known and record.revision == self._decider.revision(TOOL)
         if known and record.answer in ("recalibrate", "cannot tell"):
             return FULL
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
@@ -103,7 +104,7 @@ class ToolPart:
 
     def _full_is_due(self) -> bool:
         every_s = self._hands.config.full_every_s
-        return every_s > 0.0 and self._age_s(self._memory.tool.full_ns) >= every_s
+        return every_s > 0.0 and not 0.0 <= self._age_s(self._memory.tool.full_ns) < every_s
 
     def _check(self, cycle_id: str, name: str, outcome: ToolOutcome) -> Script[bool]:
         """A quick check; whether it gave an answer."""
