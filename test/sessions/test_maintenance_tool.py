@@ -2,9 +2,13 @@
 
 import maintenance_cell
 import pytest
-from maintenance_cell import Cell, bent
+from maintenance_cell import ARM, Cell, bent, passed
+from tool_driver import TAUGHT
 
+from robocal_ros.core.codes import Code
+from robocal_ros.core.proposals import TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.sessions.events import ACCEPT, ROLLBACK
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -49,3 +53,54 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
     cell.finish()
     assert modes(cell) == ["quick"]
     assert level(cell) is AccuracyLevel.OK
+
+
+def proposed(cell: Cell) -> int:
+    """A tool candidate one millimetre from the taught one."""
+    tool = TAUGHT.copy()
+    tool[0, 3] += 1e-3
+    return cell.history.propose(
+        Proposal(
+            kind=TOOL, model_hash=ARM.model_hash, based_on=cell.history.head(TOOL).revision,
+            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT, reason="",
+            document={},
+            model={
+                "T_flange_tool": tool.tolist(), "covariance": None, "thermal_revision": 0,
+                "made_with": {"taught": TAUGHT.tolist()},
+            },
+        )
+    )  # fmt: skip
+
+
+def decide(cell: Cell, name: str, calibration_id: int) -> None:
+    assert cell.session.decide(name, calibration_id, "a person", "", cell.wall_ns).done
+
+
+def found_bent(cell: Cell) -> None:
+    cell.check = bent()
+    cell.run("bent", TOO_SHORT_FOR_FULL_S)
+    cell.finish()
+    assert level(cell) is AccuracyLevel.DEGRADED
+
+
+def test_a_bent_tool_stays_bent_when_another_one_comes_into_force(cell):
+    """The tool of the model in force changed, the one on the robot did not."""
+    decide(cell, ACCEPT, proposed(cell))
+    found_bent(cell)
+    assert cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns).done
+    assert level(cell) is AccuracyLevel.DEGRADED
+    cell.check = passed()
+    cell.log.clear()
+    cell.run("c2", LONG_S)
+    cell.finish()
+    assert modes(cell) == ["quick"]
+    assert level(cell) is AccuracyLevel.OK
+
+
+@pytest.mark.parametrize("rolled_back", [False, True])
+def test_a_bent_tool_expires_as_any_other(cell, rolled_back):
+    decide(cell, ACCEPT, proposed(cell))
+    found_bent(cell)
+    if rolled_back:
+        cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    assert level(cell, 30 * DAY_NS) is AccuracyLevel.EXPIRED
