@@ -104,3 +104,33 @@ def test_a_bent_tool_expires_as_any_other(cell, rolled_back):
     if rolled_back:
         cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
     assert level(cell, 30 * DAY_NS) is AccuracyLevel.EXPIRED
+
+
+def until_measuring(cell: Cell, mode: str) -> None:
+    cell.run("c1", LONG_S)
+    while not (cell.tool.measuring and cell.mode == mode):
+        cell.step()
+
+
+def test_a_pass_is_not_credited_to_another_tool(cell):
+    """A person takes the tool back while it is checked."""
+    decide(cell, ACCEPT, proposed(cell))
+    until_measuring(cell, "quick")
+    cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    result = cell.finish()
+    assert "another tool came into force" in result.message
+    assert (result.tool_answer, result.complete) == ("", False)
+    assert level(cell) is AccuracyLevel.EXPIRED  # never checked
+    cell.log.clear()
+    cell.run("c2", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    assert level(cell) is AccuracyLevel.OK
+
+
+def test_a_full_measurement_of_another_tool_is_not_credited(cell):
+    decide(cell, ACCEPT, proposed(cell))
+    cell.check = bent()
+    until_measuring(cell, "full")
+    cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    assert "another tool came into force" in cell.finish().message
+    assert level(cell) is AccuracyLevel.DEGRADED

@@ -59,6 +59,7 @@ class ToolPart:
         self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
         self._decided = decided
         self._times = hands.config.times
+        self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
 
     def worst_s(self, mode: str) -> float:
@@ -155,7 +156,7 @@ class ToolPart:
         self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
 
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
-        """From home and back home; None where it did not fit or did not begin."""
+        """From home and back home; None where it did not fit, or tells of another tool."""
         hands = self._hands
         worst_s = self.worst_s(mode)
         if not hands.fits(worst_s):
@@ -163,6 +164,7 @@ class ToolPart:
             return None
         hands.doing = f"tool measurement ({mode})"
         yield from hands.stand(STANDS_S)
+        self._checked = self._decider.revision(TOOL)
         try:
             answer = yield from hands.arm()
             if answer.done:
@@ -176,6 +178,10 @@ class ToolPart:
         yield from hands.go_home()
         if not answer.has_result:
             outcome.told = f"tool measurement ({mode}): {answer.message}"
+        elif self._checked != self._decider.revision(TOOL):
+            outcome.left = f"tool measurement ({mode})"
+            outcome.told = f"{outcome.left} is discarded: another tool came into force"
+            return None
         return answer
 
     def _note(self, answer: Answer, verdict: str) -> None:
@@ -184,7 +190,7 @@ class ToolPart:
             words=answer.message,
             deviation_mm=answer.deviation_mm,
             sigma_mm=answer.sigma_mm,
-            revision=self._decider.revision(TOOL),
+            revision=self._checked,
             wall_ns=self.wall_ns,
         )
 
