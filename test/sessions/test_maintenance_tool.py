@@ -2,15 +2,17 @@
 
 import maintenance_cell
 import pytest
-from maintenance_cell import ARM, Cell, bent, passed
+from maintenance_cell import ARM, POSES, REFUSED, SILENT, Cell, bent, config_of, passed
 from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, ROLLBACK
+from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 LONG_S = 120.0
@@ -134,3 +136,39 @@ def test_a_full_measurement_of_another_tool_is_not_credited(cell):
     cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
     assert "another tool came into force" in cell.finish().message
     assert level(cell) is AccuracyLevel.DEGRADED
+
+
+def automatic(history, **changes) -> Cell:
+    """A cell that may accept without a person, whose tool is found bent."""
+    cell = Cell(history, config_of(bounds=AcceptBounds(automatic=True), **changes), check=bent())
+    cell.open_gap()
+    return cell
+
+
+def measured_in_full(cell: Cell) -> int:
+    """Until the full measurement is about to give a candidate."""
+    until_measuring(cell, "full")
+    number = proposed(cell)
+    cell.full = Answer(Code.ACCEPT, "a new tool", number, (), True, "", 1.0, 0.03)
+    return number
+
+
+@pytest.mark.parametrize("how", [REFUSED, SILENT])
+def test_a_tool_without_a_thermal_result_waits(history, how):
+    cell = automatic(history)
+    cell.services["thermal"] = how
+    number = measured_in_full(cell)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert result.accepted == ()
+    assert cell.history.head(TOOL).revision == 0
+
+
+@pytest.mark.parametrize("poses", [POSES, POSES[:0]])
+def test_a_tool_with_a_known_drift_is_accepted(history, poses):
+    cell = automatic(history, poses=poses)
+    number = measured_in_full(cell)
+    while not cell.history.head(TOOL).revision:
+        cell.step()
+    cell.check = passed()
+    assert cell.finish().accepted == (number,)

@@ -17,6 +17,8 @@ from robocal_ros.sessions.tool_results import FULL, QUICK
 NS = 1_000_000_000
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 
+UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
+
 
 @dataclass
 class ToolOutcome:
@@ -59,6 +61,7 @@ class ToolPart:
         self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
         self._decided = decided
         self._times = hands.config.times
+        self._drift_is_known = False
         self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
 
@@ -81,8 +84,9 @@ class ToolPart:
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
         return QUICK if due else ""
 
-    def script(self, cycle_id: str) -> Script[ToolOutcome]:
-        """Everything that is due and fits."""
+    def script(self, cycle_id: str, drift_is_known: bool) -> Script[ToolOutcome]:
+        """Everything that is due and fits; where the drift is not known a person decides."""
+        self._drift_is_known = drift_is_known
         outcome = ToolOutcome()
         wanted = self.wants()
         if not wanted:
@@ -129,7 +133,7 @@ class ToolPart:
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
-        if why := MOVED * self._book.moved or self._decider.withheld(answer.candidate_id):
+        if why := self._withheld(answer.candidate_id):
             outcome.told = f"tool candidate {answer.candidate_id} waits for a decision: {why}"
             return
         done = self._decider.decide(
@@ -141,6 +145,12 @@ class ToolPart:
             return
         outcome.accepted = True
         yield from self._verify(cycle_id, outcome)
+
+    def _withheld(self, candidate_id: int) -> str:
+        """Why the candidate waits for a person; empty: it need not."""
+        if self._book.moved:
+            return MOVED
+        return self._decider.withheld(candidate_id) or UNSURE * (not self._drift_is_known)
 
     def _verify(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         """Check the tool that was just accepted; one that is not right is taken back."""
