@@ -6,12 +6,14 @@ from maintenance_cell import ARM, POSES, REFUSED, SILENT, Cell, bent, config_of,
 from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import StorageError
 from robocal_ros.core.proposals import TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, ROLLBACK
-from robocal_ros.sessions.maintenance import AcceptBounds
+from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -64,8 +66,8 @@ def proposed(cell: Cell) -> int:
     return cell.history.propose(
         Proposal(
             kind=TOOL, model_hash=ARM.model_hash, based_on=cell.history.head(TOOL).revision,
-            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT, reason="",
-            document={},
+            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT,
+            reason="", document={},
             model={
                 "T_flange_tool": tool.tolist(), "covariance": None, "thermal_revision": 0,
                 "made_with": {"taught": TAUGHT.tolist()},
@@ -172,3 +174,54 @@ def test_a_tool_with_a_known_drift_is_accepted(history, poses):
         cell.step()
     cell.check = passed()
     assert cell.finish().accepted == (number,)
+
+
+def until_verified(cell: Cell) -> None:
+    """Until the accepted tool is checked."""
+    while not (cell.history.head(TOOL).revision and cell.tool.measuring):
+        cell.step()
+
+
+def test_an_accepted_tool_that_fails_its_check_is_taken_back(history):
+    cell = automatic(history)
+    measured_in_full(cell)
+    result = cell.finish()
+    assert "was taken back" in result.message
+    assert (result.code, result.accepted) == (Code.ACCEPT, ())
+    assert history.head(TOOL).calibration_id is None
+
+
+def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
+    cell = automatic(history)
+    first = proposed(cell)
+    decide(cell, ACCEPT, first)
+    second = proposed(cell)
+    decide(cell, ACCEPT, second)
+    number = measured_in_full(cell)
+    while not (history.head(TOOL).calibration_id == number and cell.tool.measuring):
+        cell.step()
+    decide(cell, ROLLBACK, first)
+    result = cell.finish()
+    assert history.head(TOOL).calibration_id == first
+    assert result.accepted == ()
+    assert "taken back" not in result.message
+
+
+@pytest.mark.parametrize("where", [(CalibrationHistory, "rollback"), (Decider, "roll_back")])
+def test_a_tool_that_cannot_be_taken_back_is_a_fault(history, monkeypatch, where):
+    def held(*args, **kwargs):
+        raise StorageError("the history is held")
+
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    until_verified(cell)
+    monkeypatch.setattr(
+        Decider if raises else CalibrationHistory, "roll_back" if raises else "rollback", held
+    )
+    result = cell.finish()
+    assert result.accepted == (number,)
+    assert result.code is Code.CONFLICT
+    assert "could not be taken back: the history is held" in result.message
+    assert cell.state is State.FAULT
+    assert not cell.tool.armed
+    assert cell.at_home()

@@ -9,6 +9,7 @@ from robocal_ros.sessions.events import ACCEPT, Outcome
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
+from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
@@ -101,6 +102,8 @@ class Run:
         )
         if found.accepted:
             self._accepted(found.candidate_id)
+        if found.fault:
+            raise FaultError(Code.CONFLICT, found.fault)
 
     def _drift_is_known(self) -> bool:
         """Whether the model in force is what this cycle found; without poses nobody asks."""

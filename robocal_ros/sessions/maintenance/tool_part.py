@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
@@ -30,6 +31,7 @@ class ToolOutcome:
     checked : the last quick check's answer.
     candidate_id : of the full measurement; 0 without.
     accepted : whether it was accepted without a person, and stayed.
+    fault : why an accepted tool that failed its check is still in force; empty: it is not.
     told : why not, or what a person must know.
     left : what did not fit.
     """
@@ -38,6 +40,7 @@ class ToolOutcome:
     checked: str = ""
     candidate_id: int = 0
     accepted: bool = False
+    fault: str = ""
     told: str = ""
     left: str = ""
 
@@ -154,13 +157,25 @@ class ToolPart:
 
     def _verify(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         """Check the tool that was just accepted; one that is not right is taken back."""
-        if not (yield from self._check(cycle_id, "verify", outcome)):
+        verified = yield from self._check(cycle_id, "verify", outcome)
+        if not self._decider.in_force(TOOL, outcome.candidate_id):
+            outcome.accepted = False  # somebody chose another one
+        elif not verified:
             outcome.left = outcome.left or "verification of the accepted tool"
+        elif outcome.checked == "recalibrate":
+            self._take_back(outcome)
+
+    def _take_back(self, outcome: ToolOutcome) -> None:
+        try:
+            back = self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
+            self._decided(back)
+            why = "" if back.done else back.message
+        except RobocalError as error:
+            why = str(error)
+        if why:
+            number = outcome.candidate_id
+            outcome.fault = f"tool {number} failed its check and could not be taken back: {why}"
             return
-        if outcome.checked != "recalibrate":
-            return
-        back = self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
-        self._decided(back)
         outcome.accepted = False
         outcome.told = "the accepted tool failed its check and was taken back: look at it"
         self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
