@@ -215,9 +215,7 @@ def test_a_tool_that_cannot_be_taken_back_is_a_fault(history, monkeypatch, where
     cell = automatic(history)
     number = measured_in_full(cell)
     until_verified(cell)
-    monkeypatch.setattr(
-        Decider if raises else CalibrationHistory, "roll_back" if raises else "rollback", held
-    )
+    monkeypatch.setattr(*where, held)
     result = cell.finish()
     assert result.accepted == (number,)
     assert result.code is Code.CONFLICT
