@@ -79,16 +79,20 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, revision: int, wall_ns:
     due_in_s = config.tool_due_s - age_s
     if not record.answer:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
-    error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM)
+    if age_s < 0.0:  # the clock was set back: nobody knows how old it is
+        return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
-    if record.revision != revision:
-        words = "tool: another one is in force than was checked: check it"
-        return _Finding(AccuracyLevel.DUE, words, None, 0.0)
-    if record.answer == "recalibrate":
-        words = f"tool: {record.words}: measure and accept it"
-        return _Finding(AccuracyLevel.DEGRADED, words, error, min(due_in_s, 0.0))
+    same = record.revision == revision
+    error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM) if same else None
     if age_s > config.tool_expires_s:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
+    if record.answer == "recalibrate":  # until a check passes, whatever came into force since
+        todo = "measure and accept it" if same else "another one is in force since: check it"
+        words = f"tool: {record.words}: {todo}"
+        return _Finding(AccuracyLevel.DEGRADED, words, error, min(due_in_s, 0.0))
+    if not same:
+        words = "tool: another one is in force than was checked: check it"
+        return _Finding(AccuracyLevel.DUE, words, None, 0.0)
     if record.answer == "cannot tell" or due_in_s <= 0.0:
         words = f"tool: {when}, {record.words}"
         return _Finding(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))

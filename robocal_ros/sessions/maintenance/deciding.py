@@ -33,6 +33,10 @@ class Decider:
         """The one in force."""
         return self._history.head(kind).revision
 
+    def in_force(self, kind: str, calibration_id: int) -> bool:
+        """Whether it is this one."""
+        return self._history.head(kind).calibration_id == calibration_id
+
     def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
         """Carry out a decision about one calibration; one that was made before is its answer again.
 

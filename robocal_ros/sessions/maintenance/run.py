@@ -4,10 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.proposals import THERMAL
 from robocal_ros.sessions.events import ACCEPT, Outcome
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
+from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
@@ -86,7 +88,7 @@ class Run:
             self._accepted(answer.candidate_id)
 
     def _measure_tool(self) -> Script[None]:
-        found = yield from self._tool.script(self.result.cycle_id)
+        found = yield from self._tool.script(self.result.cycle_id, self._drift_is_known())
         if found.left:
             self._left(found.left)
         for words in (found.last.message if found.last else "", found.told):
@@ -100,6 +102,15 @@ class Run:
         )
         if found.accepted:
             self._accepted(found.candidate_id)
+        if found.fault:
+            raise FaultError(Code.CONFLICT, found.fault)
+
+    def _drift_is_known(self) -> bool:
+        """Whether the model in force is what this cycle found; without poses nobody asks."""
+        code, found = self.result.thermal_code, self.result.thermal_id
+        if not self._hands.ways.count or code is Code.NO_SIGNIFICANT_GAIN:
+            return True
+        return code is Code.ACCEPT and found > 0 and self._decider.in_force(THERMAL, found)
 
     def _accepted(self, calibration_id: int) -> None:
         self.result = replace(self.result, accepted=(*self.result.accepted, calibration_id))

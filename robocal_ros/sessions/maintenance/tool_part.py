@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
@@ -17,6 +18,8 @@ from robocal_ros.sessions.tool_results import FULL, QUICK
 NS = 1_000_000_000
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 
+UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
+
 
 @dataclass
 class ToolOutcome:
@@ -28,6 +31,7 @@ class ToolOutcome:
     checked : the last quick check's answer.
     candidate_id : of the full measurement; 0 without.
     accepted : whether it was accepted without a person, and stayed.
+    fault : why an accepted tool that failed its check is still in force; empty: it is not.
     told : why not, or what a person must know.
     left : what did not fit.
     """
@@ -36,6 +40,7 @@ class ToolOutcome:
     checked: str = ""
     candidate_id: int = 0
     accepted: bool = False
+    fault: str = ""
     told: str = ""
     left: str = ""
 
@@ -59,6 +64,8 @@ class ToolPart:
         self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
         self._decided = decided
         self._times = hands.config.times
+        self._drift_is_known = False
+        self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
 
     def worst_s(self, mode: str) -> float:
@@ -73,14 +80,16 @@ class ToolPart:
         record, config = self._memory.tool, self._hands.config
         if config.T_base_laser is None or self._decider.pending(TOOL):
             return ""
-        known = record.wall_ns > 0 and record.revision == self._decider.revision(TOOL)
+        known = 0 < record.wall_ns <= self.wall_ns
+        known = known and record.revision == self._decider.revision(TOOL)
         if known and record.answer in ("recalibrate", "cannot tell"):
             return FULL
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
         return QUICK if due else ""
 
-    def script(self, cycle_id: str) -> Script[ToolOutcome]:
-        """Everything that is due and fits."""
+    def script(self, cycle_id: str, drift_is_known: bool) -> Script[ToolOutcome]:
+        """Everything that is due and fits; where the drift is not known a person decides."""
+        self._drift_is_known = drift_is_known
         outcome = ToolOutcome()
         wanted = self.wants()
         if not wanted:
@@ -103,7 +112,7 @@ class ToolPart:
 
     def _full_is_due(self) -> bool:
         every_s = self._hands.config.full_every_s
-        return every_s > 0.0 and self._age_s(self._memory.tool.full_ns) >= every_s
+        return every_s > 0.0 and not 0.0 <= self._age_s(self._memory.tool.full_ns) < every_s
 
     def _check(self, cycle_id: str, name: str, outcome: ToolOutcome) -> Script[bool]:
         """A quick check; whether it gave an answer."""
@@ -127,7 +136,7 @@ class ToolPart:
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
-        if why := MOVED * self._book.moved or self._decider.withheld(answer.candidate_id):
+        if why := self._withheld(answer.candidate_id):
             outcome.told = f"tool candidate {answer.candidate_id} waits for a decision: {why}"
             return
         done = self._decider.decide(
@@ -140,21 +149,39 @@ class ToolPart:
         outcome.accepted = True
         yield from self._verify(cycle_id, outcome)
 
+    def _withheld(self, candidate_id: int) -> str:
+        """Why the candidate waits for a person; empty: it need not."""
+        if self._book.moved:
+            return MOVED
+        return self._decider.withheld(candidate_id) or UNSURE * (not self._drift_is_known)
+
     def _verify(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         """Check the tool that was just accepted; one that is not right is taken back."""
-        if not (yield from self._check(cycle_id, "verify", outcome)):
+        verified = yield from self._check(cycle_id, "verify", outcome)
+        if not self._decider.in_force(TOOL, outcome.candidate_id):
+            outcome.accepted = False  # somebody chose another one
+        elif not verified:
             outcome.left = outcome.left or "verification of the accepted tool"
+        elif outcome.checked == "recalibrate":
+            self._take_back(outcome)
+
+    def _take_back(self, outcome: ToolOutcome) -> None:
+        try:
+            back = self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
+            self._decided(back)
+            why = "" if back.done else back.message
+        except RobocalError as error:
+            why = str(error)
+        if why:
+            number = outcome.candidate_id
+            outcome.fault = f"tool {number} failed its check and could not be taken back: {why}"
             return
-        if outcome.checked != "recalibrate":
-            return
-        back = self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
-        self._decided(back)
         outcome.accepted = False
         outcome.told = "the accepted tool failed its check and was taken back: look at it"
         self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
 
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
-        """From home and back home; None where it did not fit or did not begin."""
+        """From home and back home; None where it did not fit, or tells of another tool."""
         hands = self._hands
         worst_s = self.worst_s(mode)
         if not hands.fits(worst_s):
@@ -162,6 +189,7 @@ class ToolPart:
             return None
         hands.doing = f"tool measurement ({mode})"
         yield from hands.stand(STANDS_S)
+        self._checked = self._decider.revision(TOOL)
         try:
             answer = yield from hands.arm()
             if answer.done:
@@ -175,6 +203,10 @@ class ToolPart:
         yield from hands.go_home()
         if not answer.has_result:
             outcome.told = f"tool measurement ({mode}): {answer.message}"
+        elif self._checked != self._decider.revision(TOOL):
+            outcome.left = f"tool measurement ({mode})"
+            outcome.told = f"{outcome.left} is discarded: another tool came into force"
+            return None
         return answer
 
     def _note(self, answer: Answer, verdict: str) -> None:
@@ -183,7 +215,7 @@ class ToolPart:
             words=answer.message,
             deviation_mm=answer.deviation_mm,
             sigma_mm=answer.sigma_mm,
-            revision=self._decider.revision(TOOL),
+            revision=self._checked,
             wall_ns=self.wall_ns,
         )
 
