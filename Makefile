@@ -37,7 +37,7 @@ demo: setup  ## a simulated shift through the live nodes, with a report in out/
 HALF := test/core test/sessions test/sim test/report
 REST := $(HALF:%=--ignore=%) --ignore=test/nodes
 TIMED := $(addprefix test/nodes/test_,base cell_sim_node joint_correction_node launch maintenance_node replay_node run \
-	tcf_node thermal_node tool_cell trajectory_proxy)
+	tcf_node tool_cell trajectory_proxy)
 TIMED := $(TIMED:%=%.py)
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
