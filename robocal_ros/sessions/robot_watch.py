@@ -63,6 +63,11 @@ class RobotWatch:
         return bool(self._readings)
 
     @property
+    def newest(self) -> tuple[float, Array] | None:
+        """Stamp and joints (n,) of the newest reading that counts; None before any."""
+        return self._readings[-1] if self._readings else None
+
+    @property
     def silent_s(self) -> float:
         """How long the joint states have been silent."""
         return self.silence.lasts_s if self._readings else np.inf

@@ -346,6 +346,14 @@ def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):
     assert cell.run("c1", LONG_S) is Code.CONFLICT
 
 
+def test_a_reading_that_is_older_does_not_count(cell):
+    cell.motion = JointMotion(POSES[0])
+    cell.pass_time(0.5)
+    cell.session.reading(cell.now_s - 0.3, HOME, cell.now_s)
+    assert not cell.session.status(cell.now_s).at_home
+    assert cell.run("c1", LONG_S) is Code.LIMIT_EXCEEDED
+
+
 def test_nothing_runs_twice_not_after_a_restart_either(cell):
     cell.run("c1", LONG_S)
     first = cell.finish()

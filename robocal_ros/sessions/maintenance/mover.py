@@ -43,7 +43,8 @@ class Mover:
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,); ``stamp_s`` on their own clock."""
         self._watch.reading(stamp_s, q, now_s)
-        self._q, self.newest_s = q, stamp_s
+        if (newest := self._watch.newest) is not None:
+            self.newest_s, self._q = newest  # an older stamp does not count
 
     def look(self, now_s: float) -> None:
         """Count silence; call it often."""
