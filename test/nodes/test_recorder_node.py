@@ -85,8 +85,7 @@ def test_what_it_cannot_write_is_told_and_it_lives_on(graph):
     assert "cannot be made" in recorder.output
 
 
-def test_two_types_do_not_mix(graph):
-    """Who publishes another type under a name does not end the recording."""
+def test_the_type_is_the_one_that_is_offered(graph):
     started(graph)
     publisher = graph.publisher(Bool, "/words")
     said(graph, publisher, Bool, True)
