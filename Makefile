@@ -32,13 +32,13 @@ help:  ## this list
 demo: setup  ## a simulated shift through the live nodes, with a report in out/
 	$(ROS) python bags/demo.py
 
-# Node tests mostly wait; what the others compute fills their pauses, and gives way to them (nice).
+# Node tests mostly wait; what the others compute fills their pauses, and gives way at once.
 # Each pair of workers shares its tests as they go. What failed is shown last.
 SPREAD := -n 2 --dist worksteal
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
-	nice $(ROS) python -m pytest $(SPREAD) --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
+	chrt --idle 0 $(ROS) python -m pytest $(SPREAD) --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
 	trap 'kill $$others 2>/dev/null || true' EXIT
 	nodes=0
 	computing=0
