@@ -6,8 +6,13 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).parent.parent
+
+# Cores are shared with other tests: how long an example takes tells nothing of it.
+settings.register_profile("shared", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("shared")
 
 # Without rclpy (make test-floor) the node tests cannot even be imported.
 collect_ignore = [] if importlib.util.find_spec("rclpy") else ["nodes"]
