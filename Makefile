@@ -32,26 +32,21 @@ help:  ## this list
 demo: setup  ## a simulated shift through the live nodes, with a report in out/
 	$(ROS) python bags/demo.py
 
-# Two halves beside each other, on two cores; then the nodes so, in two halves as well. What is
-# timed to milliseconds stands beside what mostly computes or waits.
-HALF := test/core test/sessions test/sim test/report
-REST := $(HALF:%=--ignore=%) --ignore=test/nodes
-TIMED := $(addprefix test/nodes/test_,base cell_sim_node joint_correction_node launch maintenance_node replay_node run \
-	tcf_node tool_cell trajectory_proxy)
-TIMED := $(TIMED:%=%.py)
+# Node tests mostly wait; what the others compute fills their pauses, and gives way at once.
+# Each pair of workers shares its tests as they go. What failed is shown last.
+SPREAD := -n 2 --dist worksteal
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
-	failed=0
-	beside() {
-		$(ROS) python -m pytest $$1 >out/beside.txt 2>&1 & local other=$$!
-		$(ROS) python -m pytest $$2 || failed=1
-		wait $$other || failed=1
-		cat out/beside.txt
-	}
-	beside "$(HALF)" "$(REST)"
-	beside "test/nodes $(TIMED:%=--ignore=%)" "$(TIMED)"
-	exit $$failed
+	chrt --idle 0 $(ROS) python -m pytest $(SPREAD) --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
+	trap 'kill $$others 2>/dev/null || true' EXIT
+	nodes=0
+	computing=0
+	$(ROS) python -m pytest $(SPREAD) test/nodes 2>&1 | tee out/test_nodes.txt || nodes=$$?
+	wait $$others || computing=$$?
+	cat out/test_others.txt
+	[[ $$nodes -eq 0 ]] || cat out/test_nodes.txt
+	exit $$((nodes | computing))
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries
 	$(ROS) $(VENV)-bench/bin/python -m bench

@@ -2,11 +2,17 @@
 
 import importlib.util
 import os
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).parent.parent
+
+# Cores are shared with other tests: how long an example takes tells nothing of it.
+settings.register_profile("shared", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("shared")
 
 # Without rclpy (make test-floor) the node tests cannot even be imported.
 collect_ignore = [] if importlib.util.find_spec("rclpy") else ["nodes"]
@@ -15,6 +21,18 @@ collect_ignore = [] if importlib.util.find_spec("rclpy") else ["nodes"]
 def find_data() -> Path:
     """Folder of the real measurements, whether it is there or not."""
     return Path(os.environ.get("ROBOCAL_DATA", ROOT.parent / "shared" / "data"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """A file in which pytest finds no test is a mistake, and would pass unseen."""
+    report = yield
+    if isinstance(collector, pytest.Module) and report.passed and not report.result:
+        report.outcome = "failed"
+        report.longrepr = f"{collector.path}: no test in this file"
+    return report
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -20,9 +20,9 @@ def environment(**variables: str) -> dict[str, str]:
 
 
 def robocal(
-    *arguments: object, timeout_s: float = 60.0, **variables: str
+    *arguments: object, timeout_s: float = 180.0, **variables: str
 ) -> subprocess.CompletedProcess[str]:
-    """Run it; nothing is checked."""
+    """Run it; nothing is checked. The time-out only ends what hangs: cores may be busy elsewhere."""
     return subprocess.run(
         [*COMMAND, *(str(argument) for argument in arguments)],
         capture_output=True,
