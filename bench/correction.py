@@ -16,6 +16,7 @@ from bench.speed import medians, pinocchio_model
 from bench.tables import Cell, Goal, Table
 from robocal_ros.core import frames
 from robocal_ros.core.joint_correction import JointCorrection, pack_model, solution
+from robocal_ros.core.joint_correction.room import work_size
 from robocal_ros.core.joint_correction.staged import StagedCorrection
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.kinematics.universal_robots import link_transform
@@ -143,7 +144,7 @@ def compiled_entry(correction: JointCorrection, q: Array) -> Callable[[], Array]
     """The compiled code called from Python, once for each point, into arrays that are there."""
     n = q.shape[1]
     points, ones, out = q[:, None].copy(), np.ones(1), np.empty((len(q), 1, n + solution.REPORT))
-    work = np.empty(solution.work_size(n))
+    work = np.empty(work_size(n))
     given = correction.models, ones, correction.largest, correction.free_axis, work
 
     def run() -> Array:

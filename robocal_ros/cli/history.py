@@ -10,7 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import count, text
-from robocal_ros.cli.history_view import show_decision, show_entry, show_list
+from robocal_ros.cli.history_view import (
+    show_corrections,
+    show_decision,
+    show_entry,
+    show_list,
+)
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import (
@@ -44,8 +49,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         _add_history(action)
         return action
 
-    listing = add("list", "the latest calibrations, newest first")
-    listing.add_argument("--limit", type=count, default=50, metavar="N", help="default 50")
+    for name, words in (
+        ("list", "the latest calibrations, newest first"),
+        ("corrections", "what joint_correction_node corrected with, newest change first"),
+    ):
+        listing = add(name, words)
+        listing.add_argument("--limit", type=count, default=50, metavar="N", help="default 50")
     showing = add("show", "all that is kept of one calibration")
     showing.add_argument("id", type=int, help="number in the list")
     for name, words in (
@@ -164,6 +173,16 @@ def _show(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     return document, show_entry
 
 
+def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    document = {
+        "corrections": [
+            asdict(record) | {"taught_tool": list(record.taught_tool)}
+            for record in history.corrections(args.limit)
+        ]
+    }
+    return document, show_corrections
+
+
 def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     head = history.accept(
         args.id,
@@ -203,6 +222,7 @@ def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer
 _ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]] = {
     "list": _list,
     "show": _show,
+    "corrections": _corrections,
     "accept": _accept,
     "reject": _reject,
     "rollback": _rollback,

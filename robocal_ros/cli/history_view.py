@@ -64,6 +64,33 @@ def show_entry(console: "Console", document: Document) -> None:
     console.print("The full document, the model and its figures: --json")
 
 
+def show_corrections(console: "Console", document: Document) -> None:
+    """Print what the commands were corrected with, and since when."""
+    from rich.table import Table
+    from rich.text import Text
+
+    _show_damage(console, document)
+    table = Table(title=f"Robot {document['serial']}", title_justify="left", box=None)
+    for name in ("since (UTC)", "correction", "model", "tool", "reference", "from", "its hash"):
+        table.add_column(name, justify="right" if name in ("model", "tool") else "left")
+    table.add_column("version")
+    for record in document["corrections"]:
+        asked = ("shadow" if record["shadow"] else "on") if record["enabled"] else "off"
+        table.add_row(
+            _time(record["wall_ns"]),
+            Text(asked, style="bold green" if asked == "on" else ""),
+            str(record["model_revision"] or "none"),
+            str(record["tool_revision"] or "taught"),
+            record["reference"],
+            Text(record["reference_source"]),
+            record["reference_hash"][:8],
+            Text(record["software"]),
+        )
+    console.print(table)
+    if not document["corrections"]:
+        console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
+
+
 def show_decision(console: "Console", document: Document) -> None:
     """Print what was done."""
     from rich.text import Text

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from command import conforms, environment, robocal, robocal_json
 from jsonschema import ValidationError
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.correction_record import CorrectionRecord
 from robocal_ros.core.proposals import Proposal, State
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -76,6 +78,43 @@ class TestReading:
         assert first["decisions"][0]["by"] == "node"
         one = robocal_json("history.list.json", "history", "list", "--state", state, "--limit", "1")
         assert [c["id"] for c in one["calibrations"]] == [3]
+
+    def test_corrections(self, state):
+        name = "history.corrections.json"
+        call = ("history", "corrections", "--state", state)
+        assert robocal_json(name, *call)["corrections"] == []
+        assert "Nothing yet" in robocal(*call).stdout
+        first = CorrectionRecord(
+            wall_ns=STAMP_NS,
+            software="0.1.0",
+            model_hash="0123456789abcdef",
+            enabled=False,
+            shadow=False,
+            model_revision=0,
+            tool_revision=0,
+            reference="calibrated",
+            reference_source="/robots/cold [1].yaml",
+            reference_name="cold",
+            reference_hash="fedcba9876543210",
+            taught_tool=(0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0),
+        )
+        second = replace(first, wall_ns=STAMP_NS + 1, enabled=True, model_revision=3)
+        with CalibrationHistory.open(SERIAL, state_dir=state) as history:
+            for record in (first, second):
+                history.note_correction(record)
+        found = robocal_json(name, *call)["corrections"]
+        assert [c["model_revision"] for c in found] == [3, 0]
+        assert [
+            CorrectionRecord(**c | {"taught_tool": tuple(c["taught_tool"])}) for c in found
+        ] == [
+            second,
+            first,
+        ]
+        assert robocal_json(name, *call, "--limit", "1")["corrections"] == found[:1]
+        lines = robocal(*call).stdout.splitlines()
+        for line, words in zip(lines[-2:], (("on", "3"), ("off", "none")), strict=True):
+            assert {*words, "taught", "calibrated", "[1].yaml", "fedcba98"} <= set(line.split())
+            assert "2023-11-14 22:13:20" in line
 
     def test_list_for_people(self, state):
         done = robocal("history", "list", ROBOCAL_STATE=str(state))

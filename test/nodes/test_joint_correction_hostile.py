@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Duration, Time
+from control_msgs.action import FollowJointTrajectory
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from joint_correction_live import (
     HOME,
     NAMES,
+    NODE,
     NOMINAL,
     Line,
     distance,
@@ -27,6 +30,7 @@ from joint_correction_live import (
     tool_message,
     trajectory,
 )
+from rclpy.action import ActionClient, ActionServer, GoalResponse
 from robocal_msgs.msg import KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
@@ -49,7 +53,7 @@ BLEND_RAD_S = np.radians(PARAMETERS["blend_deg_s"])
 START_RAD = np.radians(PARAMETERS["start_deg"])
 THERMAL_RAD = np.radians(PARAMETERS["thermal_joint_deg"])
 ACTUAL = drifted(times=10.0)
-FULL = JointCorrection.between(NOMINAL, ACTUAL)
+CONTROLLER = "/arm_controller/follow_joint_trajectory"
 # A blend is straight in the parameters, not quite in the joints: second order of its 1e-3 rad.
 CURVED = 1e-6
 
@@ -70,8 +74,9 @@ class Step:
 class Log:
     """What went in and came out."""
 
-    def __init__(self) -> None:
+    def __init__(self, free_axis: bool) -> None:
         self.steps: list[Step] = []
+        self._full = JointCorrection.between(NOMINAL, ACTUAL, free_axis=free_axis)
 
     def add(self, taught: Any, out: Any, blends_s: float, begins: bool = False) -> None:
         self.steps.append(Step(np.array(taught), np.array(out), blends_s, begins))
@@ -83,15 +88,12 @@ class Log:
             assert np.all(np.abs(step.out - step.taught) <= THERMAL_RAD)
             assert np.all((step.out >= NOMINAL.lower - 1e-9) & (step.out <= NOMINAL.upper + 1e-9))
         for earlier, later in itertools.pairwise(self.steps):
-            posture = np.abs(shift(later.taught) - shift(earlier.taught))
+            shifts = self._full.correct(np.stack([later.taught, earlier.taught])).joint_shift
+            posture = np.abs(shifts[0] - shifts[1])
             change = np.abs((later.out - later.taught) - (earlier.out - earlier.taught))
             allowed = BLEND_RAD_S * later.blends_s + START_RAD * later.begins + posture + CURVED
             assert np.all(change <= allowed), (change, allowed)
         del self.steps[:-1]
-
-
-def shift(q: np.ndarray) -> np.ndarray:
-    return np.asarray(FULL.correct(q).q - q)
 
 
 # ---- what may come ------------------------------------------------------------------------------
@@ -185,6 +187,8 @@ def good_path(points: list[tuple[np.ndarray, float]]) -> JointTrajectory:
 
 
 PATHS = st.lists(st.tuples(NEAR, st.floats(0.05, 0.5)), min_size=1, max_size=5).map(good_path)
+# and whether the controller accepts it
+GOALS = st.tuples(st.one_of(PATHS, PATHS, GARBAGE_PATHS), st.booleans())
 
 
 def attacks(stream: str, on: bool) -> st.SearchStrategy[Any]:
@@ -193,6 +197,7 @@ def attacks(stream: str, on: bool) -> st.SearchStrategy[Any]:
         "taught": st.one_of(NEAR, NEAR, FAR),
         "enable": st.booleans() if on else st.just(False),
         "path": PATHS,
+        "goal": GOALS,
         "flood": STREAMS[stream],
         stream: STREAMS[stream],
         "joint_trajectory": GARBAGE_PATHS,
@@ -204,11 +209,45 @@ def attacks(stream: str, on: bool) -> st.SearchStrategy[Any]:
     return st.lists(one, min_size=1, max_size=8)
 
 
+class Controller:
+    """Accepts goals, or rejects them; one that it accepts has succeeded."""
+
+    def __init__(self, node: Any) -> None:
+        self.accepts = True
+        self.goals: list[JointTrajectory] = []
+        self._server = ActionServer(
+            node, FollowJointTrajectory, CONTROLLER, self._follow, goal_callback=self._judge
+        )
+
+    def _judge(self, goal: Any) -> GoalResponse:
+        self.goals.append(goal.trajectory)
+        return GoalResponse.ACCEPT if self.accepts else GoalResponse.REJECT
+
+    @staticmethod
+    def _follow(handle: Any) -> Any:
+        handle.succeed()
+        return FollowJointTrajectory.Result()
+
+    def close(self) -> None:
+        self._server.destroy()
+
+
 class Attacked(Line):
     """A line whose robot stands where it was sent last."""
 
-    def __init__(self, graph: Any, stream: str, on: bool) -> None:
-        super().__init__(graph, **PARAMETERS, enable_on_start=on)
+    def __init__(self, graph: Any, stream: str, on: bool, **mode: bool) -> None:
+        self.controller = Controller(graph.probe)
+        super().__init__(
+            graph, **PARAMETERS, **mode, enable_on_start=on, follow_joint_trajectory=CONTROLLER
+        )
+        self.shadow = mode.get("shadow", False)
+        self.client = ActionClient(
+            graph.probe, FollowJointTrajectory, f"{NODE}/follow_joint_trajectory"
+        )
+        graph.spin_until(self.client.server_is_ready, "the action")
+        graph.spin_until(
+            self.node._proxy._clients[CONTROLLER].server_is_ready, "the controller's action"
+        )
         self.take(model_message(ACTUAL), self.to_model, "kinematic_model")
         self.stream = stream
         self.into = {
@@ -219,7 +258,8 @@ class Attacked(Line):
             "kinematic_model": self.to_model,
             "tool_frame": self.to_tool,
         }
-        self.log = Log()
+        self.sent: set[str] = set()
+        self.log = Log(mode.get("free_axis", False))
         self.since_s = time.monotonic()  # the last command was not before it
         self.longest_s = np.inf
         self.taught = HOME.copy()
@@ -234,6 +274,8 @@ class Attacked(Line):
             self.command(self.stream, self.good(message))
         elif what == "path":
             self.command("joint_trajectory", message)
+        elif what == "goal":
+            self.goal(*message)
         else:
             self.command(what, message)
 
@@ -245,6 +287,7 @@ class Attacked(Line):
     def command(self, topic: str, message: Any, copies: int = 1) -> int:
         """Send it; what comes out is noted, and the robot goes there."""
         self.stand()
+        self.sent.add(str(message))
         before, taken, accepted = time.monotonic(), *self.counts(topic)
         for _ in range(copies):
             self.into[topic].publish(message)
@@ -257,6 +300,12 @@ class Attacked(Line):
         }.get(topic)
         if inbox is not None:
             self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs of {topic}")
+        if self.shadow:
+            for out in itertools.chain(self.targets, self.arrays, self.paths):
+                self.passed(out)
+            for box in (self.targets, self.arrays, self.paths):
+                box.clear()
+            return count
         for out in self.targets:
             index = [NAMES.index(name) for name in out.name]
             self.went(before, index, message.position, out.position)
@@ -268,6 +317,35 @@ class Attacked(Line):
         for path in paths:
             self.follow(path, message, before)
         return count
+
+    def passed(self, out: Any) -> None:
+        """In shadow mode what goes out is what came, and finite."""
+        assert str(out) in self.sent
+        if isinstance(out, JointTrajectory):
+            rows = [row for p in out.points for row in (p.positions, p.velocities)]
+        else:
+            rows = [out.data if isinstance(out, Float64MultiArray) else out.position]
+        assert all(np.all(np.isfinite(row)) for row in rows)
+
+    def goal(self, trajectory: JointTrajectory, accepts: bool) -> None:
+        """Send a goal, which the controller accepts or rejects."""
+        self.stand()
+        self.sent.add(str(trajectory))
+        before, self.controller.accepts = time.monotonic(), accepts
+        goal = FollowJointTrajectory.Goal(trajectory=trajectory)
+        sent = self.client.send_goal_async(goal)
+        self.graph.spin_until(sent.done, "the goal is taken")
+        ended = sent.result().get_result_async()
+        self.graph.spin_until(ended.done, "the goal ends")
+        goals = list(self.controller.goals)
+        self.controller.goals.clear()
+        succeeded = ended.result().status == GoalStatus.STATUS_SUCCEEDED
+        assert succeeded == bool(goals and accepts)
+        for out in goals:
+            if self.shadow:
+                self.passed(out)
+            else:
+                self.follow(out, trajectory, before, stops=accepts)
 
     def counts(self, topic: str) -> tuple[int, int]:
         """How many messages were received, and how many of them were not refused."""
@@ -281,11 +359,15 @@ class Attacked(Line):
         self.log.add(self.taught, self.at, pause, self.longest_s == np.inf)
         self.since_s, self.longest_s = before, LONGEST_STEP_S
 
-    def follow(self, path: JointTrajectory, taught: JointTrajectory, before: float) -> None:
-        """A trajectory got through; a stop ends it before the robot moves."""
+    def follow(
+        self, path: JointTrajectory, taught: JointTrajectory, before: float, stops: bool = True
+    ) -> None:
+        """A trajectory got through; a stop, or its rejection, ends it before the robot moves."""
         if not path.points:
             return
-        last_s, kept = 0.0, self.log.steps[-1:]
+        # one that was stopped, or rejected, before it has blended until then
+        under_way_s = before - self.since_s if self.longest_s == np.inf else 0.0
+        last_s, kept = -max(under_way_s, 0.0), self.log.steps[-1:]
         for point, given_point in zip(path.points, taught.points, strict=True):
             rows = (point.positions, point.velocities, point.accelerations, point.effort)
             assert all(np.all(np.isfinite(row)) for row in rows)
@@ -295,18 +377,27 @@ class Attacked(Line):
                 last_s = at_s
         self.log.check()
         self.log.steps[:] = kept
-        self.command("joint_trajectory", JointTrajectory(joint_names=NAMES))
+        if stops:
+            self.command("joint_trajectory", JointTrajectory(joint_names=NAMES))
         self.since_s, self.longest_s = min(self.since_s, before), np.inf
 
 
 @pytest.mark.parametrize(
-    ("stream", "on"), [("joint_targets", True), ("joint_commands", True), ("joint_commands", False)]
+    ("stream", "on", "mode"),
+    [
+        ("joint_targets", True, {}),
+        ("joint_commands", True, {}),
+        ("joint_commands", False, {}),
+        ("joint_targets", True, {"free_axis": True}),
+        ("joint_targets", True, {"shadow": True}),
+        ("joint_commands", True, {"shadow": True}),
+    ],
 )
-def test_nothing_wrong_goes_out(graph: Any, stream: str, on: bool) -> None:
-    line = Attacked(graph, stream, on)
+def test_nothing_wrong_goes_out(graph: Any, stream: str, on: bool, mode: dict[str, bool]) -> None:
+    line = Attacked(graph, stream, on, **mode)
 
     @settings(
-        max_examples=20,
+        max_examples=10,
         deadline=None,
         database=None,
         phases=[Phase.generate],  # the node remembers: nothing can be replayed or made smaller
@@ -323,13 +414,15 @@ def test_nothing_wrong_goes_out(graph: Any, stream: str, on: bool) -> None:
         line.log.check()
 
     attack()
+    line.client.destroy()
+    line.controller.close()
     for _ in range(3000):
         line.command(stream, line.good(HOME))
         if line.node._session.status().settled:
             break
     line.command(stream, line.good(HOME))
     line.log.check()
-    if on:
+    if on and not line.shadow:
         assert distance(ACTUAL, line.at) < 1e-9
     else:
         assert list(line.at) == HOME.tolist()

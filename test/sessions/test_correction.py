@@ -30,6 +30,7 @@ from hypothesis import strategies as st
 
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
 from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.sessions.correction import (
     CorrectionSession,
@@ -775,6 +776,14 @@ def test_a_corrected_trajectory_that_comes_back_without_its_mark(warm: Robot) ->
     warm.session.trajectory(still(), warm.now)
 
 
+def test_own_output_in_another_order_is_known(warm: Robot) -> None:
+    out, path = warm.stream(), warm.session.trajectory(still(), warm.now)
+    back = JointCommand(NAMES[::-1], out[::-1].copy())
+    refused(Reason.OWN_OUTPUT, warm.session.target, back, warm.now)
+    turned = replace(path, names=NAMES[::-1], position=path.position[:, ::-1].copy(), mark="")
+    refused(Reason.OWN_OUTPUT, warm.session.trajectory, turned, warm.now)
+
+
 def test_a_rounded_target_is_no_echo_of_a_tiny_correction() -> None:
     """Corrected by less than a float32 holds: the same rounded target again is no loop."""
     robot = Robot()
@@ -784,6 +793,35 @@ def test_a_rounded_target_is_no_echo_of_a_tiny_correction() -> None:
     for _ in range(10):
         shift = np.abs(robot.stream(rounded) - rounded).max()
     assert 0.0 < shift < 5e-7
+
+
+def test_a_model_that_is_the_reference_to_rounding_corrects_nothing() -> None:
+    """A file's decimals and a quaternion on the way leave 1e-13 of it."""
+    robot = Robot()
+    robot.read(HOME)
+    robot.session.offer_model(offer(NOMINAL.with_mdh(NOMINAL.mdh + 1e-13)))
+    robot.session.enable(True)
+    assert np.array_equal(robot.stream(), HOME)
+    status = robot.session.status()
+    assert status.settled
+    assert not status.active
+
+
+def test_a_reading_is_un_corrected_once(warm: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its velocities are found with what its positions were found with."""
+    calls = []
+    correct = StagedCorrection.correct
+
+    def counted(stage: StagedCorrection, q: np.ndarray, s: np.ndarray) -> StagedResult:
+        calls.append(len(q))
+        return correct(stage, q, s)
+
+    q = warm.settle()
+    monkeypatch.setattr(StagedCorrection, "correct", counted)
+    warm.read(q)
+    positions_only = len(calls)
+    warm.read(q, velocity=np.full(6, 0.1))
+    assert len(calls) == 2 * positions_only
 
 
 def test_own_output_that_comes_back(warm: Robot) -> None:

@@ -14,11 +14,13 @@ from correction_robot import (
     Robot,
     bent_tool,
     drifted,
+    good_here_only,
     offer,
+    refused,
     still,
 )
 
-from robocal_ros.sessions.correction import Course, JointCommand, TrajectoryCommand
+from robocal_ros.sessions.correction import Course, JointCommand, Reason, TrajectoryCommand
 
 STEP_S = 0.05
 
@@ -129,6 +131,24 @@ def test_a_goal_that_is_rejected_when_nothing_ran() -> None:
     assert not before.settled  # nothing was blended
     out = robot.session.target(JointCommand(NAMES, HOME), robot.now).position
     assert np.abs(out - HOME).max() < RATE * 0.1
+
+
+def test_a_rejected_goal_is_nowhere_the_robot_goes() -> None:
+    """A model is judged where the robot goes, and a target by what was put out before it."""
+    arm, far = good_here_only()
+    robot = Robot(velocity_limits=np.full(6, 0.01))
+    robot.read(HOME)
+    robot.session.enable(True)
+    robot.stream()
+    robot.stream()
+    path = TrajectoryCommand(NAMES, np.stack([HOME, far]), np.array([0.0, 2000.0]))
+    robot.session.trajectory(path, robot.now, may_be_rejected=True)
+    course = robot.session.course
+    assert course is not None
+    course.reject()
+    robot.session.offer_model(offer(arm))  # too large where the goal was
+    # where it may begin, but 3e-4 rad within 20 ms of what was put out before
+    refused(Reason.VELOCITY_LIMIT, robot.stream, HOME + 3e-4)
 
 
 def test_a_goal_begins_as_it_is_forwarded() -> None:

@@ -345,12 +345,13 @@ class Hostile(Both):
         self.do(lambda desk: desk.session.trajectory(STOP, self.now - rng.choice([0.0, 200.0])))
 
     def on_echo(self, rng: np.random.Generator, count: int) -> None:
-        """What went out comes back, as it was or rounded, with its mark or without."""
+        """What went out comes back, as it was, rounded or reversed, marked or not."""
         if not isinstance(self.sent, bytes):
             return
         back = positions(self.sent, NAMES)
         ways = [back, back.astype(np.float32)]
         echoes = [serialized(NAMES, [way, [], []], self.stamp) for way in ways]
+        echoes.append(serialized(NAMES[::-1], [back[::-1], [], []], self.stamp))
         for echo in (*echoes, self.sent):
             self.now += DT
             self.target(echo)

@@ -72,26 +72,28 @@ class ClampedCorrection(StagedCorrection):
         reason = worst if np.any(kept < 1.0) else None
         return ClampedResult(made, full.arm, full.tool, kept, reason)
 
-    def uncorrect(self, corrected: Array, s: Array) -> Array:
-        """Taught joints (m, n) of corrected ones: the inverse of `correct`.
+    def inverse(self, corrected: Array, s: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Taught joints (m, n) of corrected ones, and whether all of the correction is made there.
 
         Where a bound holds or a singularity is near, by plain steps until it is exact or as near
         as it gets: the inverse of the whole correction would lead astray.
         """
         made = self.correct(corrected, s)
         if np.all(made.whole):
-            return super().uncorrect(corrected, s)
+            return super().inverse(corrected, s)
         q, answer, best = corrected, corrected, np.full(len(corrected), np.inf)
+        whole = np.zeros(len(corrected), dtype=np.bool_)
         for _ in range(MOST_STEPS):
             miss = corrected - made.q
             size = np.max(np.abs(miss), axis=1)
             answer = np.where((size < best)[:, None], q, answer)
+            whole = np.where(size < best, made.whole, whole)
             best = np.minimum(best, size)
             if np.all(best < EXACT):
                 break
             q = q + miss
             made = self.correct(q, s)
-        return answer
+        return answer, whole
 
     def _shares(self, q: Array, full: StagedResult) -> dict[Reason, Array]:
         """Largest share (m,) of the shift by each bound; equation 1."""

@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.joint_correction import kernels, solution
+from robocal_ros.core.joint_correction.room import work_size
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
@@ -117,7 +118,7 @@ class JointCorrection:
         self.largest = plain(largest, (self.n,)).copy()
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
-        self._work = np.empty(solution.work_size(self.n))
+        self._work = np.empty(work_size(self.n))
         self._inverse: JointCorrection | None = None  # made once, for a stream of readings
 
     @classmethod

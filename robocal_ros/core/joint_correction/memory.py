@@ -51,8 +51,8 @@ class Memory(NamedTuple):
     offset : (n,) what was added to the target corrected last.
     measured, taught : (n,) last readings, and the same un-corrected.
     read_s : (n,) when these were taken.
-    echoes, within : (64, n) ring of the last corrected positions of targets (with fewer joints
-        shorter rows in its place), and (64,) how near they come back.
+    echoes, within : (64, n) ring of the last corrected positions of targets, in the arm's order
+        (with fewer joints shorter rows in its place), and (64,) how near they come back.
     track_s, track : (32,) and (32, n) ring of where the robot was within the response time.
     """
 

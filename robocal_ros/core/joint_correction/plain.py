@@ -38,6 +38,8 @@ from robocal_ros.core.joint_correction.plainness import (
     within,
 )
 from robocal_ros.core.joint_correction.rates import rates_at
+from robocal_ros.core.joint_correction.room import room_in, settle
+from robocal_ros.core.joint_correction.room import work_size as room_size
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -48,7 +50,7 @@ _ROWS = 4
 
 def work_size(n: int, k: int) -> int:
     """How many scratch numbers k stages for n joints need."""
-    return solution.work_size(n) + _ROWS * n + 2 * k * (n + solution.REPORT)
+    return room_size(n) + _ROWS * n + 2 * k * (n + solution.REPORT)
 
 
 @lean
@@ -134,8 +136,8 @@ def _has_rates(
 ) -> bool:
     """Speed ``rows[1]`` at q becomes that of the answer; False where singular."""
     speed, zero, out = rows[1], rows[2], rows[3]
-    room = solution.room_in(work, q.shape[0], free_axis)
-    solution.settle(models, SETTLED, room)
+    room = room_in(work, q.shape[0], free_axis)
+    settle(models, SETTLED, room)
     for i in range(q.shape[0]):
         zero[i] = 0.0
     rates_at(q, speed, zero, answer, room, out, zero)
@@ -164,10 +166,7 @@ def _note_target(q: Array, corrected: Array, found: Array, memory: Memory, now_s
 
 
 @lean
-def _note_echo(came: Array, layout: Index, goes: Array, memory: Memory) -> None:
-    n = memory.goal.shape[0]
-    taught = came[layout[wire.CAME] : layout[wire.CAME] + n]
-    out = goes[layout[wire.GOES] : layout[wire.GOES] + n]
+def _note_echo(taught: Array, out: Array, memory: Memory) -> None:
     of.remember_echo(memory.echoes, memory.within, memory.counts[of.ECHOED], taught, out)
     memory.counts[of.ECHOED] += 1
 
@@ -183,12 +182,11 @@ def _note_reading(
 
 
 @lean
-def _goes_on(came: Array, layout: Index, memory: Memory, now_s: float, least_gap_s: float) -> bool:
+def _goes_on(q: Array, memory: Memory, now_s: float, least_gap_s: float) -> bool:
     """Whether a target belongs to the stream, and was not put out before."""
     if not of.goes_on(memory.times, least_gap_s, now_s):
         return False
-    position = came[layout[wire.CAME] : layout[wire.CAME] + memory.goal.shape[0]]
-    return not of.is_echo(memory.echoes, memory.within, position)
+    return not of.is_echo(memory.echoes, memory.within, q)
 
 
 @lean
@@ -203,9 +201,9 @@ def pass_plainly(
     q, speed, moves = rows[0], rows[1], layout[wire.COUNT + wire.VELOCITY] > 0
     if not _is_next(came, form, layout, last, memory, now_s):
         return False
-    if not (is_reading or _goes_on(came, layout, memory, now_s, bounds[LEAST_GAP_S])):
-        return False
     _take_joints(came, layout, place, q, speed)
+    if not (is_reading or _goes_on(q, memory, now_s, bounds[LEAST_GAP_S])):
+        return False
     if not within(q, limits[DOUBTFUL]):
         return False
     if not _solve(q, is_reading, limits, bounds, models, largest, free_axis, clamped, work, found):
@@ -223,7 +221,7 @@ def pass_plainly(
         _note_reading(q, answer, memory, now_s, age_s)
     else:
         _note_target(q, answer, found, memory, now_s)
-        _note_echo(came, layout, goes, memory)
+        _note_echo(q, answer, memory)
     return True
 
 

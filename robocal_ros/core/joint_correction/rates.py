@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import lean
-from robocal_ros.core.joint_correction.solution import Room, room_in, settle
+from robocal_ros.core.joint_correction.room import Room, room_in, settle
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 
@@ -58,7 +58,7 @@ def rates_batch(
 
     J' qd' = J qd, and its derivative J' qdd' + (dJ'/dt) qd' = J qdd + (dJ/dt) qd, analytically,
     for arms of six joints. Meaningful where a point was corrected in full; NaN where the pose is
-    singular. ``work`` is scratch of `solution.work_size` numbers.
+    singular. ``work`` is scratch of `room.work_size` numbers.
     """
     room = room_in(work, q.shape[1], False)
     for i in range(q.shape[0]):

@@ -1,19 +1,19 @@
 """Compiled solution of the joint correction: one point, or a trajectory.
 
-``models`` (4, n + 2, 9) are the packed reference and actual model, each at the start and at the
-end of a blend. ``work`` is scratch of `work_size` numbers, so that a point allocates nothing.
+Most points of six joints are solved by `straight`; the others, and all other arms, here.
+``models`` and ``work``: see `room`.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import lean
-from robocal_ros.core.joint_correction import equations
+from robocal_ros.core.joint_correction import equations, straight
 from robocal_ros.core.joint_correction import kernels as k
+from robocal_ros.core.joint_correction import straight_kinematics as six
+from robocal_ros.core.joint_correction.room import Room, room_in, settle
 from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import turns_size, walk
+from robocal_ros.core.kinematics.kernels import walk
 
 Array = NDArray[np.float64]
 
@@ -35,81 +35,6 @@ MOST_OVER = 2.0
 # What `correct_point` writes after the n joints.
 POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, SHARE = range(7)
 REPORT = 7
-
-
-class Room(NamedTuple):
-    """Where a solution is worked out: parts of ``work``, made once for a batch.
-
-    Attributes
-    ----------
-    taught, actual : (n + 2, 9) blended models.
-    taught_links, links : (n, 9) their joints.
-    taught_root, taught_tool, root, tool : their (4, 4) ends, T_base_root and T_flange_tool.
-    goal, aim : (4, 4) where the tool must go, and the part of the way there that is gone. Such
-        poses have the axes of the flange, their origin is the tool's.
-    here : (4, 4) pose of the tool at the joints tried last.
-    turns, frames : scratch of `walk`.
-    J, L : (n, 6) Jacobian, and the factor for its steps.
-    e, spare, spare_twist : (6,) residual to ``aim``, and scratch.
-    x, step : (n,) shift of the joints, and its last step.
-    """
-
-    taught: Array
-    actual: Array
-    taught_links: Array
-    links: Array
-    taught_root: Array
-    taught_tool: Array
-    root: Array
-    tool: Array
-    goal: Array
-    aim: Array
-    here: Array
-    turns: Array
-    frames: Array
-    J: Array
-    L: Array
-    e: Array
-    spare: Array
-    spare_twist: Array
-    x: Array
-    step: Array
-
-
-def work_size(n: int) -> int:
-    """How many scratch numbers a solution for n joints needs."""
-    return 18 * (n + 2) + 7 * 16 + 24 * (n // 8 + 1) + 6 * n + 6 * n + max(n, 6) ** 2 + 18 + 2 * n
-
-
-@lean
-def room_in(work: Array, n: int, free: bool) -> Room:
-    """Divide ``work``."""
-    m = 9 * (n + 2)
-    taught, actual, at = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9), 2 * m
-    poses, at = work[at : at + 112].reshape(7, 4, 4), at + 112
-    turns, at = work[at : at + turns_size(n)], at + turns_size(n)
-    frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
-    J, at = work[at : at + 6 * n].reshape(n, 6), at + 6 * n
-    size = equations.unknowns(n, free)
-    L, at = work[at : at + size * size].reshape(size, size), at + size * size
-    twists, at = work[at : at + 18].reshape(3, 6), at + 18
-    return Room(
-        taught, actual, taught[:n], actual[:n], poses[0], poses[1], poses[2], poses[3], poses[4],
-        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1], twists[2],
-        work[at : at + n], work[at + n : at + 2 * n],
-    )  # fmt: skip
-
-
-@lean
-def settle(models: Array, s: float, room: Room) -> None:
-    """Models at blend s, and their ends."""
-    n = room.links.shape[0]
-    k.blend(models[0], models[1], s, room.taught)
-    k.blend(models[2], models[3], s, room.actual)
-    newton.pose(room.taught[n], room.taught_root)
-    newton.pose(room.taught[n + 1], room.taught_tool)
-    newton.pose(room.actual[n], room.root)
-    newton.pose(room.actual[n + 1], room.tool)
 
 
 @lean
@@ -251,13 +176,68 @@ def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> No
 
 
 @lean
+def _is_straight(largest: Array, free: bool, room: Room) -> bool:
+    """Whether the settled models are for `straight`; its constants then."""
+    n = room.links.shape[0]
+    if free or n != six.N:
+        return False
+    turning = True
+    for i in range(n):
+        turning &= room.links[i, 8] < 0.5
+        room.constants[six.LARGEST + i] = largest[i]
+    taught, tool = room.taught_tool, room.tool
+    six.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
+    six.constants(room.links, room.root, tool, taught, six.ACTUAL, room.constants)
+    return turning
+
+
+@lean
+def _put(q: Array, lane: int, lanes: int, room: Room) -> None:
+    """A point becomes one of those that `straight` solves."""
+    for i in range(six.N):
+        room.came[i * lanes + lane] = q[i]
+
+
+@lean
+def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
+    """A point of `straight`, with its report; False where it must be solved here."""
+    goes, n = room.goes, six.N
+    for i in range(n):
+        out[i] = goes[i * lanes + lane]
+    out[n + POSITION_ERROR] = goes[straight.POSITION_LEFT * lanes + lane]
+    out[n + ROTATION_ERROR] = goes[straight.ROTATION_LEFT * lanes + lane]
+    out[n + ITERATIONS], out[n + SHARE] = straight.ITERATIONS, 1.0
+    out[n + CONVERGED] = goes[straight.FINE * lanes + lane]
+    out[n + TCP_SHIFT] = goes[straight.TCP_SHIFT * lanes + lane]
+    out[n + TCP_ROTATION] = goes[straight.TCP_ROTATION * lanes + lane]
+    return bool(out[n + CONVERGED] > 0.5)
+
+
+@lean
+def _straight_one(q: Array, room: Room, out: Array) -> bool:
+    _put(q, 0, 1, room)
+    straight.correct_one(room.constants, room.came, room.goes)
+    return _take_over(room, 0, 1, out)
+
+
+@lean
+def _alike(s: Array) -> bool:
+    """Whether points can be solved at once: as many as there are lanes, with one blend."""
+    same = s.shape[0] == straight.LANES
+    for i in range(s.shape[0]):
+        same &= s[i] == s[0]
+    return same
+
+
+@lean
 def correct_point(
     q: Array, models: Array, s: float, largest: Array, free: bool, work: Array, out: Array
 ) -> None:
     """`correct_batch` for one point (n,)."""
     room = room_in(work, q.shape[0], free)
     settle(models, s, room)
-    _correct(q, largest, free, room, out)
+    if not (_is_straight(largest, free, room) and _straight_one(q, room, out)):
+        _correct(q, largest, free, room, out)
 
 
 @lean
@@ -270,8 +250,22 @@ def correct_batch(
     tool's z is free. ``out`` (m, n + 7): joints, then the report. See
     `joint_correction.JointCorrection`.
     """
-    room = room_in(work, q.shape[1], free)
-    for i in range(q.shape[0]):
-        if i == 0 or s[i] != s[i - 1]:
-            settle(models, s[i], room)
-        _correct(q[i], largest, free, room, out[i])
+    room, first, is_straight = room_in(work, q.shape[1], free), 0, False
+    while first < q.shape[0]:
+        if first == 0 or s[first] != s[first - 1]:
+            settle(models, s[first], room)
+            is_straight = _is_straight(largest, free, room)
+        lanes = straight.LANES if _alike(s[first : first + straight.LANES]) else 1
+        if is_straight and lanes > 1:
+            for lane in range(lanes):
+                _put(q[first + lane], lane, lanes, room)
+            straight.correct_lanes(room.constants, room.came, room.goes)
+        for lane in range(lanes):
+            i = first + lane
+            if is_straight and lanes > 1:
+                solved = _take_over(room, lane, lanes, out[i])
+            else:
+                solved = is_straight and _straight_one(q[i], room, out[i])
+            if not solved:
+                _correct(q[i], largest, free, room, out[i])
+        first += lanes

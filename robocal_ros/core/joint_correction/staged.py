@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.joint_correction import rates, solution
+from robocal_ros.core.joint_correction import rates
 from robocal_ros.core.joint_correction.correction import (
     CorrectionResult,
     JointCorrection,
@@ -21,6 +21,7 @@ from robocal_ros.core.joint_correction.correction import (
 )
 from robocal_ros.core.joint_correction.plain import load_kernels as load_plain_kernels
 from robocal_ros.core.joint_correction.plainness import EXACT
+from robocal_ros.core.joint_correction.room import work_size
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
@@ -87,7 +88,7 @@ class StagedCorrection:
         self.models = np.stack([reference, reference, start, end])
         # six joints and six equations: rates by the chain rule
         self.analytic = self.n == 6 and not free_axis
-        self._work = np.empty(solution.work_size(self.n))
+        self._work = np.empty(work_size(self.n))
         self._tool: JointCorrection | None = None
         if not (np.array_equal(start[-1], taught) and np.array_equal(end[-1], taught)):
             self._tool = JointCorrection(np.stack([*bare, start, end]), tool_largest, free_axis)
@@ -116,8 +117,12 @@ class StagedCorrection:
         until it is, or until it is as near as it gets: always a number, and never further off
         than twice the bounds of both shifts together.
         """
+        return self.inverse(corrected, s)[0]
+
+    def inverse(self, corrected: Array, s: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """`uncorrect`, and (m,) whether all of the correction is made there."""
         answer, best = corrected.copy(), np.full(len(corrected), np.inf)
-        part = np.zeros(len(corrected), dtype=np.bool_)
+        part, whole = np.zeros((2, len(corrected)), dtype=np.bool_)
         rows, aim = np.arange(len(corrected)), corrected
         for _ in range(MOST_REFINEMENTS):
             q = self._exchanged(aim, s[rows])
@@ -126,6 +131,7 @@ class StagedCorrection:
             size = np.max(np.abs(miss), axis=1)
             better = size < best[rows]
             answer[rows[better]], best[rows[better]] = q[better], size[better]
+            whole[rows[better]] = made.whole[better]
             if made.tool is not None:
                 part[rows[better]] = made.tool.share[better] < 1.0
             more = better & (size >= EXACT)  # one that no longer gets nearer needs other steps
@@ -135,7 +141,8 @@ class StagedCorrection:
         for i in np.flatnonzero((best >= ROUNDING) | part):
             exact = bool(best[i] < ROUNDING)
             answer[i] = self._searched(answer[i], corrected[i], s[i : i + 1], exact=exact)
-        return answer
+            whole[i] = self.correct(answer[i : i + 1], s[i : i + 1]).whole[0]
+        return answer, whole
 
     def _exchanged(self, q: Array, s: Array) -> Array:
         """Joints (m, n) corrected with the models exchanged: nearly the taught ones."""
@@ -232,18 +239,20 @@ class StagedCorrection:
             )
         return out_v, out_a
 
-    def taught_velocity(self, q: Array, corrected: Array, velocity: Array) -> Array:
-        """Velocities (m, n) of taught joints ``q`` while the corrected ones move at ``velocity``.
+    def taught(self, corrected: Array, velocity: Array) -> tuple[Array, Array]:
+        """Taught joints (m, n) of corrected ones, and their velocities; at the end of the blend.
 
-        At the end of the blend. Where a singularity is near they are the corrected joints' own.
+        Where a singularity is near the velocities are the corrected joints' own.
         """
-        out, unused, zero = np.empty_like(q), np.empty_like(q), np.zeros_like(q)
-        models, ones = self.models[[2, 3, 0, 1]], np.ones(len(q))
+        ones, zero = np.ones(len(corrected)), np.zeros_like(corrected)
+        q, whole = self.inverse(corrected, ones)
         if not self.analytic:
-            return path_rates(lambda p, _: self.uncorrect(p, ones), corrected, velocity, zero)[0]
+            found = path_rates(lambda p, _: self.uncorrect(p, ones), corrected, velocity, zero)
+            return q, found[0]
+        out, unused, models = zero.copy(), zero.copy(), self.models[[2, 3, 0, 1]]
         rates.rates_batch(corrected, velocity, zero, q, models, ones, self._work, out, unused)
-        exact = self.correct(q, ones).whole & np.isfinite(out).all(axis=1)
-        return np.where(exact[:, None], out, velocity)
+        exact = whole & np.isfinite(out).all(axis=1)
+        return q, np.where(exact[:, None], out, velocity)
 
 
 def load_kernels(arm: SerialArm) -> None:

@@ -5,7 +5,8 @@ commands    targets and trajectories, corrected
 readings    joint states, un-corrected
 inputs      what comes in, as types; how they are built from messages
 status      what is said of it, as types
-incoming    joints by name, order in time, own output that comes back
+incoming    joints by name, order in time
+echoes      own output that comes back
 offers      which models are taken over
 tools       which tools are taken over, and when
 starts      where a command may begin

@@ -61,7 +61,7 @@ class Commands:
         self._corrector, self._starts = corrector, starts
         self._stream = StreamPeriod(memory, config.stream_gap_s)
         self._out, self._times = memory.out, memory.times  # of the last target
-        self.courses = Courses(corrector, starts)
+        self.courses = Courses(corrector, starts, memory)
         self.goal, self.offset = memory.goal, memory.offset
         self.settled: JointCommand | None = None
 
@@ -80,8 +80,8 @@ class Commands:
         """Correct one message of a stream; the blend advances with ``now_s``."""
         self.settled = None
         self._guard.require_order(TARGET, command.stamp_ns, command.mark, now_s, command.names)
-        self._guard.require_not_own(TARGET, command.names, command.position)
         q, index = self._joints.complete(command.names, command.position[None], now_s)
+        self._guard.require_not_own(TARGET, index, command.position)
         speeds = None if command.velocity is None else command.velocity[None]
         require_finite(command.names, speeds)
         # Messages may come at once after a delay: each has the stream's own period; and a pause
@@ -97,7 +97,7 @@ class Commands:
         self.goal[:] = q[0]
         self._guard.accept_order(TARGET, command.stamp_ns, now_s, command.names)
         out = corrected.position
-        self._guard.note_output(TARGET, command.names, command.position, out)
+        self._guard.note_output(TARGET, index, command.position, out)
         self._out[:] = np.nan
         self._out[index], self._times[of.OUT] = out, now_s
         self._starts.note_target(index)
@@ -169,8 +169,8 @@ class Commands:
         times = command.time_from_start_s
         if not np.all(np.isfinite(times)) or times[0] < 0.0 or np.any(np.diff(times) <= 0.0):
             raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
-        self._guard.require_not_own(TRAJECTORY, command.names, command.position)
         q, index = self._joints.complete(command.names, command.position, now_s)
+        self._guard.require_not_own(TRAJECTORY, index, command.position)
         require_finite(command.names, command.velocity)
         require_finite(command.names, command.acceleration)
         dt_s = np.append(np.inf, np.diff(times))
@@ -183,7 +183,7 @@ class Commands:
         )
         self._guard.accept_order(TRAJECTORY, 0, now_s)
         out = corrected.position
-        self._guard.note_output(TRAJECTORY, command.names, command.position, out)
+        self._guard.note_output(TRAJECTORY, index, command.position, out)
         begin, led_from = now_s + starts_in_s, places[1, index]
         sent = Sent(index, begin, times, command.position, out, led_from, now_s)
         self._starts.note_sent(sent, now_s)

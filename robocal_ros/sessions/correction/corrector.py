@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction import pack_model
-from robocal_ros.core.joint_correction.blending import Commanded
+from robocal_ros.core.joint_correction.blending import ROUNDING, Commanded
 from robocal_ros.core.joint_correction.bounds import (
     CorrectionConfig,
     Policy,
@@ -61,7 +61,7 @@ class Corrector:
         """Head for a model and tool when ``on``, else for no correction."""
         actual = pack_model(arm)
         for known in (self.reference, self._wanted, self._commanded.end):
-            if np.array_equal(known, actual):
+            if np.allclose(known, actual, rtol=0.0, atol=ROUNDING):
                 actual = known  # a settled blend is told by identity
                 break
         self.known = actual

@@ -4,23 +4,41 @@ A controller that rejects a goal goes on with what it has. So each trajectory kn
 the place of, until it is known to be accepted.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction.blending import Commanded
+from robocal_ros.core.joint_correction.memory import Memory
 from robocal_ros.sessions.correction.corrector import Corrector
 from robocal_ros.sessions.correction.starts import Beginning, Starts
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Left:
-    """What was commanded when something else took its place."""
+    """What was commanded when something else took its place.
+
+    Attributes
+    ----------
+    goal, out : (n,) of the `Memory`: taught joints that were commanded last, and what was put out
+        for the last target.
+    """
 
     commanded: Commanded
     beginning: Beginning
+    goal: Array
+    out: Array
 
     def stopped(self, now_s: float) -> "Left":
         """The same, ended at an instant."""
-        return Left(self.commanded.stopped(now_s), self.beginning.stopped(now_s))
+        return replace(
+            self,
+            commanded=self.commanded.stopped(now_s),
+            beginning=self.beginning.stopped(now_s),
+        )
 
 
 class Course:
@@ -68,13 +86,14 @@ class Courses:
     current : None when something else was put out since: a target, or a stop.
     """
 
-    def __init__(self, corrector: Corrector, starts: Starts) -> None:
-        self._corrector, self._starts = corrector, starts
+    def __init__(self, corrector: Corrector, starts: Starts, memory: Memory) -> None:
+        self._corrector, self._starts, self._memory = corrector, starts, memory
         self.current: Course | None = None
 
     def left(self) -> Left:
         """What is commanded, before a trajectory takes its place."""
-        return Left(self._corrector.under_way, self._starts.beginning)
+        goal, out = self._memory.goal.copy(), self._memory.out.copy()
+        return Left(self._corrector.under_way, self._starts.beginning, goal, out)
 
     def take(self, left: Left, *, at_once: bool, may_be_rejected: bool) -> None:
         """A trajectory takes the place of what was ``left``; ``at_once``: when it is forwarded."""
@@ -96,6 +115,7 @@ class Courses:
         self.current = course
         self._corrector.go_back(left.commanded)
         self._starts.go_back(left.beginning)
+        self._memory.goal[:], self._memory.out[:] = left.goal, left.out
 
     def stop(self, now_s: float) -> None:
         """What is under way ends."""

@@ -1,4 +1,4 @@
-"""What comes in: joints by name, their last known state, order in time, own output."""
+"""What comes in: joints by name, their last known state, order in time."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.joint_correction import memory as of
-from robocal_ros.core.joint_correction.correction import plain
 from robocal_ros.core.joint_correction.memory import RESPONSE_S, Memory
 from robocal_ros.core.joint_correction.refusals import Reason, RefusedError
 from robocal_ros.core.joint_correction.starting import Whereabouts
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
+from robocal_ros.sessions.correction.echoes import Echoes
 from robocal_ros.sessions.correction.inputs import JointCommand
 
 Array = NDArray[np.float64]
@@ -242,47 +242,14 @@ class CorrectionGuard:
         for last in self._stamps.values():
             last[0] = 0
 
-    def note_output(self, kind: str, names: tuple[str, ...], taught: Array, out: Array) -> None:
-        """Remember what was put out for what came in."""
-        self._echoes[kind].remember(names, taught, out)
+    def note_output(self, kind: str, index: Index, taught: Array, out: Array) -> None:
+        """Remember what was put out for joints ``index`` (k,) of what came in."""
+        self._echoes[kind].remember(index, taught, out)
 
-    def require_not_own(self, kind: str, names: tuple[str, ...], position: Array) -> None:
-        """Refuse what was put out, and comes back without its mark."""
-        if self._echoes[kind].holds(names, position):
+    def require_not_own(self, kind: str, index: Index, position: Array) -> None:
+        """Refuse what was put out, and comes back without its mark, in whatever order."""
+        if self._echoes[kind].holds(index, position):
             raise RefusedError(Reason.OWN_OUTPUT, f"equal to a {kind} that was corrected before")
-
-
-class Echoes:
-    """The last corrected positions, to know them when they come back; without a memory one."""
-
-    def __init__(self, memory: Memory | None = None) -> None:
-        self._memory = memory
-        self._names: tuple[str, ...] = ()
-        self._shape: tuple[int, ...] = ()
-        self._positions = np.zeros((1, 0))
-        self._within = np.full(1, -1.0) if memory is None else memory.within
-        self._kept = np.zeros(1, dtype=np.int64)
-        if memory is not None:
-            self._kept = memory.counts[of.ECHOED : of.ECHOED + 1]
-
-    def remember(self, names: tuple[str, ...], taught: Array, corrected: Array) -> None:
-        """Keep ``corrected`` for a while; one that equals ``taught`` is no echo."""
-        if names != self._names or corrected.shape != self._shape:
-            self._names, self._shape = names, corrected.shape
-            self._positions = np.zeros((1, corrected.size))
-            if self._memory is not None:
-                room = self._memory.echoes.reshape(-1)[: of.ECHOES * corrected.size]
-                self._positions = room.reshape(of.ECHOES, -1)
-            self._within[:] = -1.0
-        flat = plain(taught.reshape(-1)), plain(corrected.reshape(-1))
-        of.remember_echo(self._positions, self._within, int(self._kept[0]), *flat)
-        self._kept += 1
-
-    def holds(self, names: tuple[str, ...], position: Array) -> bool:
-        """Whether a position is one of them, up to rounding."""
-        if names != self._names or position.shape != self._shape:
-            return False
-        return of.is_echo(self._positions, self._within, plain(position.reshape(-1)))
 
 
 def require_finite(names: tuple[str, ...], values: Array | None) -> None:

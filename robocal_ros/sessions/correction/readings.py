@@ -57,13 +57,16 @@ class Readings:
         stage = None if self._shadow else self._corrector.commanded(now_s)
         if stage is None:
             return measured, state.position, state.velocity
-        taught = stage.uncorrect(measured[None], np.ones(1))
         position, velocity = state.position.copy(), state.velocity
-        position[place] = taught[0, index]
-        if velocity is not None and len(place):
+        if velocity is None or not len(place):
+            taught = stage.uncorrect(measured[None], np.ones(1))
+        else:
             velocity = velocity.copy()
-            speed = self._joints.spread(velocity[None, place], index)
-            velocity[place] = stage.taught_velocity(taught, measured[None], speed)[0, index]
+            taught, speed = stage.taught(
+                measured[None], self._joints.spread(velocity[None, place], index)
+            )
+            velocity[place] = speed[0, index]
+        position[place] = taught[0, index]
         return taught[0], position, velocity
 
     def offset(self, now_s: float) -> Array:
