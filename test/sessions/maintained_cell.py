@@ -52,7 +52,7 @@ class MaintainedCell(Robot):
     def __init__(self, history: Any, tool: np.ndarray = TAUGHT, **changes: Any) -> None:
         super().__init__(history, tool)
         self.history = history
-        self.arm = self.true = self.cell.arm
+        self.arm = self.cell.arm
         self.motion, self.q = JointMotion(HOME), HOME.copy()
         driving = DrivingConfig(HOUSING, 0.1, 0.008, 0.05)
         settings: dict[str, Any] = {
