@@ -6,15 +6,18 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from shift import warmed
 from tool_driver import TAUGHT, noisy_cell
 from tool_driver import config_of as tool_config
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.motion.housing import Housing
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
 from robocal_ros.sessions.maintenance import requests as ask
@@ -134,6 +137,7 @@ class Cell:
         self.due: list[tuple[float, int, Answer]] = []
         self.tool = ToolNode()
         self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
+        self.beats_every_s = BEAT_S
         self.silent, self.offset = False, np.zeros(ARM.n)
         self.log: list[ask.Request] = []
         self.events: list[tuple[str, Any]] = []
@@ -214,7 +218,7 @@ class Cell:
             self._carry_out(request)
 
     def _beat(self) -> None:
-        if self.beating and self.now_s >= self.beat_s + BEAT_S:
+        if self.beating and self.now_s >= self.beat_s + self.beats_every_s:
             self.beat_s, self.heard = self.now_s, self.is_open
             self.session.gap(self.is_open, self.now_s)
         if self.drift is not None:
@@ -339,6 +343,21 @@ def kinds(cell: Cell) -> list[str]:
     return [type(request).__name__ for request in cell.log]
 
 
+def _kept(history: Any, kind: str, model: dict[str, Any]) -> int:
+    return history.propose(
+        Proposal(
+            kind=kind, model_hash=ARM.model_hash, based_on=history.head(kind).revision,
+            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT,
+            reason="", document={}, model=model,
+        )
+    )  # fmt: skip
+
+
+def thermal_proposed(history: Any, kelvin: float) -> int:
+    """A thermal candidate: a robot with grown links."""
+    return _kept(history, THERMAL, model_document(warmed(ARM, kelvin)))
+
+
 def proposed(
     history: Any,
     shift_m: Sequence[float] = (1e-3, 0.0, 0.0),
@@ -346,22 +365,13 @@ def proposed(
     **made_otherwise: Any,
 ) -> int:
     """A tool candidate beside the taught one, as the tool node keeps it."""
-    tool = TAUGHT.copy()
-    tool[:3, 3] += shift_m
+    tool = KnownTool(TAUGHT.copy())
+    tool.T_flange_tool[:3, 3] += shift_m
     if thermal_revision is None:
         thermal_revision = history.head(THERMAL).revision
-    return history.propose(
-        Proposal(
-            kind=TOOL, model_hash=ARM.model_hash, based_on=history.head(TOOL).revision,
-            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT,
-            reason="", document={},
-            model={
-                "T_flange_tool": tool.tolist(), "covariance": None,
-                "thermal_revision": thermal_revision,
-                "made_with": made_with(tool_config(CELL, **made_otherwise)),
-            },
-        )
-    )  # fmt: skip
+    made = made_with(tool_config(CELL, **made_otherwise))
+    model = {"thermal_revision": thermal_revision, "made_with": made}
+    return _kept(history, TOOL, tool.document() | model)
 
 
 def new_tool(number: int) -> Answer:

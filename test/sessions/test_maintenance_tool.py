@@ -7,7 +7,6 @@ import maintenance_cell
 import numpy as np
 import pytest
 from maintenance_cell import (
-    ARM,
     CELL,
     KNOWN,
     LONG_S,
@@ -21,14 +20,13 @@ from maintenance_cell import (
     opened,
     passed,
     proposed,
+    thermal_proposed,
 )
-from shift import warmed
 from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import StaleError, StorageError
-from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
+from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.events import ACCEPT, ROLLBACK
 from robocal_ros.sessions.maintenance import AcceptBounds, State
@@ -214,14 +212,8 @@ def test_a_tool_with_a_known_drift_is_accepted(history, poses):
 
 
 def thermal_candidate(cell: Cell) -> int:
-    """What the thermal node answers from now on: a robot with grown links."""
-    number = cell.history.propose(
-        Proposal(
-            kind=THERMAL, model_hash=ARM.model_hash, based_on=0, cycle_id="", stamp_ns=0,
-            created_ns=0, software="", method="", code=Code.ACCEPT, reason="", document={},
-            model=model_document(warmed(ARM, 10.0)),
-        )
-    )  # fmt: skip
+    """What the thermal node answers from now on."""
+    number = thermal_proposed(cell.history, 10.0)
     cell.thermal = Answer(Code.ACCEPT, "warm", number)
     return number
 
