@@ -68,7 +68,7 @@ class MaintenanceDriver:
     def _call(self, client: Any, request: Any, number: int, read: Callable[[Any], Answer]) -> None:
         if not client.service_is_ready():
             words = f"{client.srv_name} is not there: start its node"
-            self._answered(number, Answer(Code.CONFLICT, words))
+            self._answered(number, Answer(Code.CONFLICT, words, absent=True))
             return
         client.call_async(request).add_done_callback(
             lambda future: self._answered(number, read(future.result()))

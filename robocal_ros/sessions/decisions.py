@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.proposals import BEFORE_ANY, THERMAL, TOOL
+from robocal_ros.core.errors import InputError, RobocalError, StaleError
+from robocal_ros.core.proposals import BEFORE_ANY, THERMAL, TOOL, Entry
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
@@ -39,6 +39,7 @@ def decide(
             history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
             return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
         if command.name == events.ACCEPT:
+            require_thermal(history, history.get(chosen))
             head = history.accept(
                 chosen, by=by, reason=why, expected_head=expected, wall_ns=wall_ns
             )
@@ -57,6 +58,25 @@ def decide(
     what = f"calibration {chosen}" if chosen else BEFORE_ANY.get(kind, "nothing")
     message = f"revision {head.revision}: {what} in force"
     return Outcome(command, Code.ACCEPT, message, None, chosen)
+
+
+def require_thermal(history: History, entry: Entry) -> None:
+    """Refuse a tool whose flange poses came from another thermal model than the one in force.
+
+    What the drift did to the flange would stay in it, and be corrected a second time.
+
+    Raises
+    ------
+    StaleError
+    """
+    if entry.kind != TOOL:
+        return
+    measured = history.model(entry.id)["thermal_revision"]
+    if measured != (revision := history.head(THERMAL).revision):
+        raise StaleError(
+            f"tool {entry.id} was measured with thermal revision {measured}, in force is "
+            f"{revision}: measure it again"
+        )
 
 
 def named(history: History, command: Command, kind: str) -> Command:

@@ -21,11 +21,14 @@ HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.05
 
 
 class Robot:
-    """Follows plans with a lag; its beams see the true tool."""
+    """Follows plans with a lag; its beams see the true tool on the true robot.
+
+    ``true`` is the arm as it is; one that drifts is another one than the nodes know.
+    """
 
     def __init__(self, history, tool=TRUTH, **changes):
         self.cell = noisy_cell()
-        arm = self.cell.arm
+        arm = self.true = self.cell.arm
         self.session = ToolSession(arm, history, config_of(self.cell), "test")
         config = DrivingConfig(HOUSING, 0.1, 0.008, 0.05, **changes)
         self.driver = ToolDriver(self.session, config, self.send, self.ask)
@@ -51,9 +54,9 @@ class Robot:
 
     def receive(self, at_s: float, plan: JointPlan) -> None:
         self.motion.follow(at_s, plan.time_s + at_s, plan.q, plan.qd)
-        fk, end_s = self.cell.arm.fk, at_s + plan.duration_s
+        motion, end_s = self.motion, at_s + plan.duration_s
         moved = self.cell.station.edges(
-            self.tool, lambda t: fk(self.motion.at(t)[0]), (at_s, end_s), self.rng
+            self.tool, lambda t: self.true.fk(motion.joints(t)), (at_s, end_s), self.rng
         )
         self.edges = [
             EdgeSample(self.ns(e.time_s), "", e.beam, e.blocked, e.sigma_s) for e in moved
@@ -85,7 +88,7 @@ class Robot:
         self.now_s += PERIOD_S
         while self.coming and self.coming[0][0] <= self.now_s:
             self.receive(*self.coming.pop(0))
-        self.q = self.motion.at([self.now_s])[0][0]
+        self.q = self.motion.joints(np.array([self.now_s]))[0]
         self.path.append(self.q.copy())
         while self.edges and self.edges[0].stamp_ns <= self.ns(self.now_s):
             self.driver.beam(self.edges[0].blocked)

@@ -43,16 +43,24 @@ OFFSETS_DEG = [
 ]
 POSES = HOME + np.radians(OFFSETS_DEG)
 SENSE_S = 0.1
+TELLS_S = 1.0  # the thermal node says so often how accurate the robot is
 TOLERANCE_M = 7e-4  # after one cycle the drift is not known better
 
 
 class MaintainedCell(Robot):
-    """Everything around one maintenance session."""
+    """Everything around one maintenance session.
 
-    def __init__(self, history: Any, tool: np.ndarray = TAUGHT, **changes: Any) -> None:
+    One robot drifts for the sphere and for the beams; ``from_s``: a cell that goes on where another
+    one on the same history ended.
+    """
+
+    def __init__(
+        self, history: Any, tool: np.ndarray = TAUGHT, *, from_s: float = 0.0, **changes: Any
+    ) -> None:
         super().__init__(history, tool)
+        self.now_s = from_s
         self.history = history
-        self.arm = self.true = self.cell.arm
+        self.arm = self.cell.arm
         self.motion, self.q = JointMotion(HOME), HOME.copy()
         driving = DrivingConfig(HOUSING, 0.1, 0.008, 0.05)
         settings: dict[str, Any] = {
@@ -71,6 +79,7 @@ class MaintainedCell(Robot):
         self.pending: list[int] = []  # requests that the thermal session carries out
         self.measuring = 0
         self.is_open, self.beat_s, self.sensed_s = True, -np.inf, -np.inf
+        self.told_s = -np.inf
         self.steps, self.rests_s = 0, 0.0
         self.sphere = np.random.default_rng(4)
         self.sensor_off_m = np.zeros(3)
@@ -90,6 +99,8 @@ class MaintainedCell(Robot):
         if self.now_s >= self.beat_s + BEAT_S:
             self.beat_s = self.now_s
             self.maintenance.gap(self.is_open, self.now_s)
+        if self.maintenance.running and self.now_s >= self.told_s + TELLS_S:
+            self._tell_drift()
         if self.rests_s > 0.4 and self.now_s >= self.sensed_s + SENSE_S:
             self._sense()
         for outcome in self.thermal.advance(wall_ns=self.wall_ns):
@@ -202,9 +213,13 @@ class MaintainedCell(Robot):
         assert not self.driver.armed
         return self.maintenance.result(cycle_id)
 
-    def accuracy(self) -> Any:
-        """What the line reads."""
+    def _tell_drift(self) -> None:
+        self.told_s = self.now_s
         found = self.thermal.accuracy(self.ns(self.now_s))
         drift = Drift(found.level, found.reason, found.error, found.due_in_s)
         self.maintenance.drift(drift, self.now_s)
+
+    def accuracy(self) -> Any:
+        """What the line reads."""
+        self._tell_drift()
         return self.maintenance.accuracy(self.now_s, self.wall_ns)

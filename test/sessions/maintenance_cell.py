@@ -1,21 +1,30 @@
 """A simulated robot with a thermal and a tool node that may fail in any way, under one session."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from shift import warmed
 from tool_driver import TAUGHT, noisy_cell
+from tool_driver import config_of as tool_config
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.motion.housing import Housing
 from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
 from robocal_ros.sessions.maintenance import requests as ask
+from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import STATION, Ways
+from robocal_ros.sessions.tool_config import made_with
 from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.tool_cell import joints_at
 
@@ -24,7 +33,9 @@ LAG_S = 0.02  # of the controller
 BEAT_S = 0.2
 STALE_S = 0.5
 WALL_NS = 1_700_000_000_000_000_000
+LONG_S = 120.0  # a gap in which all fits
 OK, REFUSED, SILENT, SLOW = "ok", "refused", "silent", "slow"
+KNOWN = Drift(AccuracyLevel.OK, "95 % below", ToolError(1e-5, 2e-5), 600.0)
 
 CELL = noisy_cell()
 ARM = CELL.arm
@@ -100,6 +111,7 @@ class NeverError(Exception):
 class ToolNode:
     """Moves the robot by itself, once armed."""
 
+    there: bool = True
     armed: bool = False
     measuring: int = 0  # number of the request
     until_s: float = 0.0
@@ -115,7 +127,8 @@ class Cell:
     services: dict[str, str] = field(default_factory=dict)
     thermal: Answer = field(default_factory=lambda: Answer(Code.NO_SIGNIFICANT_GAIN, "warm"))
     check: Answer = field(default_factory=lambda: passed())
-    full: Answer = field(default_factory=lambda: same_tool())
+    full: Callable[["Cell"], Answer] = field(default=lambda cell: same_tool())
+    drift: Drift | None = None  # told by the thermal node
 
     def __post_init__(self) -> None:
         self.now_s = 10.0
@@ -124,6 +137,7 @@ class Cell:
         self.due: list[tuple[float, int, Answer]] = []
         self.tool = ToolNode()
         self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
+        self.beats_every_s = BEAT_S
         self.silent, self.offset = False, np.zeros(ARM.n)
         self.log: list[ask.Request] = []
         self.events: list[tuple[str, Any]] = []
@@ -188,7 +202,7 @@ class Cell:
         while self.coming and self.coming[0][0] <= self.now_s:
             at_s, plan = self.coming.pop(0)
             self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
-        q = self.motion.at([self.now_s])[0][0]
+        q = self.motion.joints(np.array([self.now_s]))[0]
         if np.max(np.abs(q - self.q)) > 1e-7:
             self.moved_s = self.now_s
         self.q = q
@@ -204,9 +218,11 @@ class Cell:
             self._carry_out(request)
 
     def _beat(self) -> None:
-        if self.beating and self.now_s >= self.beat_s + BEAT_S:
+        if self.beating and self.now_s >= self.beat_s + self.beats_every_s:
             self.beat_s, self.heard = self.now_s, self.is_open
             self.session.gap(self.is_open, self.now_s)
+        if self.drift is not None:
+            self.session.drift(self.drift, self.now_s)
 
     # ---- the nodes ------------------------------------------------------------------------------
 
@@ -220,6 +236,9 @@ class Cell:
         match request:
             case ask.Move() | ask.Stop():
                 self.coming.append((self.now_s + LAG_S, request.plan))
+            case ask.Arm() | ask.Disarm() if not self.tool.there:
+                gone = Answer(Code.CONFLICT, "not there: start its node", absent=True)
+                self.session.answered(request.number, gone)
             case ask.BeginCycle() | ask.EndCycle():
                 self._answer("thermal", request.number, self.thermal)
                 if isinstance(request, ask.BeginCycle):
@@ -260,9 +279,13 @@ class Cell:
         if np.max(np.abs(self.q - HOME)) < 0.01:
             self.motion.follow(self.now_s, DOWN.time_s + self.now_s, DOWN.q, DOWN.qd)
 
+    def tool_dies(self) -> None:
+        """Its process ends; what it sent to the controller is driven to its end."""
+        self.tool = ToolNode(there=False)
+
     def _tool_goes_on(self) -> None:
         if self.tool.measuring and self.now_s >= self.tool.until_s:
-            found = self.check if self.mode == "quick" else self.full
+            found = self.check if self.mode == "quick" else self.full(self)
             self.due.append((self.now_s, self.tool.measuring, found))
             self.tool.measuring, self.tool.armed = 0, False
 
@@ -305,6 +328,55 @@ class Cell:
 
     def at_home(self) -> bool:
         return bool(np.max(np.abs(self.q - HOME)) <= self.config.home_near)
+
+
+def opened(history: Any, **changes: Any) -> Cell:
+    """A cell in an open gap, after what every start does."""
+    cell = Cell(history, **changes)
+    cell.open_gap()
+    assert kinds(cell) == ["Disarm"]  # whatever the node before it left
+    cell.log.clear()
+    return cell
+
+
+def kinds(cell: Cell) -> list[str]:
+    return [type(request).__name__ for request in cell.log]
+
+
+def _kept(history: Any, kind: str, model: dict[str, Any]) -> int:
+    return history.propose(
+        Proposal(
+            kind=kind, model_hash=ARM.model_hash, based_on=history.head(kind).revision,
+            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT,
+            reason="", document={}, model=model,
+        )
+    )  # fmt: skip
+
+
+def thermal_proposed(history: Any, kelvin: float) -> int:
+    """A thermal candidate: a robot with grown links."""
+    return _kept(history, THERMAL, model_document(warmed(ARM, kelvin)))
+
+
+def proposed(
+    history: Any,
+    shift_m: Sequence[float] = (1e-3, 0.0, 0.0),
+    thermal_revision: int | None = None,
+    **made_otherwise: Any,
+) -> int:
+    """A tool candidate beside the taught one, as the tool node keeps it."""
+    tool = KnownTool(TAUGHT.copy())
+    tool.T_flange_tool[:3, 3] += shift_m
+    if thermal_revision is None:
+        thermal_revision = history.head(THERMAL).revision
+    made = made_with(tool_config(CELL, **made_otherwise))
+    model = {"thermal_revision": thermal_revision, "made_with": made}
+    return _kept(history, TOOL, tool.document() | model)
+
+
+def new_tool(number: int) -> Answer:
+    """The answer of a full measurement that led to a candidate."""
+    return Answer(Code.ACCEPT, "a new tool", number, (), True, "", 1.0, 0.03)
 
 
 def passed() -> Answer:

@@ -1,10 +1,13 @@
 """The maintenance of a cell in closed loop, in one process: real sessions, simulated cell."""
 
-from dataclasses import replace
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from maintained_cell import MaintainedCell
+from maintained_cell import POSES, MaintainedCell
 from tool_driver import TAUGHT, TRUTH
 
 from robocal_ros.core.codes import Code
@@ -12,26 +15,76 @@ from robocal_ros.core.errors import ConflictError, InputError, RobocalError, Sta
 from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK
+from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 GAP_S = 240.0
-KELVIN = 10.0
+KELVIN, HOT_KELVIN = 10.0, 40.0
+BEYOND = 16.3  # chi-square of 3 unknowns, one in a thousand
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A state folder, and how far the cell had come; each test goes on with a copy of its own."""
+
+    folder: Path
+    now_s: float
+    result: Any = None
+
+    def opened(self, folder: Path) -> CalibrationHistory:
+        shutil.copytree(self.folder, folder, dirs_exist_ok=True)
+        return CalibrationHistory.open("K1", state_dir=folder)
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory) -> Kept:
+    """A cell whose cold reference is captured."""
+    folder = tmp_path_factory.mktemp("captured")
+    with CalibrationHistory.open("K1", state_dir=folder) as opened:
+        cell = MaintainedCell(opened)
+        cell.capture_reference()
+    return Kept(folder, cell.now_s)
 
 
 @pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
+def history(captured, tmp_path):
+    with captured.opened(tmp_path) as opened:
         yield opened
 
 
-def maintained(history, tool=TRUTH, **bounds) -> MaintainedCell:
-    """A cell whose cold reference is captured, after three hours of work."""
-    cell = MaintainedCell(history, tool, bounds=AcceptBounds(**bounds))
-    cell.capture_reference()
-    cell.production(3.0, KELVIN)
-    return cell
+@pytest.fixture
+def warm(history, captured):
+    """Makes the cell with a bent tool after three hours of work; takes bounds."""
+
+    def made(kelvin: float = KELVIN, poses: np.ndarray = POSES, **bounds: Any) -> MaintainedCell:
+        config = {"poses": poses, "bounds": AcceptBounds(**bounds)}
+        cell = MaintainedCell(history, TRUTH, from_s=captured.now_s, **config)
+        cell.production(3.0, kelvin)
+        return cell
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def measured(captured, tmp_path_factory) -> Kept:
+    """After a cycle of a warm robot with a bent tool: both candidates wait."""
+    folder = tmp_path_factory.mktemp("measured")
+    with captured.opened(folder) as opened:
+        cell = MaintainedCell(opened, TRUTH, from_s=captured.now_s)
+        cell.production(3.0, KELVIN)
+        result = cell.maintain("c1", GAP_S)
+        assert cell.accuracy().level is AccuracyLevel.DEGRADED
+    return Kept(folder, cell.now_s, result)
+
+
+@pytest.fixture
+def waiting(measured, tmp_path):
+    """The cell in which both candidates wait, and the cycle that brought them."""
+    with measured.opened(tmp_path / "waiting") as opened:
+        cell = MaintainedCell(opened, TRUTH, from_s=measured.now_s)
+        cell.production(0.1, KELVIN)
+        yield cell, measured.result
 
 
 def true_error_m(cell: MaintainedCell) -> np.ndarray:
@@ -43,8 +96,8 @@ def true_error_m(cell: MaintainedCell) -> np.ndarray:
     return np.linalg.norm((believed - true)[:, :3], axis=1)
 
 
-def test_one_call_makes_a_warm_robot_with_a_bent_tool_accurate(history):
-    cell = maintained(history, automatic=True, tool_m=0.01, tool_rad=0.1)
+def test_one_call_makes_a_warm_robot_with_a_bent_tool_accurate(warm):
+    cell = warm(automatic=True, tool_m=0.01, tool_rad=0.1)
     before = true_error_m(cell)
     result = cell.maintain("c1", GAP_S)
     assert result.complete, result.message
@@ -58,20 +111,18 @@ def test_one_call_makes_a_warm_robot_with_a_bent_tool_accurate(history):
     assert np.all(after < said.error.bound_m), (after, said.error)
 
 
-def test_without_leave_everything_is_proposed_and_nothing_changed(history):
-    cell = maintained(history)
-    result = cell.maintain("c1", GAP_S)
+def test_without_leave_everything_is_proposed_and_nothing_changed(waiting):
+    cell, result = waiting
+    history = cell.history
     assert "auto_accept is off" in result.message
     assert (history.head(THERMAL).revision, history.head(TOOL).revision) == (0, 0)
-    assert cell.accuracy().level is AccuracyLevel.DEGRADED
     status = cell.maintenance.status(cell.now_s)
     assert (status.thermal_pending, status.tool_pending) == (result.thermal_id, result.tool_id)
     assert result.thermal_id > 0
     assert result.tool_id > 0
-    count = len(cell.sent)
     again = cell.maintain("c2", GAP_S)  # the tool waits for a person: it is not measured again
     assert f"tool candidate {result.tool_id} waits" in again.message
-    assert len(cell.sent) - count == len(cell.maintenance.config.poses) + 1
+    assert len(cell.sent) == len(cell.maintenance.config.poses) + 1
     decide = cell.maintenance.decide
     for _ in range(2):
         assert decide(ACCEPT, result.tool_id, "plc", "", cell.wall_ns).done
@@ -82,9 +133,9 @@ def test_without_leave_everything_is_proposed_and_nothing_changed(history):
     ("bounds", "words"),
     [({"tool_m": 3.9e-3}, "mm from where"), ({"thermal_m": 5e-5, "tool_m": 0.01}, "commissioning")],
 )
-def test_what_is_beyond_the_bounds_waits(history, bounds, words):
+def test_what_is_beyond_the_bounds_waits(warm, bounds, words):
     """The true tool is 4.1 mm and 3.7 deg away, the true drift some hundredths of a millimetre."""
-    cell = maintained(history, automatic=True, **({"tool_rad": 0.1} | bounds))
+    cell = warm(automatic=True, **({"tool_rad": 0.1} | bounds))
     result = cell.maintain("c1", GAP_S)
     if "thermal_m" in bounds:
         assert "at commissioning (allowed without a person 0.05 mm)" in result.message
@@ -95,9 +146,9 @@ def test_what_is_beyond_the_bounds_waits(history, bounds, words):
         assert result.accepted == (result.thermal_id,)
 
 
-def test_a_tool_that_is_measured_after_something_moved_waits(history):
+def test_a_tool_that_is_measured_after_something_moved_waits(warm):
     """A robot that was pushed shows its beams a bent tool."""
-    cell = maintained(history, automatic=True, tool_m=0.01, tool_rad=0.1)
+    cell = warm(automatic=True, tool_m=0.01, tool_rad=0.1)
     cell.sensor_off_m = np.array([5e-3, 0.0, -4e-3])
     result = cell.maintain("c1", GAP_S)
     assert result.thermal_code is Code.SENSOR_OR_ROBOT_MOVED
@@ -127,21 +178,58 @@ def test_small_steps_do_not_creep_past_the_bounds(history):
     assert np.linalg.norm(tip - TAUGHT[:3, 3]) <= 2e-3
 
 
-def test_a_candidate_of_an_older_revision_is_stale(history):
-    cell = maintained(history)
-    first = cell.maintain("c1", GAP_S)
+def test_a_candidate_of_an_older_revision_is_stale(waiting):
+    cell, first = waiting
     cell.production(1.0, KELVIN + 2.0)
     second = cell.maintain("c2", GAP_S)
     decide, wall_ns = cell.maintenance.decide, cell.wall_ns
     assert decide(ACCEPT, second.thermal_id, "plc", "", wall_ns).revision == 1
     with pytest.raises(StaleError, match="solved against revision 0, in force is 1"):
         decide(ACCEPT, first.thermal_id, "plc", "", wall_ns)
-    assert history.head(THERMAL).calibration_id == second.thermal_id
+    assert cell.history.head(THERMAL).calibration_id == second.thermal_id
 
 
-def test_decisions_are_the_same_when_they_come_twice(history):
-    cell = maintained(history)
-    result = cell.maintain("c1", GAP_S)
+def test_a_tool_that_was_measured_with_another_thermal_model_is_stale(waiting):
+    """The drift is in it, and would be corrected a second time."""
+    cell, result = waiting
+    decide, wall_ns = cell.maintenance.decide, cell.wall_ns
+    assert decide(ACCEPT, result.thermal_id, "plc", "", wall_ns).done
+    with pytest.raises(StaleError, match="measured with thermal revision 0, in force is 1"):
+        decide(ACCEPT, result.tool_id, "plc", "", wall_ns)
+    cell.ask(Command(ACCEPT, {"id": result.tool_id, "by": "me"}))  # as `tcf_node` is asked
+    assert cell.outcomes[-1].status is Code.STALE
+    assert cell.history.head(TOOL).revision == 0
+    assert cell.maintenance.status(cell.now_s).tool_pending == 0
+
+
+def tool_off_m(history, tool_id: int) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) of the measured tip from the true one, and (3, 3) covariance of the measurement."""
+    found = KnownTool.of_document(history.model(tool_id))
+    return found.T_flange_tool[:3, 3] - TRUTH[:3, 3], found.covariance[:3, :3]
+
+
+def test_a_tool_is_measured_with_the_drift_that_was_just_found(warm, history):
+    """The same hot robot carries the tool through the beams; the cold model puts its drift there.
+
+    Of the fresh model the held-out measurements tell how well it is known.
+    """
+    bounds = {"automatic": True, "tool_m": 0.01, "tool_rad": 0.1}
+    result = warm(HOT_KELVIN, **bounds).maintain("c1", GAP_S)
+    assert result.accepted == (result.thermal_id, result.tool_id), result.message
+    assert history.model(result.tool_id)["thermal_revision"] == 1
+    held_out_m = history.get(result.thermal_id).candidate_rms_mm * 1e-3
+    off_m, covariance = tool_off_m(history, result.tool_id)
+    noise = covariance + held_out_m**2 / 3.0 * np.eye(3)
+    assert off_m @ np.linalg.solve(noise, off_m) < BEYOND
+    for kind in (TOOL, THERMAL):
+        history.rollback(0, kind=kind, by="test", reason="", wall_ns=0)
+    cold = warm(HOT_KELVIN, poses=POSES[:0]).maintain("c2", GAP_S)
+    off_m, _ = tool_off_m(history, cold.tool_id)
+    assert off_m @ np.linalg.solve(noise, off_m) > 2.0 * BEYOND
+
+
+def test_decisions_are_the_same_when_they_come_twice(waiting):
+    cell, result = waiting
     session, wall_ns = cell.maintenance, cell.wall_ns
     with pytest.raises(ConflictError, match="one candidate must wait"):
         session.decide_only(ACCEPT, "plc", wall_ns)  # one of each kind

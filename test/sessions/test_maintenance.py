@@ -8,6 +8,7 @@ from maintenance_cell import (
     ARM,
     CELL,
     HOME,
+    LONG_S,
     POSES,
     REFUSED,
     SILENT,
@@ -15,8 +16,11 @@ from maintenance_cell import (
     STALE_S,
     TIMES,
     Cell,
+    ToolNode,
     bent,
     config_of,
+    kinds,
+    opened,
 )
 
 from robocal_ros.core.codes import Code
@@ -27,29 +31,13 @@ from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sim.joint_motion import JointMotion
-from robocal_ros.storage.calibrations import CalibrationHistory
 
-LONG_S = 120.0
 SMALL = ToolError(1e-4, 1.5e-4)
 
 
 @pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
-
-
-@pytest.fixture
 def cell(history) -> Cell:
-    made = Cell(history)
-    made.open_gap()
-    assert kinds(made) == ["Disarm"]  # whatever the node before it left
-    made.log.clear()
-    return made
-
-
-def kinds(cell: Cell) -> list[str]:
-    return [type(request).__name__ for request in cell.log]
+    return opened(history)
 
 
 def over(cell: Cell, *, fault: bool = False) -> None:
@@ -219,6 +207,105 @@ def test_a_tool_node_that_never_confirms_is_a_fault(cell):
     cell.pass_time(1.0)
     cell.session.acknowledge("me")
     assert cell.state is State.IDLE
+
+
+GONE_S = 6.0  # the tool node is looked for as long
+
+
+def test_a_tool_node_that_was_never_started_keeps_nothing_but_its_part(history):
+    cell = Cell(history)
+    cell.tool_dies()
+    cell.open_gap()
+    with pytest.raises(ConflictError, match="not there: start it"):  # it may yet be found
+        cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns)
+    cell.pass_time(GONE_S)
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.code, result.thermal_code) == (Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
+    assert (result.tool_code, result.left) == (Code.CONFLICT, ("tool measurement (quick)",))
+    assert "tool: the tool node is not there: start it" in result.message
+    assert not {"Arm", "Measure"} & set(kinds(cell))
+    over(cell)
+    cell.tool = ToolNode()
+    cell.run("c2", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    over(cell)
+
+
+def test_a_tool_node_that_died_at_home_is_a_fault_that_can_be_acknowledged(cell):
+    cell.run("c1", LONG_S)
+    cell.finish()
+    cell.tool_dies()
+    count = kinds(cell).count("Move")
+    cell.run("c2", LONG_S)
+    assert "not there: start it" in cell.finish().message
+    assert kinds(cell).count("Move") == count
+    with pytest.raises(ConflictError, match=r"not confirmed .* not there"):
+        cell.session.acknowledge("me")
+    cell.pass_time(GONE_S)
+    cell.session.acknowledge("me")
+    assert cell.state is State.IDLE
+
+
+def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
+    """Nobody but itself can tell that nothing is under way."""
+    until_moving(cell, "tool")
+    cell.tool_dies()
+    cell.is_open = False
+    over(cell, fault=True)
+    cell.motion = JointMotion(HOME)  # brought home by hand
+    cell.pass_time(2.0 * GONE_S)
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
+    cell.tool = ToolNode()
+    cell.pass_time(1.0)
+    cell.session.acknowledge("me")
+    assert cell.state is State.IDLE
+
+
+def test_a_tool_node_is_let_go_only_while_the_robot_stands_at_home(history):
+    cell = Cell(history)
+    cell.tool_dies()
+    cell.motion = JointMotion(POSES[0])
+    cell.pass_time(2.0 * GONE_S)
+    assert not cell.session.status(cell.now_s).disarmed
+    cell.motion = JointMotion(HOME)
+    cell.pass_time(1.0)
+    assert cell.session.status(cell.now_s).disarmed
+
+
+def test_a_tool_node_that_hangs_is_not_let_go(history):
+    """It is there, or was found meanwhile, and may be armed by an operator."""
+    cell = Cell(history)
+    cell.tool_dies()
+    cell.pass_time(0.5 * GONE_S)
+    cell.tool, cell.services["disarm"] = ToolNode(armed=True), SILENT
+    cell.pass_time(2.0 * GONE_S)
+    assert not cell.session.status(cell.now_s).disarmed
+    cell.tool_dies()
+    cell.pass_time(0.5 * GONE_S)  # absent anew: not for long
+    assert not cell.session.status(cell.now_s).disarmed
+    cell.pass_time(GONE_S)
+    assert cell.session.status(cell.now_s).disarmed
+
+
+@pytest.mark.parametrize("how", ["closed", "cancelled"])
+def test_a_deaf_tool_node_is_stopped_by_what_armed_it(cell, how):
+    """It hangs, and the robot moves on by the plan that the controller has."""
+    until_moving(cell, "tool")
+    cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    assert cell.moved_s == cell.now_s
+    since_s = cell.now_s
+    if how == "closed":
+        cell.is_open = False
+    else:
+        cell.session.cancel("by the PLC")
+    cell.pass_time(3.0)
+    assert cell.moved_s <= since_s + 0.2 + SHORTEST_STOP_S + 0.1
+    assert cell.state is State.FAULT
+    assert "Stop" in kinds(cell)
+    with pytest.raises(ConflictError, match="not confirmed"):
+        cell.session.acknowledge("me")
 
 
 @pytest.mark.parametrize("service", ["thermal", "arm", "measure", "sensor"])

@@ -1,43 +1,53 @@
 """What is known of the tool: when it was checked, which one, and what may be concluded."""
 
+from dataclasses import replace
+from typing import Any
+
 import maintenance_cell
+import numpy as np
 import pytest
-from maintenance_cell import ARM, POSES, REFUSED, SILENT, Cell, bent, config_of, passed
+from maintenance_cell import (
+    CELL,
+    KNOWN,
+    LONG_S,
+    POSES,
+    REFUSED,
+    SILENT,
+    Cell,
+    bent,
+    config_of,
+    new_tool,
+    opened,
+    passed,
+    proposed,
+    thermal_proposed,
+)
 from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import StorageError
-from robocal_ros.core.proposals import TOOL, Proposal
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.core.errors import StaleError, StorageError
+from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.events import ACCEPT, ROLLBACK
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.tool_config import rows_of
 from robocal_ros.storage.calibrations import CalibrationHistory
 
-LONG_S = 120.0
 TOO_SHORT_FOR_FULL_S = 33.0
 DAY_NS = 86_400 * 10**9
 
 
 @pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
-
-
-@pytest.fixture
 def cell(history) -> Cell:
-    made = Cell(history)
-    made.open_gap()
-    return made
+    return opened(history)
 
 
 def level(cell: Cell, later_ns: int = 0) -> AccuracyLevel:
     """With a drift of which all is known."""
-    cell.session.drift(Drift(AccuracyLevel.OK, "", ToolError(1e-5, 2e-5), 600.0), cell.now_s)
+    cell.session.drift(KNOWN, cell.now_s)
     return cell.session.accuracy(cell.now_s, cell.wall_ns + later_ns).level
 
 
@@ -59,23 +69,6 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
     assert level(cell) is AccuracyLevel.OK
 
 
-def proposed(cell: Cell) -> int:
-    """A tool candidate one millimetre from the taught one."""
-    tool = TAUGHT.copy()
-    tool[0, 3] += 1e-3
-    return cell.history.propose(
-        Proposal(
-            kind=TOOL, model_hash=ARM.model_hash, based_on=cell.history.head(TOOL).revision,
-            cycle_id="", stamp_ns=0, created_ns=0, software="", method="", code=Code.ACCEPT,
-            reason="", document={},
-            model={
-                "T_flange_tool": tool.tolist(), "covariance": None, "thermal_revision": 0,
-                "made_with": {"taught": TAUGHT.tolist()},
-            },
-        )
-    )  # fmt: skip
-
-
 def decide(cell: Cell, name: str, calibration_id: int) -> None:
     assert cell.session.decide(name, calibration_id, "a person", "", cell.wall_ns).done
 
@@ -89,7 +82,7 @@ def found_bent(cell: Cell) -> None:
 
 def test_a_bent_tool_stays_bent_when_another_one_comes_into_force(cell):
     """The tool of the model in force changed, the one on the robot did not."""
-    decide(cell, ACCEPT, proposed(cell))
+    decide(cell, ACCEPT, proposed(cell.history))
     found_bent(cell)
     assert cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns).done
     assert level(cell) is AccuracyLevel.DEGRADED
@@ -103,11 +96,54 @@ def test_a_bent_tool_stays_bent_when_another_one_comes_into_force(cell):
 
 @pytest.mark.parametrize("rolled_back", [False, True])
 def test_a_bent_tool_expires_as_any_other(cell, rolled_back):
-    decide(cell, ACCEPT, proposed(cell))
+    decide(cell, ACCEPT, proposed(cell.history))
     found_bent(cell)
     if rolled_back:
         cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
     assert level(cell, 30 * DAY_NS) is AccuracyLevel.EXPIRED
+
+
+def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
+    cell.check = bent()
+    number = measured_in_full(cell)
+    cell.finish()
+    assert level(cell) is AccuracyLevel.DEGRADED
+    decide(cell, ACCEPT, number)
+    assert level(cell) is AccuracyLevel.DUE
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert "measured and accepted; a check has not passed yet" in said.reason
+    assert said.error is None  # of a tool that no check has seen nothing is predicted
+    assert level(cell, 30 * DAY_NS) is AccuracyLevel.EXPIRED
+    cell.restart()
+    assert level(cell) is AccuracyLevel.DUE
+    cell.pass_time(0.3)
+    cell.check = passed()
+    cell.run("c2", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    assert level(cell) is AccuracyLevel.OK
+
+
+def test_another_tool_than_the_measured_one_stays_degraded(cell):
+    cell.check = bent()
+    number = measured_in_full(cell)
+    cell.finish()
+    decide(cell, ACCEPT, number)
+    decide(cell, ACCEPT, proposed(cell.history))
+    assert level(cell) is AccuracyLevel.DEGRADED
+    decide(cell, ROLLBACK, number)
+    assert level(cell) is AccuracyLevel.DUE
+    cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    assert level(cell) is AccuracyLevel.DEGRADED
+
+
+def test_a_measured_tool_whose_check_finds_it_bent_stays_degraded(cell):
+    cell.check = bent()
+    number = measured_in_full(cell)
+    cell.finish()
+    decide(cell, ACCEPT, number)
+    cell.run("c2", TOO_SHORT_FOR_FULL_S)
+    assert cell.finish().tool_answer == "recalibrate"
+    assert level(cell) is AccuracyLevel.DEGRADED
 
 
 def until_measuring(cell: Cell, mode: str) -> None:
@@ -118,7 +154,7 @@ def until_measuring(cell: Cell, mode: str) -> None:
 
 def test_a_pass_is_not_credited_to_another_tool(cell):
     """A person takes the tool back while it is checked."""
-    decide(cell, ACCEPT, proposed(cell))
+    decide(cell, ACCEPT, proposed(cell.history))
     until_measuring(cell, "quick")
     cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
     result = cell.finish()
@@ -132,7 +168,7 @@ def test_a_pass_is_not_credited_to_another_tool(cell):
 
 
 def test_a_full_measurement_of_another_tool_is_not_credited(cell):
-    decide(cell, ACCEPT, proposed(cell))
+    decide(cell, ACCEPT, proposed(cell.history))
     cell.check = bent()
     until_measuring(cell, "full")
     cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
@@ -142,16 +178,15 @@ def test_a_full_measurement_of_another_tool_is_not_credited(cell):
 
 def automatic(history, **changes) -> Cell:
     """A cell that may accept without a person, whose tool is found bent."""
-    cell = Cell(history, config_of(bounds=AcceptBounds(automatic=True), **changes), check=bent())
-    cell.open_gap()
-    return cell
+    config = config_of(bounds=AcceptBounds(automatic=True), **changes)
+    return opened(history, config=config, check=bent(), drift=KNOWN)
 
 
-def measured_in_full(cell: Cell) -> int:
+def measured_in_full(cell: Cell, **given: Any) -> int:
     """Until the full measurement is about to give a candidate."""
     until_measuring(cell, "full")
-    number = proposed(cell)
-    cell.full = Answer(Code.ACCEPT, "a new tool", number, (), True, "", 1.0, 0.03)
+    number = proposed(cell.history, **given)
+    cell.full = lambda cell: new_tool(number)
     return number
 
 
@@ -176,6 +211,97 @@ def test_a_tool_with_a_known_drift_is_accepted(history, poses):
     assert cell.finish().accepted == (number,)
 
 
+def thermal_candidate(cell: Cell) -> int:
+    """What the thermal node answers from now on."""
+    number = thermal_proposed(cell.history, 10.0)
+    cell.thermal = Answer(Code.ACCEPT, "warm", number)
+    return number
+
+
+UNSOUND = (AccuracyLevel.FAULT, None)  # None: silent
+
+
+@pytest.mark.parametrize("said", [AccuracyLevel.DEGRADED, AccuracyLevel.EXPIRED, *UNSOUND])
+def test_a_thermal_model_waits_while_the_drift_is_a_fault(history, said):
+    """What is EXPIRED is just what a measurement mends."""
+    cell = automatic(history)
+    cell.check = passed()
+    cell.drift = said and replace(KNOWN, level=said)
+    number = thermal_candidate(cell)
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert result.accepted == (() if said in UNSOUND else (number,)), result.message
+    assert (f"thermal candidate {number} waits" in result.message) == (said in UNSOUND)
+
+
+@pytest.mark.parametrize("said", [AccuracyLevel.EXPIRED, *UNSOUND])
+def test_a_tool_waits_while_the_drift_is_not_known(history, said):
+    cell = automatic(history)
+    cell.drift = said and replace(KNOWN, level=said)
+    number = measured_in_full(cell)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert ("silent" if said is None else said.name) in result.message
+    assert result.accepted == ()
+
+
+@pytest.mark.parametrize(
+    "bounds", [{"tool_m": np.nan}, {"tool_rad": np.nan}, {"tool_m": 0.9e-3}, {"thermal_m": np.nan}]
+)
+def test_a_bound_that_is_no_number_lets_nothing_pass(history, bounds):
+    cell = opened(
+        history,
+        config=config_of(bounds=AcceptBounds(automatic=True, **bounds)),
+        check=bent(),
+        drift=KNOWN,
+    )
+    thermal = thermal_candidate(cell)
+    number = measured_in_full(cell, thermal_revision=int("thermal_m" not in bounds))
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert result.accepted == (() if "thermal_m" in bounds else (thermal,))
+
+
+BESIDE = np.eye(4) + 1e-5 * np.eye(4, k=3)  # a hundredth of a millimetre
+
+
+@pytest.mark.parametrize(
+    ("other", "what"),
+    [
+        ({"taught": rows_of(BESIDE @ TAUGHT)}, "'taught' tool"),
+        ({"points_m": rows_of(CELL.laser.points + np.full(3, 1e-5))}, "'laser'"),
+    ],
+)
+def test_bounds_hold_only_against_what_both_nodes_were_given(history, other, what):
+    cell = automatic(history)
+    number = measured_in_full(cell, **other)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert f"another {what} than this node's: give both nodes the same" in result.message
+    assert result.accepted == ()
+
+
+def test_a_tool_of_another_thermal_revision_is_stale(cell):
+    cell.check = bent()
+    number = measured_in_full(cell, thermal_revision=3)
+    cell.finish()
+    with pytest.raises(StaleError, match="thermal revision 3, in force is 0: measure it again"):
+        cell.session.decide(ACCEPT, number, "a person", "", cell.wall_ns)
+    assert cell.session.status(cell.now_s).tool_pending == 0
+    cell.log.clear()
+    cell.run("c2", LONG_S)  # it waits for nobody
+    cell.finish()
+    assert modes(cell) == ["full"]
+
+
+def test_a_tool_of_another_thermal_revision_is_not_accepted_without_a_person(history):
+    cell = automatic(history)
+    number = measured_in_full(cell, thermal_revision=3)
+    result = cell.finish()
+    assert f"tool candidate {number} waits for a decision: tool {number} was" in result.message
+    assert result.accepted == ()
+
+
 def until_verified(cell: Cell) -> None:
     """Until the accepted tool is checked."""
     while not (cell.history.head(TOOL).revision and cell.tool.measuring):
@@ -187,15 +313,16 @@ def test_an_accepted_tool_that_fails_its_check_is_taken_back(history):
     measured_in_full(cell)
     result = cell.finish()
     assert "was taken back" in result.message
+    assert level(cell) is AccuracyLevel.DEGRADED
     assert (result.code, result.accepted) == (Code.ACCEPT, ())
     assert history.head(TOOL).calibration_id is None
 
 
 def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
     cell = automatic(history)
-    first = proposed(cell)
+    first = proposed(cell.history)
     decide(cell, ACCEPT, first)
-    second = proposed(cell)
+    second = proposed(cell.history)
     decide(cell, ACCEPT, second)
     number = measured_in_full(cell)
     while not (history.head(TOOL).calibration_id == number and cell.tool.measuring):

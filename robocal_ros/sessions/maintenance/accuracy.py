@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from robocal_ros.core.combined_error import both_errors, offset_error
+from robocal_ros.core.proposals import Head
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
@@ -33,17 +34,17 @@ class _Finding:
 
 
 def accuracy_of(
-    config: MaintenanceConfig, drift: Drift | None, memory: Memory, revision: int, wall_ns: int
+    config: MaintenanceConfig, drift: Drift | None, memory: Memory, tool: Head, wall_ns: int
 ) -> Accuracy:
     """Judge everything at once; ``drift`` None: the thermal node is silent.
 
-    ``revision``: of the tool in force. The worst part gives the level.
+    ``tool``: the one in force. The worst part gives the level.
     """
     parts = []
     if len(config.poses):
         parts.append(_thermal(drift))
     if config.T_base_laser is not None:
-        parts.append(_tool(config, memory.tool, revision, wall_ns))
+        parts.append(_tool(config, memory.tool, tool, wall_ns))
     error = _error([part.error for part in parts])
     if memory.fault:
         return Accuracy(AccuracyLevel.FAULT, f"maintenance: {memory.fault}", error)
@@ -74,7 +75,7 @@ def _thermal(drift: Drift | None) -> _Finding:
     return _Finding(drift.level, f"drift: {drift.reason}", drift.error, drift.due_in_s)
 
 
-def _tool(config: MaintenanceConfig, record: ToolRecord, revision: int, wall_ns: int) -> _Finding:
+def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: int) -> _Finding:
     age_s = (wall_ns - record.wall_ns) / NS
     due_in_s = config.tool_due_s - age_s
     if not record.answer:
@@ -82,11 +83,14 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, revision: int, wall_ns:
     if age_s < 0.0:  # the clock was set back: nobody knows how old it is
         return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
-    same = record.revision == revision
+    same = record.revision == tool.revision
     error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM) if same else None
     if age_s > config.tool_expires_s:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
-    if record.answer == "recalibrate":  # until a check passes, whatever came into force since
+    if record.candidate and record.candidate == tool.calibration_id:
+        words = f"tool: {when}, measured and accepted; a check has not passed yet"
+        return _Finding(AccuracyLevel.DUE, words, None, min(due_in_s, 0.0))
+    if record.answer == "recalibrate":  # until a check passes, whatever else came into force since
         todo = "measure and accept it" if same else "another one is in force since: check it"
         words = f"tool: {record.words}: {todo}"
         return _Finding(AccuracyLevel.DEGRADED, words, error, min(due_in_s, 0.0))

@@ -71,7 +71,7 @@ class Conductor:
         self._close_script()
         hands, run = self._hands, self.run
         hands.halt()
-        if hands.engaged:
+        if hands.tool.engaged:
             hands.disengage()
         self.run, hands.doing = None, "fault"
         self._tell(FAULT, {}, code, reason)
@@ -82,20 +82,20 @@ class Conductor:
         hands = self._hands
         if self.run is None:
             return
-        if hands.engaged or hands.robot.moving or hands.robot.beside_home():
+        if hands.tool.engaged or hands.robot.moving or hands.robot.beside_home():
             self.fault(Code.CONFLICT, f"{why}, and the robot is not handed over at home")
         else:
             self._end(Code.CONFLICT, why)
 
     def _whole(self, run: Run) -> Script[None]:
-        if self._hands.engaged:
+        if self._hands.tool.engaged:
             yield from self._hands.disarmed()
         yield from run.script()
 
     def _script_ended(self, run: Run) -> None:
         if away := self._hands.robot.beside_home():
             self.fault(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
-        elif self._hands.engaged:
+        elif self._hands.tool.engaged:
             self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)

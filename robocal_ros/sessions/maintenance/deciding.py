@@ -1,14 +1,18 @@
 """Decisions about thermal models and tools, and what may be accepted without a person."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of, reference_of
 from robocal_ros.core.errors import ConflictError, InputError, StaleError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, State
+from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, Head, State
 from robocal_ros.core.tool.judging import KnownTool, change_between
-from robocal_ros.sessions.decisions import decide
+from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.sessions.decisions import decide, require_thermal
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
@@ -16,6 +20,7 @@ from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
+SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser
 DONE = {ACCEPT: State.IN_FORCE, REJECT: State.REJECTED}  # what a repeated decision finds
 
 
@@ -27,15 +32,28 @@ class Decider:
 
     def pending(self, kind: str) -> list[Entry]:
         """Candidates that can be accepted now, newest first."""
-        return list(self._history.pending(kind))
+        found = self._history.pending(kind)
+        return [entry for entry in found if not self._outdated(entry)]
+
+    def _outdated(self, entry: Entry) -> str:
+        """Why it is STALE although its own kind's revision is in force; else empty."""
+        try:
+            require_thermal(self._history, entry)
+        except StaleError as error:
+            return str(error)
+        return ""
+
+    def head(self, kind: str) -> Head:
+        """What is in force."""
+        return self._history.head(kind)
 
     def revision(self, kind: str) -> int:
-        """The one in force."""
-        return self._history.head(kind).revision
+        """Of what is in force."""
+        return self.head(kind).revision
 
     def in_force(self, kind: str, calibration_id: int) -> bool:
         """Whether it is this one."""
-        return self._history.head(kind).calibration_id == calibration_id
+        return self.head(kind).calibration_id == calibration_id
 
     def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
         """Carry out a decision about one calibration; one that was made before is its answer again.
@@ -52,7 +70,7 @@ class Decider:
             raise InputError(
                 f"calibration {calibration_id} is of kind {entry.kind}: decide elsewhere"
             )
-        head = self._history.head(entry.kind)
+        head = self.head(entry.kind)
         if name in DONE and entry.state is DONE[name]:
             words = f"calibration {calibration_id} is {entry.state.value.replace('_', ' ')} already"
             return Outcome(
@@ -63,6 +81,8 @@ class Decider:
                 f"calibration {calibration_id} was solved against revision {entry.based_on}, in "
                 f"force is {head.revision}: measure again"
             )
+        if name == ACCEPT:
+            require_thermal(self._history, entry)
         return self._carried_out(command, entry.kind, head.revision, wall_ns)
 
     def roll_back(self, kind: str, by: str, why: str, wall_ns: int) -> Outcome:
@@ -119,20 +139,41 @@ class Decider:
         if entry.state is not State.PENDING:
             return f"it is {entry.state.value}"
         if entry.kind == THERMAL:
-            shift_m = self.thermal_shift_m(calibration_id)
-            if shift_m > bounds.thermal_m:
-                return (
-                    f"the tool centre point would be {shift_m * 1e3:.2f} mm from where it was at "
-                    f"commissioning (allowed without a person {bounds.thermal_m * 1e3:.2f} mm)"
-                )
-            return ""
-        tip_m, tilt_rad = self.tool_shift(calibration_id)
-        if tip_m > bounds.tool_m or tilt_rad > bounds.tool_rad:
+            return self._shift_withheld(calibration_id)
+        return self._outdated(entry) or self._tool_withheld(calibration_id)
+
+    def _shift_withheld(self, calibration_id: int) -> str:
+        allowed_m, shift_m = self._config.bounds.thermal_m, self.thermal_shift_m(calibration_id)
+        if not shift_m <= allowed_m:
             return (
-                f"the tool is {tip_m * 1e3:.2f} mm and {np.degrees(tilt_rad):.2f} deg from the "
-                f"taught one (allowed without a person {bounds.tool_m * 1e3:.2f} mm, "
+                f"the tool centre point would be {shift_m * 1e3:.2f} mm from where it was at "
+                f"commissioning (allowed without a person {allowed_m * 1e3:.2f} mm)"
+            )
+        return ""
+
+    def _tool_withheld(self, calibration_id: int) -> str:
+        bounds, config = self._config.bounds, self._config
+        model = self._history.model(calibration_id)
+        if what := self._other_reference(model["made_with"]):
+            return f"it was measured with another {what} than this node's: give both nodes the same"
+        found = KnownTool.of_document(model).T_flange_tool
+        change = change_between(config.T_flange_tool, found)
+        if not (change.tip_m <= bounds.tool_m and change.axis_rad <= bounds.tool_rad):
+            return (
+                f"the tool is {change.tip_m * 1e3:.2f} mm and {np.degrees(change.axis_rad):.2f} "
+                f"deg from the taught one (allowed without a person {bounds.tool_m * 1e3:.2f} mm, "
                 f"{np.degrees(bounds.tool_rad):.2f} deg)"
             )
+        return ""
+
+    def _other_reference(self, made_with: Mapping[str, Any]) -> str:
+        """What the tool node was given differently, so that bounds would mean something else."""
+        taught = np.array(made_with["taught"])
+        if not np.max(np.abs(taught - self._config.T_flange_tool)) <= SAME:
+            return "'taught' tool"
+        laser, T_base_laser = LaserFrame(np.array(made_with["points_m"])), self._config.T_base_laser
+        if T_base_laser is None or not np.max(np.abs(laser.T_base_laser - T_base_laser)) <= SAME:
+            return "'laser'"
         return ""
 
     def thermal_shift_m(self, calibration_id: int) -> float:
@@ -146,10 +187,3 @@ class Decider:
         tip = np.append(self._config.T_flange_tool[:3, 3], 1.0)
         shift = (arm.fk(q) @ tip - cold.fk(q) @ tip)[:, :3]
         return float(np.max(np.linalg.norm(shift, axis=1)))
-
-    def tool_shift(self, calibration_id: int) -> tuple[float, float]:
-        """Of the tip, m, and of the axis, rad, from the taught tool that it was measured for."""
-        model = self._history.model(calibration_id)
-        taught = np.array(model["made_with"]["taught"])
-        change = change_between(taught, KnownTool.of_document(model).T_flange_tool)
-        return change.tip_m, change.axis_rad

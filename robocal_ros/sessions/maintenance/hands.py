@@ -13,6 +13,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, LimitError
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
+from robocal_ros.sessions.maintenance.disarming import Disarming
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
 from robocal_ros.sessions.maintenance.requests import (
     Answer,
@@ -31,8 +32,6 @@ Array = NDArray[np.float64]
 R = TypeVar("R")
 Script = Generator[None, None, R]
 
-DISARM_AGAIN_S = 0.5
-
 
 class SilentError(ConflictError):
     """A node did not answer in time."""
@@ -45,7 +44,7 @@ class Hands:
     ----------
     now_s : of the tick.
     out : requests that wait to be carried out.
-    engaged : the tool's driver may be armed; only a confirmed disarm ends that.
+    tool : whether the tool's driver may move the robot.
     measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
     doing : what goes on, in words.
     """
@@ -56,13 +55,11 @@ class Hands:
         self.gap = Gap(config.times.stale_s)
         self.now_s = 0.0
         self.out: list[Request] = []
-        self.engaged = False
+        self.tool = Disarming()
         self.measured: list[float] = []
         self.doing = ""
         self._numbers = 0
         self._waiting: dict[int, Answer | None] = {}
-        self._disarm_asked_s = -np.inf
-        self._disarms: set[int] = set()
 
     # ---- time -----------------------------------------------------------------------------------
 
@@ -85,9 +82,7 @@ class Hands:
 
     def answered(self, number: int, answer: Answer) -> None:
         """An answer came; one that nobody waits for is none."""
-        if number in self._disarms:
-            self._disarms.discard(number)
-            self.engaged = self.engaged and not answer.done
+        self.tool.answered(number, answer, self.now_s)
         if number in self._waiting:
             self._waiting[number] = answer
 
@@ -126,14 +121,17 @@ class Hands:
 
     def doubt(self) -> None:
         """Nobody knows whether the tool's driver is armed; without a station there is none."""
-        self.engaged = self.config.T_base_laser is not None
-        self._disarms.clear()  # what is still to come of them was carried out before this
+        if self.config.T_base_laser is not None:
+            self.tool.doubt()
 
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
         self.doubt()
+        self.tool.armed = True
         self.robot.place = STATION
-        return (yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm))
+        answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm)
+        self.tool.armed = not answer.absent
+        return answer
 
     def disengage(self) -> None:
         """Break its run off and disarm it, at once; again and again until it is confirmed."""
@@ -142,7 +140,8 @@ class Hands:
 
     def keep_disarming(self) -> None:
         """Ask again where nobody confirmed."""
-        if self.engaged and self.now_s >= self._disarm_asked_s + DISARM_AGAIN_S:
+        self._let_go()
+        if self.tool.again(self.now_s):
             self._ask_disarm()
 
     def disarmed(self) -> Script[None]:
@@ -155,14 +154,20 @@ class Hands:
         """
         self._ask_disarm()
         until_s = self.now_s + self.config.times.answer_s
-        while self.engaged:
+        while self.tool.engaged:
             if self.now_s >= until_s:
-                raise FaultError(Code.CONFLICT, "the tool node does not confirm that it disarmed")
+                words = f"the tool node does not confirm that it disarmed; {self.tool.words()}"
+                raise FaultError(Code.CONFLICT, words)
             yield
+            self._let_go()
 
     def _ask_disarm(self) -> None:
-        self._disarms.add(self.request(Disarm))
-        self._disarm_asked_s = self.now_s
+        self.tool.asked(self.request(Disarm), self.now_s)
+
+    def _let_go(self) -> None:
+        """Do not wait for a driver that is gone, see `disarming`."""
+        if self.tool.gone(self.now_s) and not self.robot.beside_home():
+            self.tool.engaged &= self.robot.resting(STANDS_S) is None
 
     def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[Answer]:
         """Let the armed driver measure, for a limited time; a longer run is broken off.
@@ -217,8 +222,10 @@ class Hands:
             yield
 
     def halt(self) -> None:
-        """Stop what this node moves."""
+        """Stop what this node moves, or has moved by the tool's driver: that may be deaf."""
         plan = self.robot.stop(self.now_s)
+        if plan is None and self.tool.armed:
+            plan = self.robot.stop_measured(self.now_s)
         if plan is not None:
             self.request(Stop, plan)
 
@@ -248,7 +255,7 @@ class Hands:
     def after_break(self) -> Script[None]:
         """Stop everything, wait until it stands and is disarmed, then bring the robot home."""
         self.halt()
-        if self.engaged:
+        if self.tool.engaged:
             self.disengage()
             yield from self.disarmed()
         yield from self.stand(STANDS_S)

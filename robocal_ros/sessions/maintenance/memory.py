@@ -68,6 +68,7 @@ class ToolRecord:
     ----------
     answer : "pass", "recalibrate" or "cannot tell"; empty: never measured.
     revision : of the tool that was in force then.
+    candidate : calibration that a full measurement proposes in its place; 0: none.
     wall_ns, full_ns : when, and when it was last measured in full.
     """
 
@@ -76,6 +77,7 @@ class ToolRecord:
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
     revision: int = 0
+    candidate: int = 0
     wall_ns: int = 0
     full_ns: int = 0
 

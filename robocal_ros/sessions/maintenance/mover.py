@@ -168,6 +168,13 @@ class Mover:
         self._watch.forget()
         return stop(self._arm, self._config.driving.limits, *state)
 
+    def stop_measured(self, now_s: float) -> JointPlan | None:
+        """The stop of whatever moves the robot, from its readings alone; None while these fail."""
+        if self.silent:
+            return None
+        state = self._watch.state(now_s, keeps=False)
+        return stop(self._arm, self._config.driving.limits, *state)
+
     def _kept(self, tip_m: float, joint_rad: float) -> bool:
         driving = self._config.driving
         return tip_m <= driving.deviation_m and joint_rad <= driving.deviation_rad

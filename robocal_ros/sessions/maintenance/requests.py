@@ -80,6 +80,7 @@ class Answer:
     has_result : whether a measurement reached one.
     answer : of a quick check: "pass", "recalibrate", "cannot tell".
     deviation_mm, sigma_mm : of the tip from the tool in force.
+    absent : the request reached nobody, as the node is not there.
     """
 
     code: Code
@@ -90,6 +91,7 @@ class Answer:
     answer: str = ""
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
+    absent: bool = False
 
     @property
     def done(self) -> bool:

@@ -5,7 +5,9 @@ from dataclasses import replace
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.events import ACCEPT, Outcome
+from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
@@ -14,9 +16,15 @@ from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
 
+UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
+
 
 class Run:
     """The script of a cycle, and its result as it grows.
+
+    Parameters
+    ----------
+    drift : what the thermal node says of itself now; None: it is silent.
 
     Attributes
     ----------
@@ -32,11 +40,13 @@ class Run:
         decider: Decider,
         memory: Memory,
         decided: Callable[[Outcome], None],
+        drift: Callable[[], Drift | None],
     ) -> None:
         self.result = CycleResult(cycle_id)
         self._hands, self._decider, self._decided = hands, decider, decided
+        self._drift = drift
         self._thermal = ThermalPart(hands, book)
-        self._tool = ToolPart(hands, book, decider, memory, decided)
+        self._tool = ToolPart(hands, book, decider, memory, decided, self._unsure)
         self.wall_ns = 0
         self._words: list[str] = []
 
@@ -77,7 +87,9 @@ class Run:
         self.result = replace(self.result, thermal_code=answer.code, thermal_id=answer.candidate_id)
         if not (answer.done and answer.candidate_id):
             return
-        if why := self._decider.withheld(answer.candidate_id):
+        # EXPIRED was said before this measurement, and must not keep its result waiting.
+        why = self._decider.withheld(answer.candidate_id) or self._unsound(AccuracyLevel.FAULT)
+        if why:
             self._tell(f"thermal candidate {answer.candidate_id} waits for a decision: {why}")
             return
         within = "within the configured bounds"
@@ -88,7 +100,7 @@ class Run:
             self._accepted(answer.candidate_id)
 
     def _measure_tool(self) -> Script[None]:
-        found = yield from self._tool.script(self.result.cycle_id, self._drift_is_known())
+        found = yield from self._tool.script(self.result.cycle_id)
         if found.left:
             self._left(found.left)
         for words in (found.last.message if found.last else "", found.told):
@@ -104,6 +116,21 @@ class Run:
             self._accepted(found.candidate_id)
         if found.fault:
             raise FaultError(Code.CONFLICT, found.fault)
+
+    def _unsure(self) -> str:
+        """Why a tool that was measured now waits for a person; empty: it need not.
+
+        By now the thermal node has heard of the cycle: what is EXPIRED still has no cold reference.
+        """
+        expired = AccuracyLevel.EXPIRED if self._hands.ways.count else AccuracyLevel.FAULT
+        return self._unsound(expired) or UNSURE * (not self._drift_is_known())
+
+    def _unsound(self, worst: AccuracyLevel) -> str:
+        """Why the drift, from a level on, leaves a decision to a person; else empty."""
+        drift = self._drift()
+        if drift is None:  # a cell without measuring poses need not have a thermal node
+            return "the thermal node is silent" if self._hands.ways.count else ""
+        return f"the drift is {drift.level.name}: {drift.reason}" if drift.level >= worst else ""
 
     def _drift_is_known(self) -> bool:
         """Whether the model in force is what this cycle found; without poses nobody asks."""

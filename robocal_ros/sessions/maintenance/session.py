@@ -26,13 +26,14 @@ from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
-from robocal_ros.sessions.maintenance.tool_part import ToolPart
+from robocal_ros.sessions.maintenance.tool_part import worst_s
 from robocal_ros.sessions.maintenance.ways import HOME, Ways
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 Array = NDArray[np.float64]
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
+UNCONFIRMED = "the tool node has not confirmed that it is disarmed"
 MOST_ID = 100  # characters of a cycle's name
 
 
@@ -110,8 +111,8 @@ class MaintenanceSession:
             raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
         if (open_run := self._conductor.run) is not None:
             raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
-        if hands.engaged:
-            raise ConflictError("the tool node has not confirmed that it is disarmed")
+        if hands.tool.engaged:
+            raise ConflictError(f"{UNCONFIRMED}; {hands.tool.words()}")
         if why := hands.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
         hands.gap.begin(gap_s, now_s)
@@ -121,7 +122,15 @@ class MaintenanceSession:
             raise LimitError(f"{words}: bring it home, then acknowledge")
         hands.robot.place = (HOME, HOME)
         memory.begin(cycle_id)
-        run = Run(cycle_id, hands, self._book, self._decider, memory, self._decided)
+        run = Run(
+            cycle_id,
+            hands,
+            self._book,
+            self._decider,
+            memory,
+            self._decided,
+            lambda: self._heard_drift(hands.now_s),
+        )
         run.at(wall_ns)
         self._conductor.begin(run)
         words = f"cycle '{cycle_id}' begins"
@@ -168,7 +177,7 @@ class MaintenanceSession:
         Raises
         ------
         ConflictError
-            While the tool node has not confirmed that it is disarmed.
+            While the tool node has not confirmed that it is disarmed, and is not gone.
         LimitError
             While the robot is not at home.
         StorageError
@@ -176,8 +185,8 @@ class MaintenanceSession:
         """
         if not self._memory.fault:
             return "there is no fault"
-        if self._hands.engaged:
-            raise ConflictError("the tool node has not confirmed that it is disarmed: wait for it")
+        if self._hands.tool.engaged:
+            raise ConflictError(f"{UNCONFIRMED}; {self._hands.tool.words()}")
         if away := self._hands.robot.beside_home():
             raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
         words = f"acknowledged: {self._memory.fault}"
@@ -205,10 +214,10 @@ class MaintenanceSession:
     def worst_cases(self) -> dict[str, float]:
         """How long each step may take at the most, its way home included, s."""
         thermal = ThermalPart(self._hands, self._book)
-        tool = ToolPart(self._hands, self._book, self._decider, self._memory, self._decided)
         found = {"one measuring pose": thermal.worst_s()} if self.ways.count else {}
         if self.config.T_base_laser is not None:
-            found |= {f"tool measurement ({mode})": tool.worst_s(mode) for mode in (QUICK, FULL)}
+            times = self.config.times
+            found |= {f"tool measurement ({mode})": worst_s(times, mode) for mode in (QUICK, FULL)}
         return found
 
     def result(self, cycle_id: str) -> CycleResult | None:
@@ -243,7 +252,7 @@ class MaintenanceSession:
             doing=hands.doing,
             left_s=0.0 if run is None else max(hands.gap.left_s(now_s), 0.0),
             at_home=not hands.robot.beside_home(),
-            disarmed=not hands.engaged,
+            disarmed=not hands.tool.engaged,
             last=last,
             thermal_pending=thermal,
             tool_pending=tool,
@@ -253,13 +262,14 @@ class MaintenanceSession:
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""
-        drift = self._drift
-        if drift is not None and now_s - drift[1] > self.config.silent_s:
-            drift = None
-        revision = self._decider.revision(TOOL)
         return accuracy_of(
-            self.config, None if drift is None else drift[0], self._memory, revision, wall_ns
+            self.config, self._heard_drift(now_s), self._memory, self._decider.head(TOOL), wall_ns
         )
+
+    def _heard_drift(self, now_s: float) -> Drift | None:
+        """None while the thermal part is silent."""
+        drift = self._drift
+        return drift[0] if drift is not None and now_s - drift[1] <= self.config.silent_s else None
 
     def _known(self, cycle_id: str) -> CycleResult | None:
         run = self._conductor.run

@@ -7,6 +7,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.maintenance.config import Times
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import Memory
@@ -17,8 +18,6 @@ from robocal_ros.sessions.tool_results import FULL, QUICK
 
 NS = 1_000_000_000
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
-
-UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
 
 
 @dataclass
@@ -45,12 +44,20 @@ class ToolOutcome:
     left: str = ""
 
 
+def worst_s(times: Times, mode: str) -> float:
+    """From home and back, with everything that may go wrong."""
+    limit_s = times.check_s if mode == QUICK else times.full_s
+    # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
+    return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + times.tool_home_s
+
+
 class ToolPart:
     """Keeps the tool right; what does not fit is done in the next gap.
 
     Parameters
     ----------
     decided : told of each decision that was made without a person.
+    unsure : why a tool that was measured now waits for a person; empty: it need not.
     """
 
     def __init__(
@@ -60,20 +67,13 @@ class ToolPart:
         decider: Decider,
         memory: Memory,
         decided: Callable[[Outcome], None],
+        unsure: Callable[[], str],
     ) -> None:
         self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
-        self._decided = decided
+        self._decided, self._unsure = decided, unsure
         self._times = hands.config.times
-        self._drift_is_known = False
         self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
-
-    def worst_s(self, mode: str) -> float:
-        """From home and back, with everything that may go wrong."""
-        times = self._times
-        limit_s = times.check_s if mode == QUICK else times.full_s
-        # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
-        return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + times.tool_home_s
 
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
@@ -87,9 +87,8 @@ class ToolPart:
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
         return QUICK if due else ""
 
-    def script(self, cycle_id: str, drift_is_known: bool) -> Script[ToolOutcome]:
-        """Everything that is due and fits; where the drift is not known a person decides."""
-        self._drift_is_known = drift_is_known
+    def script(self, cycle_id: str) -> Script[ToolOutcome]:
+        """Everything that is due and fits."""
         outcome = ToolOutcome()
         wanted = self.wants()
         if not wanted:
@@ -105,7 +104,7 @@ class ToolPart:
             optional = passed
         else:
             optional = False
-        if optional and not self._hands.fits(self.worst_s(FULL)):
+        if optional and not self._hands.fits(worst_s(self._times, FULL)):
             return outcome  # only when time allows
         yield from self._full(cycle_id, outcome)
         return outcome
@@ -132,7 +131,7 @@ class ToolPart:
         if answer.code is Code.NO_SIGNIFICANT_GAIN:
             self._note(answer, "pass")
             return
-        self._note(answer, "recalibrate")
+        self._note(answer, "recalibrate", answer.candidate_id if answer.done else 0)
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
@@ -153,7 +152,7 @@ class ToolPart:
         """Why the candidate waits for a person; empty: it need not."""
         if self._book.moved:
             return MOVED
-        return self._decider.withheld(candidate_id) or UNSURE * (not self._drift_is_known)
+        return self._decider.withheld(candidate_id) or self._unsure()
 
     def _verify(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         """Check the tool that was just accepted; one that is not right is taken back."""
@@ -183,8 +182,11 @@ class ToolPart:
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
         """From home and back home; None where it did not fit, or tells of another tool."""
         hands = self._hands
-        worst_s = self.worst_s(mode)
-        if not hands.fits(worst_s):
+        if hands.tool.absent:
+            outcome.left = f"tool measurement ({mode})"
+            outcome.last = Answer(Code.CONFLICT, hands.tool.words(), absent=True)
+            return None
+        if not hands.fits(worst_s(self._times, mode)):
             outcome.left = f"tool measurement ({mode})"
             return None
         hands.doing = f"tool measurement ({mode})"
@@ -209,13 +211,14 @@ class ToolPart:
             return None
         return answer
 
-    def _note(self, answer: Answer, verdict: str) -> None:
+    def _note(self, answer: Answer, verdict: str, candidate: int = 0) -> None:
         self._memory.note_tool(
             answer=verdict,
             words=answer.message,
             deviation_mm=answer.deviation_mm,
             sigma_mm=answer.sigma_mm,
             revision=self._checked,
+            candidate=candidate,
             wall_ns=self.wall_ns,
         )
 
