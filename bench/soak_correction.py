@@ -1,6 +1,7 @@
 """joint_correction_node for hours: a stream at 500 Hz, and another model every ten seconds.
 
 ``tools/with_ros python -m bench.soak_correction --seconds 60`` for a look; an hour is the default.
+With ``--keep`` it writes docs/figures/soak_correction.md too.
 """
 
 import argparse
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from robocal_msgs.msg import KinematicModel
 
+from bench.__main__ import KEPT, about
 from bench.startup import EXECUTABLES
-from bench.stream_probe import TARGETS, Probe, Stream, Subject, drifted, offered
+from bench.stream_probe import STATES, TARGETS, Probe, Stream, Subject, drifted, offered
 from bench.tables import Goal, Table, show
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
@@ -128,6 +130,8 @@ def _judged(stream: Stream, watch: Watch, memory_mb: list[float], seconds: float
     grew = memory_mb[-1] - memory_mb[0]
     lost = stream.missing
     table.add("targets", stream.sent[TARGETS], None)
+    table.add("joint states", stream.sent[STATES], None)
+    table.add("models", WARM + len(memory_mb), None)
     table.add("messages lost", lost, Goal(lost, 0))
     table.add("largest step", watch.worst, Goal(watch.worst, 1.0))
     table.add("targets compared with the model in force", watch.checked, None)
@@ -142,8 +146,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """1 when a goal is missed."""
     parser = argparse.ArgumentParser(prog="python -m bench.soak_correction", description=__doc__)
     parser.add_argument("--seconds", type=float, default=HOUR_S, help="how long")
-    table = soak(parser.parse_args(arguments).seconds)
+    parser.add_argument("--keep", action="store_true", help="write docs/figures too")
+    given = parser.parse_args(arguments)
+    start = time.monotonic()
+    table = soak(given.seconds)
     show([table])
+    if given.keep:
+        command = f"python -m bench.soak_correction --seconds {given.seconds:g} --keep"
+        facts = ", ".join(f"{name} {x}" for name, x in about(time.monotonic() - start).items())
+        text = f"Made by `{command}`: {facts}.\n\n{table.markdown()}"
+        (KEPT / "soak_correction.md").write_text(text)
     return 0 if table.met else 1
 
 

@@ -226,7 +226,7 @@ def _alike(s: Array) -> bool:
     same = s.shape[0] == straight.LANES
     for i in range(s.shape[0]):
         same &= s[i] == s[0]
-    return same
+    return bool(same)
 
 
 @lean

@@ -36,8 +36,8 @@ AT_GOAL = 1e-12
 # Longest second step as a share of the first: see `solution`.
 AHEAD, BESIDE = 0.2, 0.5
 # The last step and the one before show what one more would be: below this it is not made.
-LEFT = 1e-14
-QUIET, SHORT = 5e-13, 1e-9  # a last step that is as short needs no other; one that is longer does
+LEFT = 2e-14
+QUIET, SHORT = 5e-14, 1e-9  # a last step that is as short needs no other; one that is longer does
 SINGULAR = 1e-13  # square of a column's part that no column before has, beside the first's
 FAR = 2.0  # a solution so many times beyond the bound is another posture
 
@@ -124,7 +124,7 @@ def _step(factor: Factor, e: Six) -> Six:
 def _within(c: Array, x: Six, times: float) -> bool:
     """Whether no joint is shifted by more than so many times its bound."""
     b = LARGEST
-    return (
+    return bool(
         (abs(x[0]) <= times * c[b])
         & (abs(x[1]) <= times * c[b + 1])
         & (abs(x[2]) <= times * c[b + 2])
@@ -137,7 +137,7 @@ def _within(c: Array, x: Six, times: float) -> bool:
 @lean
 def _turns_little(c: Array, at: int, q: Six) -> bool:
     """Whether all angles are within the reach of their sines; False for NaN."""
-    return (
+    return bool(
         (abs(c[at + 1] + c[at + 7] * q[0]) <= LARGEST_ANGLE)
         & (abs(c[at + 10] + c[at + 16] * q[1]) <= LARGEST_ANGLE)
         & (abs(c[at + 19] + c[at + 25] * q[2]) <= LARGEST_ANGLE)
