@@ -242,6 +242,8 @@ class Suite:
         for node, session in (("thermal", self.thermal), ("tool", self.tool)):
             for outcome in session.poll():
                 self._record(node, outcome.command, outcome)
+        if self.maintenance.running is not None:
+            self._tell_drift()
         if self.correction is None:
             return
         heads = self.thermal.in_force.revision, self.tool.in_force.revision
@@ -270,8 +272,10 @@ class Suite:
 
     def accuracy(self) -> Accuracy:
         """What the line reads now."""
-        now_s, now_ns = self._clock.now_s, self._clock.now_ns
-        found = self.thermal.accuracy(now_ns)
+        self._tell_drift()
+        return self.maintenance.accuracy(self._clock.now_s, self._clock.now_ns)
+
+    def _tell_drift(self) -> None:
+        found = self.thermal.accuracy(self._clock.now_ns)
         drift = Drift(found.level, found.reason, found.error, found.due_in_s)
-        self.maintenance.drift(drift, now_s)
-        return self.maintenance.accuracy(now_s, now_ns)
+        self.maintenance.drift(drift, self._clock.now_s)
