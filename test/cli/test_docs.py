@@ -66,5 +66,5 @@ def test_commands_run_as_typed(page: str, tmp_path: Path, monkeypatch: pytest.Mo
     if any("out/state" in words for words in typed):  # stands for the demo's history
         assert robocal(*REPLAY, "--state", "out/state").returncode == 0
     for words in typed:
-        done = robocal(*words, timeout_s=180.0)  # several processes on a busy machine
+        done = robocal(*words)
         assert done.returncode == 0, (words, done.stderr)
