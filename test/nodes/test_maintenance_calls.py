@@ -24,6 +24,7 @@ from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.sessions.maintenance import State
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
@@ -47,7 +48,10 @@ class Plc:
         self.joints = graph.publisher(JointState, "joint_states")
         self.sent = 0
         graph.probe.create_timer(PERIOD_S, self._beat)
-        graph.spin_for(0.5)
+        graph.spin_until(lambda: self.statuses and self._ready(self.statuses[-1]), "it is ready")
+
+    def _ready(self, status: MaintenanceStatus) -> bool:
+        return bool(status.at_home and not status.doing)
 
     def _beat(self) -> None:
         self.sent += 1
@@ -111,7 +115,7 @@ def test_the_action_does_the_same(plc, graph):
 
 def test_nothing_runs_while_the_gap_is_closed(plc, graph):
     plc.is_open = False
-    graph.spin_for(0.3)
+    graph.spin_until(lambda: plc.statuses[-1].doing == "gap_open is false", "it is told")
     refused = plc.run("4711")
     assert (refused.success, refused.status) == (False, Code.CONFLICT)
     assert "gap_open is false" in refused.message
@@ -207,7 +211,7 @@ def test_a_decision_that_comes_twice_is_made_once(plc, graph):
     assert plc.trigger("reject") == f"{waiting[0]} ACCEPT {words}"
     assert plc.trigger("reject") == "0 ACCEPT nothing waits for a decision"
     names = [event.command for event in plc.events]
-    assert names == ["accept", "accept", "rollback", "reject", "reject"]
+    assert names == ["accept", "accept", "rollback", "rollback", "reject", "reject"]  # one refused
 
 
 def test_the_last_acceptance_is_taken_back_once(plc, graph):
@@ -279,9 +283,9 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     request.call_async(RunMaintenanceCycle.Request(cycle_id="a", gap_s=30.0))
     graph.spin_until(lambda: plc.node._session.running, "it runs")
     plc.node._show()
+    assert plc.node._shown.state is State.RUNNING
     plc.node.trigger_deactivate()
     graph.spin_until(lambda: plc.statuses[-1].last.cycle_id == "a", "the last word")
-    assert MaintenanceStatus.RUNNING in {status.state for status in plc.statuses}
     assert plc.statuses[-1].state == MaintenanceStatus.IDLE
     assert plc.statuses[-1].last.code == Code.CONFLICT
     graph.spin_until(lambda: plc.states[-1].state == AccuracyState.FAULT, "the line is told")
@@ -312,7 +316,7 @@ def test_heartbeats_that_waited_for_the_node_do_not_count(graph):
     home = str(HOME_DEG)
     plc = Plc(graph, lambda: graph.start("maintenance_node", {"serial": "K7", "home_deg": home}))
     graph.spin_until(lambda: plc.statuses, "the node", 20.0)
-    assert plc.run("a").success
+    graph.spin_until(lambda: plc.run("a").result.code == Code.ACCEPT, "a has ended")
     plc.node.process.send_signal(signal.SIGSTOP)
     graph.spin_for(1.0)  # twenty heartbeats wait
     plc.beating = False  # the PLC dies
