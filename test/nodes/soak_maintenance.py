@@ -17,7 +17,7 @@ from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import AccuracyState, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
-from test_maintenance_calls import HOME_DEG, Plc, proposed
+from test_maintenance_calls import HOME_DEG, Plc, process, proposed
 
 from robocal_ros.core.codes import Code
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -97,9 +97,7 @@ def test_calls_do_their_work_in_time(graph: Any, tmp_path: Path) -> None:
 
 def test_an_acknowledgement_is_in_time(graph: Any) -> None:
     """The robot stands: it is a fault that ends."""
-    home = str(HOME_DEG)
-    plc = Plc(graph, lambda: graph.start("maintenance_node", {"serial": "K7", "home_deg": home}))
-    graph.spin_until(lambda: plc.statuses, "the node", 20.0)
+    plc = Plc(graph, lambda: process(graph))
     plc.call(Acknowledge, "acknowledge")
     took_s = []
     for number in range(COUNT):

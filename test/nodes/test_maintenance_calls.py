@@ -48,6 +48,7 @@ class Plc:
         self.joints = graph.publisher(JointState, "joint_states")
         self.sent = 0
         graph.probe.create_timer(PERIOD_S, self._beat)
+        assert not self.run("").success  # discovers the call
         graph.spin_until(lambda: self.statuses and self._ready(self.statuses[-1]), "it is ready")
 
     def _ready(self, status: MaintenanceStatus) -> bool:
@@ -72,6 +73,13 @@ class Plc:
         answer = self.call(Trigger, f"{name}_trigger")
         assert answer.success == (answer.message.split()[1] == "ACCEPT")
         return str(answer.message)
+
+
+def process(graph: Any) -> Any:
+    """The node as its own process."""
+    node = graph.start("maintenance_node", {"serial": "K7", "home_deg": str(HOME_DEG)})
+    graph.spin_until(lambda: graph.probe.count_subscribers("gap_open"), "the node", 30.0)
+    return node
 
 
 @pytest.fixture
@@ -277,10 +285,10 @@ def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
 
 
 def test_a_node_that_is_deactivated_says_so(plc, graph):
-    request = plc.graph.probe.create_client(RunMaintenanceCycle, f"{NODE}/run")
-    graph.spin_until(request.service_is_ready, "the call")
-    graph.spin_for(0.3)
-    request.call_async(RunMaintenanceCycle.Request(cycle_id="a", gap_s=30.0))
+    call = graph.probe.create_client(RunMaintenanceCycle, f"{NODE}/run")
+    graph.spin_until(call.service_is_ready, "the call")
+    graph.spin_for(0.5)
+    call.call_async(RunMaintenanceCycle.Request(cycle_id="a", gap_s=30.0))
     graph.spin_until(lambda: plc.node._session.running, "it runs")
     plc.node._show()
     assert plc.node._shown.state is State.RUNNING
@@ -313,10 +321,7 @@ def test_a_heartbeat_that_cannot_be_heard_is_told(graph):
 
 
 def test_heartbeats_that_waited_for_the_node_do_not_count(graph):
-    home = str(HOME_DEG)
-    plc = Plc(graph, lambda: graph.start("maintenance_node", {"serial": "K7", "home_deg": home}))
-    graph.spin_until(lambda: plc.statuses, "the node", 20.0)
-    graph.spin_until(lambda: plc.run("a").result.code == Code.ACCEPT, "a has ended")
+    plc = Plc(graph, lambda: process(graph))
     plc.node.process.send_signal(signal.SIGSTOP)
     graph.spin_for(1.0)  # twenty heartbeats wait
     plc.beating = False  # the PLC dies
