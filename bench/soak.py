@@ -78,6 +78,8 @@ def endurance(amount: Amount) -> Table:
     restarts = "test/nodes/test_joint_correction_restarts.py"
     add("all nodes of a correction killed together, in each order", 6,
         lambda: not _pytest(restarts, ROBOCAL_RESTARTS="6"))  # fmt: skip
+    add("whole gaps of a live cell at the limits as they are set, and its calls' times", 1,
+        lambda: not _pytest("test/nodes/soak_maintenance.py"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test/core", "test/storage", "test/sessions")

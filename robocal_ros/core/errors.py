@@ -89,3 +89,7 @@ class StorageError(RobocalError):
     """The history could not be read or written; nothing was half-written."""
 
     code = Code.STORAGE_FAILED
+
+
+class StateLostError(StorageError):
+    """What was kept is gone, and what it told is forgotten."""

@@ -17,6 +17,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, Health
 from robocal_ros.nodes.endpoints import NotActiveError
+from robocal_ros.nodes.gap_sources import GapSources
 from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
 from robocal_ros.nodes.maintenance_outputs import MaintenanceOutputs
@@ -37,8 +38,10 @@ from robocal_ros.storage.state_files import StateFile
 TICK_S = 0.02
 SHOW_S = 0.2
 ACCURACY_S = 1.0
+HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks after the robot
 NS = 1_000_000_000
 MM = 1e-3
+ENDS = "the node was deactivated"
 GAP_OPEN, ACCURACY = "gap_open", "thermal_node/accuracy"
 MEASUREMENTS = {
     POINT: PointStamped,
@@ -68,6 +71,7 @@ class MaintenanceNode(HouseNode):
         self._config = session_config(settings, self._nominal)
         load_motion(self._nominal)
         self._serial_in_use, self._history = open_history(settings, self._nominal)
+        self._history.wait_at_most(HISTORY_S)
         self._keeper = StateFile(self._history.path, "maintenance")
         self._outputs = MaintenanceOutputs(
             self.add_output, self._nominal.name, self._serial_in_use, settings["base_frame"]
@@ -78,7 +82,8 @@ class MaintenanceNode(HouseNode):
         )
         self._guard = SourceGuard(self, JOINTS)
         self.add_input(JointState, JOINTS, self._take_joints, qos.STREAM)
-        self.add_input(Bool, GAP_OPEN, self._take_gap, qos.RELIABLE)
+        heartbeat = self.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
+        self._sources = GapSources(self, heartbeat)
         self.add_input(AccuracyState, ACCURACY, self._take_accuracy, qos.LATCHED)
         for topic, kind in MEASUREMENTS.items():
             self.add_input(kind, topic, self._take_measurement, qos.STREAM)
@@ -99,11 +104,14 @@ class MaintenanceNode(HouseNode):
         self._show()
 
     def deactivate(self) -> None:
-        """Stop what moves, disarm, and end the session."""
+        """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
-            self._carry_out(self._session.give_up("the node was deactivated", time.monotonic()))
+            self._carry_out(self._session.give_up(ENDS, time.monotonic()))
+            self._show()
+            gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
+            self._outputs.accuracy(gone, self._config.tolerance_m, self.now_ns())
         if self._calls is not None:
-            self._calls.break_off("the node was deactivated")
+            self._calls.break_off(ENDS)
         self._session = None
 
     def cleanup(self) -> None:
@@ -133,6 +141,7 @@ class MaintenanceNode(HouseNode):
 
     def _take_gap(self, message: Any) -> None:
         if self._session is not None:
+            self._session.doubt_gap(self._sources.doubt())
             self._session.gap(message.data, time.monotonic())
             self._tick()  # a gap that closes stops the robot now
 
@@ -189,15 +198,13 @@ class MaintenanceNode(HouseNode):
         session = self._session
         if session is None or self._calls is None:
             return
-        try:
-            status = session.status(time.monotonic())
-            shown = replace(status, left_s=round(status.left_s))
-            if shown != self._shown:
-                self._shown = shown
-                self._outputs.status(status, self.now_ns())
-            self._calls.look(status)
-        except RobocalError as error:  # the history cannot be read: tried again
-            self.get_logger().error(str(error), throttle_duration_sec=5.0)
+        session.doubt_gap(self._sources.doubt())
+        status = session.status(time.monotonic())
+        shown = replace(status, left_s=round(status.left_s))
+        if shown != self._shown:
+            self._shown = shown
+            self._outputs.status(status, self.now_ns())
+        self._calls.look(status)
 
     def _show_accuracy(self) -> None:
         if self._session is None:
@@ -225,8 +232,9 @@ class MaintenanceNode(HouseNode):
         health.values = values
         if status.state is State.FAULT:
             health.worsen(ERROR, status.fault)
-        if self._guard.fault:
-            health.worsen(ERROR, self._guard.fault)
+        for words in (self._guard.fault, self._sources.doubt(), status.trouble):
+            if words:
+                health.worsen(ERROR, words)
         warn_without_serial(health, self._serial_in_use)
         return health
 

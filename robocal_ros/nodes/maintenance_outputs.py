@@ -51,7 +51,7 @@ class MaintenanceOutputs:
             header=conversions.header(now_ns, self._base),
             state=int(status.state),
             cycle_id=status.cycle_id,
-            doing=status.doing,
+            doing="; ".join(filter(None, (status.doing or status.closed, status.trouble))),
             left_s=status.left_s,
             at_home=status.at_home,
             disarmed=status.disarmed,

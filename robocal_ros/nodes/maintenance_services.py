@@ -91,8 +91,9 @@ class MaintenanceServices:
         self.look()
 
     def _cancel(self, goal: ServerGoalHandle) -> CancelResponse:
-        if goal not in self._goals:
-            return CancelResponse.REJECT
+        running = self._session().running if goal in self._goals else None
+        if running is None or running.cycle_id != goal.request.cycle_id:
+            return CancelResponse.REJECT  # it has ended; another cycle is not meant
         self._session().cancel("cancelled by the caller of the action")
         return CancelResponse.ACCEPT
 
@@ -144,6 +145,9 @@ class MaintenanceServices:
             raise InputError(f"cycle '{request.cycle_id}' is not known: it never ran")
         response.success, response.status = True, int(Code.ACCEPT)
         response.message = status.fault or status.doing or status.state.name
+        if status.trouble:
+            response.success, response.status = False, int(Code.STORAGE_FAILED)
+            response.message = status.trouble
         return response
 
     def _acknowledge(self, request: Any, response: Any) -> Any:
@@ -195,6 +199,8 @@ class MaintenanceServices:
             return waiting, status.fault_code, status.fault
         if session.running is not None:
             return waiting, Code.NONE, status.doing
+        if status.trouble:
+            return 0, Code.STORAGE_FAILED, status.trouble
         if status.last is None:
             return waiting, Code.CONFLICT, "no cycle has ended yet"
         return waiting, status.last.code, status.last.message

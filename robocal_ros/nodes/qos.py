@@ -28,6 +28,9 @@ SENSOR = _profile(100, ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = _profile(100, ReliabilityPolicy.RELIABLE)
 """Commands and events, where none may be lost."""
 
+HEARTBEAT = _profile(1, ReliabilityPolicy.RELIABLE)
+"""What holds for a short time only: an older one that still waits says nothing."""
+
 STREAM = _profile(1000, ReliabilityPolicy.BEST_EFFORT)
 """What a session is computed from: deep enough for the seconds that a large solution takes."""
 

@@ -14,6 +14,7 @@ from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
+from robocal_ros.nodes.gap_sources import GapSources
 from robocal_ros.nodes.motion_settings import (
     MOTION,
     NS,
@@ -68,7 +69,8 @@ class TcfMotion:
         stale_s = settings["gap_stale_s"]
         self._gap = Gap(stale_s) if stale_s > 0.0 else None
         if self._gap is not None:
-            node.add_input(Bool, GAP_OPEN, self._take_gap, qos.RELIABLE)
+            heartbeat = node.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
+            self._sources = GapSources(node, heartbeat)
         node.add_service(SetBool, "~/arm", self._arm)
         node.add_timer(TICK_S, self._tick, steady=True)
 
@@ -123,6 +125,7 @@ class TcfMotion:
 
     def _take_gap(self, message: Any) -> None:
         if self._gap is not None:
+            self._gap.doubt(self._sources.doubt())
             self._gap.heard(message.data, time.monotonic())
             self._tick()
 
@@ -131,9 +134,11 @@ class TcfMotion:
         return "" if self._gap is None else self._gap.closed(now_s)
 
     def _tick(self) -> None:
+        now_s = time.monotonic()
+        if self._gap is not None:
+            self._gap.look(now_s)
         if self.driver is None:
             return
-        now_s = time.monotonic()
         if (self.driver.armed or self.driver.phase is not Phase.IDLE) and (
             why := self._closed(now_s)
         ):

@@ -5,10 +5,15 @@ import numpy as np
 from robocal_ros.core.errors import InputError
 
 LONGEST_GAP_S = 86_400.0
+STALL_S = 0.1  # between two looks: more is a pause of the own process
+DRAIN_S = 0.1  # after one, until all that waited for it has been taken
 
 
 class Gap:
     """Follows the heartbeat ``gap_open`` and the end of the gap that was told; steady clock.
+
+    A heartbeat bears no time. One that is taken just after a pause of the own process may have
+    waited all through it: it counts from before the pause.
 
     Parameters
     ----------
@@ -18,11 +23,28 @@ class Gap:
     def __init__(self, stale_s: float) -> None:
         self._stale_s = stale_s
         self._open, self._heard_s = False, -np.inf
+        self._looked_s: float | None = None
+        self._paused_s = self._drained_s = -np.inf  # the last pause's begin, and the end of doubt
+        self._doubt = ""
         self.ends_s = -np.inf
+
+    def look(self, now_s: float) -> None:
+        """The own process goes on; call it every 20 ms."""
+        if self._looked_s is not None and now_s - self._looked_s > STALL_S:
+            if self._looked_s >= self._drained_s:
+                self._paused_s = self._looked_s
+            self._drained_s = now_s + DRAIN_S
+        self._looked_s = now_s
 
     def heard(self, is_open: bool, now_s: float) -> None:
         """Take a heartbeat."""
-        self._open, self._heard_s = is_open, now_s
+        self.look(now_s)
+        self._open = is_open
+        self._heard_s = now_s if now_s >= self._drained_s else self._paused_s
+
+    def doubt(self, why: str) -> None:
+        """Nobody knows whose heartbeats these are: closed; empty ends that."""
+        self._doubt = why
 
     def begin(self, gap_s: float, now_s: float) -> None:
         """A gap of a length at the most begins.
@@ -44,11 +66,13 @@ class Gap:
 
     def closed(self, now_s: float) -> str:
         """Why the robot may not be moved by the heartbeat; empty when it may."""
+        if self._doubt:
+            return self._doubt
         if self._heard_s == -np.inf:
             return "gap_open was never heard: let the PLC publish it at 5 Hz"
         silent_s = now_s - self._heard_s
         if not 0.0 <= silent_s <= self._stale_s:
-            return f"gap_open is silent for {silent_s:.2f} s (allowed {self._stale_s:g} s)"
+            return f"gap_open is silent for more than {self._stale_s:g} s"
         return "" if self._open else "gap_open is false"
 
     def over(self, now_s: float) -> str:

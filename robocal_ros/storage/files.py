@@ -67,8 +67,10 @@ def read_text(path: Path, what: str) -> str:
     return text
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, *, durable: bool = False) -> None:
     """Write a whole file or nothing: a reader never sees one that is half-written.
+
+    ``durable``: on the disk when this returns; not even a power cut loses it.
 
     Raises
     ------
@@ -79,8 +81,22 @@ def write_text(path: Path, text: str) -> None:
     try:
         with draft.open("w", encoding="utf-8", newline="") as stream:
             stream.write(text)
+            if durable:
+                stream.flush()
+                os.fsync(stream.fileno())
         draft.replace(path)
+        if durable:
+            sync_folder(path.parent)
     except OSError as error:
         draft.unlink(missing_ok=True)
         reason = error.strerror or error
         raise InputError(f"cannot be written: {reason}", file=str(path)) from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk; an `OSError` where that fails."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -116,6 +116,11 @@ class HistoryReader:
             )
         return cls(serial, file, ledger, model_hash)
 
+    def wait_at_most(self, seconds: float) -> None:
+        """From now on wait for other processes no longer than so."""
+        with storage_errors(self.path):
+            self._file.connection.execute(f"PRAGMA busy_timeout = {round(seconds * 1e3)}")
+
     def close(self) -> None:
         """Close the file; idempotent."""
         self._file.close()

@@ -1,12 +1,16 @@
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
+import signal
+import sqlite3
 import time
+from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from rclpy.action import ActionClient
+from rclpy.action import ActionClient, CancelResponse
 from robocal_msgs.action import RunMaintenance
 from robocal_msgs.msg import AccuracyState, MaintenanceStatus, SessionEvent
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
@@ -20,6 +24,7 @@ from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.sessions.maintenance import State
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
@@ -31,19 +36,23 @@ NODE = "/maintenance_node"
 class Plc:
     """The probe: heartbeat, a robot that stands, and calls."""
 
-    def __init__(self, graph: Any) -> None:
+    def __init__(self, graph: Any, start: Callable[[], Any]) -> None:
         self.graph = graph
-        self.is_open, self.q = True, np.radians(HOME_DEG)
+        self.is_open, self.beating, self.q = True, True, np.radians(HOME_DEG)
         self.names = list(load_robot("ur10").joint_names)
         self.states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
         self.statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
         self.events = graph.collect(SessionEvent, f"{NODE}/session_events", EVENTS)
-        self.node = graph.add(MaintenanceNode, {"serial": "K7", "home_deg": HOME_DEG})
+        self.node = start()
         self.gap = graph.publisher(Bool, "gap_open")
         self.joints = graph.publisher(JointState, "joint_states")
         self.sent = 0
         graph.probe.create_timer(PERIOD_S, self._beat)
-        graph.spin_for(0.5)
+        assert not self.run("").success  # discovers the call
+        graph.spin_until(lambda: self.statuses and self._ready(self.statuses[-1]), "it is ready")
+
+    def _ready(self, status: MaintenanceStatus) -> bool:
+        return bool(status.at_home and not status.doing)
 
     def _beat(self) -> None:
         self.sent += 1
@@ -51,7 +60,8 @@ class Plc:
         ns = self.sent * round(PERIOD_S * 1e9)
         message.header.stamp = Time(sec=1000 + ns // 10**9, nanosec=ns % 10**9)
         self.joints.publish(message)
-        self.gap.publish(Bool(data=self.is_open))
+        if self.beating:
+            self.gap.publish(Bool(data=self.is_open))
 
     def call(self, kind: type, name: str, **fields: Any) -> Any:
         return self.graph.call(kind, f"{NODE}/{name}", **fields)
@@ -65,9 +75,16 @@ class Plc:
         return str(answer.message)
 
 
+def process(graph: Any) -> Any:
+    """The node as its own process."""
+    node = graph.start("maintenance_node", {"serial": "K7", "home_deg": str(HOME_DEG)})
+    graph.spin_until(lambda: graph.probe.count_subscribers("gap_open"), "the node", 30.0)
+    return node
+
+
 @pytest.fixture
 def plc(graph: Any) -> Plc:
-    return Plc(graph)
+    return Plc(graph, lambda: graph.add(MaintenanceNode, {"serial": "K7", "home_deg": HOME_DEG}))
 
 
 def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
@@ -106,7 +123,7 @@ def test_the_action_does_the_same(plc, graph):
 
 def test_nothing_runs_while_the_gap_is_closed(plc, graph):
     plc.is_open = False
-    graph.spin_for(0.3)
+    graph.spin_until(lambda: plc.statuses[-1].doing == "gap_open is false", "it is told")
     refused = plc.run("4711")
     assert (refused.success, refused.status) == (False, Code.CONFLICT)
     assert "gap_open is false" in refused.message
@@ -143,28 +160,31 @@ def test_twins_of_a_plc_without_arguments(plc, graph):
     graph.spin_until(lambda: plc.trigger("status").startswith("0 ACCEPT"), "it ends")
     assert plc.trigger("cancel") == "0 CONFLICT no cycle runs"
     assert plc.trigger("acknowledge") == "0 ACCEPT there is no fault"
-    for name in ("accept", "reject"):
-        assert plc.trigger(name).startswith("0 CONFLICT one candidate must wait")
+    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait")
+    assert plc.trigger("reject") == "0 ACCEPT nothing waits for a decision"
     assert plc.trigger("rollback").startswith("0 BAD_INPUT nothing was accepted")
     for name in ("accept", "reject", "rollback"):
         for number in (0, 99):
             assert plc.call(Decide, name, id=number).status == Code.BAD_INPUT
 
 
-def candidates(graph: Any, count: int) -> list[int]:
-    """Thermal candidates that other nodes proposed, all against the nominal model."""
+def proposed(history: CalibrationHistory, based_on: int) -> int:
+    """A thermal candidate that another node proposes."""
+    arm = load_robot("ur10")
+    return history.propose(
+        Proposal(
+            model_hash=arm.model_hash, based_on=based_on, cycle_id="", stamp_ns=1, created_ns=1,
+            software="test", method="map", code=Code.ACCEPT, reason="better", document={},
+            model=model_document(arm),
+        )
+    )  # fmt: skip
+
+
+def candidates(graph: Any, count: int, based_on: int = 0) -> list[int]:
+    """Thermal candidates that other nodes proposed, all against one revision."""
     arm = load_robot("ur10")
     with CalibrationHistory.open("K7", model_hash=arm.model_hash, state_dir=graph.state) as history:
-        return [
-            history.propose(
-                Proposal(
-                    model_hash=arm.model_hash, based_on=0, cycle_id=f"c{i}", stamp_ns=i,
-                    created_ns=i, software="test", method="map", code=Code.ACCEPT, reason="better",
-                    document={}, model=model_document(arm),
-                )
-            )
-            for i in range(count)
-        ]  # fmt: skip
+        return [proposed(history, based_on) for _ in range(count)]
 
 
 def test_decisions_by_id_are_quick_and_stale_ones_are_told(plc, graph):
@@ -181,6 +201,152 @@ def test_decisions_by_id_are_quick_and_stale_ones_are_told(plc, graph):
     assert plc.trigger("rollback").startswith("0 ACCEPT revision 2: the nominal model in force")
     print("accept:", [f"{1e3 * took:.1f} ms" for took in took_s[1:]])
     assert max(took_s[1:]) < 0.5  # the first one has to find the service
+
+
+def test_a_decision_that_comes_twice_is_made_once(plc, graph):
+    first, *_ = candidates(graph, 2)
+    assert plc.call(Decide, "accept", id=first).revision == 1
+    second, third = candidates(graph, 2, based_on=1)
+    assert plc.call(Decide, "accept", id=second).revision == 2
+    for _ in range(2):
+        back = plc.call(Decide, "rollback", id=first)
+        assert (back.success, back.status, back.revision) == (True, Code.ACCEPT, 3), back.message
+    assert plc.call(Decide, "rollback", id=third).status == Code.CONFLICT  # never accepted
+    for words in (f"0 ACCEPT calibration {second} is taken back already",) * 2:
+        assert plc.trigger("rollback") == words
+    waiting = candidates(graph, 2, based_on=3)
+    words = "; ".join(f"calibration {number} rejected" for number in reversed(waiting))
+    assert plc.trigger("reject") == f"{waiting[0]} ACCEPT {words}"
+    assert plc.trigger("reject") == "0 ACCEPT nothing waits for a decision"
+    names = [event.command for event in plc.events]
+    assert names == ["accept", "accept", "rollback", "rollback", "reject", "reject"]  # one refused
+
+
+def test_the_last_acceptance_is_taken_back_once(plc, graph):
+    (first,) = candidates(graph, 1)
+    assert plc.call(Decide, "accept", id=first).revision == 1
+    (second,) = candidates(graph, 1, based_on=1)
+    assert plc.call(Decide, "accept", id=second).revision == 2
+    assert plc.trigger("rollback").startswith(f"{first} ACCEPT revision 3")
+    assert plc.trigger("rollback").startswith("0 ACCEPT")  # an answer was lost: no step further
+
+
+def test_a_history_that_another_process_holds_delays_nobody(plc, graph):
+    (number,) = candidates(graph, 1)
+    plc.call(Decide, "accept", id=0)  # discovered
+    with closing(sqlite3.connect(plc.node._history.path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        begin = time.monotonic()
+        held = plc.call(Decide, "accept", id=number, by="plc")
+        took_s = time.monotonic() - begin
+        assert held.status == Code.STORAGE_FAILED, held.message
+        other.execute("ROLLBACK")
+    assert took_s < 0.5  # waits 0.05 s; the rest is this machine's
+    assert plc.call(Decide, "accept", id=number, by="plc").success
+
+
+def test_a_history_that_cannot_be_read_leaves_nobody_waiting(plc, graph):
+    client = ActionClient(graph.probe, RunMaintenance, f"{NODE}/run_maintenance")
+    graph.spin_until(client.server_is_ready, "the action")
+    with closing(sqlite3.connect(plc.node._history.path)) as other:
+        other.executescript("ALTER TABLE calibrations RENAME TO gone")
+        sent = client.send_goal_async(RunMaintenance.Goal(cycle_id="a", gap_s=30.0))
+        graph.spin_until(sent.done, "the goal is taken")
+        ended = sent.result().get_result_async()
+        graph.spin_until(ended.done, "the result")
+        assert ended.result().result.status == Code.STORAGE_FAILED
+        graph.spin_for(1.2)  # diagnostics and accuracy_state come meanwhile
+        known = plc.call(GetMaintenance, "status", cycle_id="a")
+        assert (known.success, known.status) == (False, Code.STORAGE_FAILED)
+        assert known.state.state == MaintenanceStatus.IDLE
+        assert known.result == ended.result().result.result
+        assert plc.statuses[-1].last == known.result
+        assert plc.trigger("status").startswith("0 STORAGE_FAILED")
+        other.executescript("ALTER TABLE gone RENAME TO calibrations")
+    assert plc.call(GetMaintenance, "status", cycle_id="a").success
+
+
+def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
+    client = ActionClient(graph.probe, RunMaintenance, f"{NODE}/run_maintenance")
+    graph.spin_until(client.server_is_ready, "the action")
+    client.send_goal_async(RunMaintenance.Goal(cycle_id="a", gap_s=30.0))
+    session, calls = plc.node._session, plc.node._calls
+
+    def ended() -> bool:
+        known = session.result("a")
+        return known is not None and known.code is not Code.NONE
+
+    graph.spin_until(ended, "a has ended")
+    (goal,) = calls._goals  # its caller is not told yet
+    session.run("b", 30.0, time.monotonic(), time.time_ns())
+    assert calls._cancel(goal) is CancelResponse.REJECT
+    graph.spin_until(lambda: session.running is None, "b has ended")
+    assert session.result("b").code is Code.ACCEPT
+
+
+def test_a_node_that_is_deactivated_says_so(plc, graph):
+    call = graph.probe.create_client(RunMaintenanceCycle, f"{NODE}/run")
+    graph.spin_until(call.service_is_ready, "the call")
+    graph.spin_for(0.5)
+    call.call_async(RunMaintenanceCycle.Request(cycle_id="a", gap_s=30.0))
+    graph.spin_until(lambda: plc.node._session.running, "it runs")
+    plc.node._show()
+    assert plc.node._shown.state is State.RUNNING
+    plc.node.trigger_deactivate()
+    graph.spin_until(lambda: plc.statuses[-1].last.cycle_id == "a", "the last word")
+    assert plc.statuses[-1].state == MaintenanceStatus.IDLE
+    assert plc.statuses[-1].last.code == Code.CONFLICT
+    graph.spin_until(lambda: plc.states[-1].state == AccuracyState.FAULT, "the line is told")
+    assert "deactivated" in plc.states[-1].reason
+
+
+def test_a_second_publisher_of_the_heartbeat_closes_the_gap(plc, graph):
+    other = graph.probe.create_publisher(Bool, "gap_open", 10)
+    words = "gap_open has 2 publishers (probe, probe): let one alone publish it"
+    graph.spin_until(lambda: plc.statuses[-1].doing == words, "it is told")
+    refused = plc.run("4711")
+    assert (refused.success, refused.status) == (False, Code.CONFLICT)
+    assert refused.message == f"{words}: the robot is not moved"
+    graph.probe.destroy_publisher(other)
+    graph.spin_until(lambda: plc.statuses[-1].doing == "", "one is left")
+    assert plc.run("4711").success
+
+
+def test_a_heartbeat_that_cannot_be_heard_is_told(graph):
+    graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
+    statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
+    graph.probe.create_publisher(Bool, "gap_open", qos.own(qos.SENSOR))
+    words = "gap_open of probe is BEST_EFFORT and not heard: publish it RELIABLE"
+    graph.spin_until(lambda: statuses and statuses[-1].doing == words, "it is told")
+
+
+def test_heartbeats_that_waited_for_the_node_do_not_count(graph):
+    plc = Plc(graph, lambda: process(graph))
+    plc.node.process.send_signal(signal.SIGSTOP)
+    graph.spin_for(1.0)  # twenty heartbeats wait
+    plc.beating = False  # the PLC dies
+    graph.spin_for(1.0)
+    plc.node.process.send_signal(signal.SIGCONT)
+    for name in ("b", "c", "d"):
+        refused = plc.run(name)
+        assert refused.status == Code.CONFLICT, refused.message
+        assert refused.message.startswith("gap_open is silent for more than 0.5 s")
+    plc.beating = True
+    graph.spin_until(lambda: plc.run("e").success, "heartbeats count again")
+
+
+def test_a_state_that_is_lost_is_a_fault(plc, graph):
+    assert plc.run("4711").success
+    graph.spin_until(lambda: plc.run("4711").result.code == Code.ACCEPT, "it ends")
+    plc.node.trigger_deactivate()
+    plc.node._keeper.path.unlink()
+    plc.node.trigger_activate()
+    graph.spin_for(0.3)
+    refused = plc.run("4711")
+    assert (refused.status, "state.json is gone" in refused.message) == (Code.CONFLICT, True)
+    assert plc.statuses[-1].fault_code == Code.STORAGE_FAILED
+    assert plc.call(Acknowledge, "acknowledge", by="me").success
+    assert plc.run("4712").success
 
 
 @pytest.mark.parametrize(

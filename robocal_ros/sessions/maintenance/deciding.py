@@ -21,7 +21,11 @@ from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
 SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser
-DONE = {ACCEPT: State.IN_FORCE, REJECT: State.REJECTED}  # what a repeated decision finds
+DONE = {  # what a repeated decision finds
+    ACCEPT: State.IN_FORCE,
+    REJECT: State.REJECTED,
+    ROLLBACK: State.IN_FORCE,
+}
 
 
 class Decider:
@@ -104,18 +108,37 @@ class Decider:
             raise ConflictError(f"one candidate must wait, found {words}: decide by id")
         return newest[0]
 
-    def last_accepted(self) -> str:
-        """Kind of the newest acceptance.
+    def decide_only(self, name: str, by: str, wall_ns: int) -> list[Outcome]:
+        """A decision without an id; what was done, in its order.
+
+        Accept: the one candidate that waits. Reject: all that wait. Rollback: take the last
+        acceptance back. The last two may come twice: nothing more is done.
 
         Raises
         ------
-        InputError
-            When nothing was accepted.
+        RobocalError
+            As `decide`, `only_pending`; BAD_INPUT where nothing was ever accepted.
         """
-        for decision in reversed(self._history.decisions()):
-            if decision.kind in KINDS and decision.action is Action.ACCEPT:
-                return decision.kind
-        raise InputError("nothing was accepted: there is nothing to roll back")
+        if name == ROLLBACK:
+            return [self._take_back(by, wall_ns)]
+        if name == ACCEPT:
+            return [self.decide(name, self.only_pending().id, by, "", wall_ns)]
+        waiting = [entry.id for kind in KINDS for entry in self.pending(kind)]
+        if not waiting:
+            return [_nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")]
+        return [self.decide(name, number, by, "", wall_ns) for number in waiting]
+
+    def _take_back(self, by: str, wall_ns: int) -> Outcome:
+        made = [d for d in self._history.decisions() if d.kind in KINDS]
+        accepted = [d for d in made if d.action is Action.ACCEPT]
+        if not accepted:
+            raise InputError("nothing was accepted: there is nothing to roll back")
+        last = accepted[-1]
+        since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
+        if not any(d.action is Action.ROLLBACK for d in since):
+            return self.roll_back(last.kind, by, "", wall_ns)
+        command = Command(ROLLBACK, {"previous": True, "by": by})
+        return _nothing_to_do(command, f"calibration {last.calibration_id} is taken back already")
 
     def _carried_out(self, command: Command, kind: str, revision: int, wall_ns: int) -> Outcome:
         outcome = decide(self._history, command, revision, wall_ns, kind)
@@ -187,3 +210,7 @@ class Decider:
         tip = np.append(self._config.T_flange_tool[:3, 3], 1.0)
         shift = (arm.fk(q) @ tip - cold.fk(q) @ tip)[:, :3]
         return float(np.max(np.linalg.norm(shift, axis=1)))
+
+
+def _nothing_to_do(command: Command, words: str) -> Outcome:
+    return Outcome(command, Code.ACCEPT, words, repeated=True)

@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import StateLostError
 
 REMEMBERED = 200  # ended cycles
 
@@ -13,7 +14,7 @@ class Keeper(Protocol):
     """Keeps one document; whole or not at all."""
 
     def load(self) -> Mapping[str, Any] | None:
-        """What was kept last; None before anything was."""
+        """What was kept last; None before anything; raises `StateLostError` where it is gone."""
 
     def save(self, document: Mapping[str, Any]) -> None:
         """Keep it; raises a `RobocalError` when that fails."""
@@ -101,14 +102,20 @@ class Memory:
 
     @classmethod
     def load(cls, keeper: Keeper) -> "Memory":
-        """Read what is kept; a cycle that was open is a fault: nobody knows where the robot is.
+        """Read what is kept; a fault where a cycle was open, or where what was kept is gone.
 
         Raises
         ------
         RobocalError
             When it cannot be read.
         """
-        document = keeper.load()
+        try:
+            document = keeper.load()
+        except StateLostError as error:
+            memory = cls(keeper)
+            known = "ended cycles, whose ids would run again, the last check, an open fault"
+            memory.set_fault(error.code, f"{error} ({known}): see where the robot is")
+            return memory
         if document is None:
             return cls(keeper)
         results = [CycleResult.of_document(each) for each in document["cycles"]]

@@ -6,15 +6,16 @@ their order. Times ``now_s`` are of one steady clock; ``wall_ns`` is the wall cl
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, LimitError
+from robocal_ros.core.errors import ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL
-from robocal_ros.sessions.events import ROLLBACK, Command, Outcome
+from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift, accuracy_of
 from robocal_ros.sessions.maintenance.conductor import Conductor
@@ -72,6 +73,10 @@ class MaintenanceSession:
     def gap(self, is_open: bool, now_s: float) -> None:
         """Take a heartbeat of ``gap_open``."""
         self._hands.gap.heard(is_open, now_s)
+
+    def doubt_gap(self, why: str) -> None:
+        """The heartbeats do not count, and why; empty: they do."""
+        self._hands.gap.doubt(why)
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,), in the arm's order; ``stamp_s`` on their own clock."""
@@ -158,18 +163,18 @@ class MaintenanceSession:
         return outcome
 
     def decide_only(self, name: str, by: str, wall_ns: int) -> Outcome:
-        """The same about the one candidate that waits; a rollback takes the last acceptance back.
+        """The same without an id, see `Decider.decide_only`.
 
         Raises
         ------
         RobocalError
-            When there is not one; as `decide`.
+            When there is nothing to decide about; as `decide`.
         """
-        if name != ROLLBACK:
-            return self.decide(name, self._decider.only_pending().id, by, "", wall_ns)
-        outcome = self._decider.roll_back(self._decider.last_accepted(), by, "", wall_ns)
-        self._decided(outcome)
-        return outcome
+        outcomes = self._decider.decide_only(name, by, wall_ns)
+        for outcome in outcomes:
+            self._decided(outcome)
+        answer = next((outcome for outcome in outcomes if not outcome.done), outcomes[-1])
+        return replace(answer, message="; ".join(outcome.message for outcome in outcomes))
 
     def acknowledge(self, by: str) -> str:
         """End a fault, in words; without one nothing happens.
@@ -199,6 +204,7 @@ class MaintenanceSession:
         """Look at everything, and go on; what is to be carried out now, in this order."""
         hands = self._hands
         hands.now_s = now_s
+        hands.gap.look(now_s)
         hands.robot.look(now_s)
         self._conductor.tick(wall_ns)
         return hands.handed_out()
@@ -244,8 +250,12 @@ class MaintenanceSession:
         memory, hands, run = self._memory, self._hands, self._conductor.run
         last = next(reversed(memory.cycles.values()), None)
         named = last.cycle_id if last is not None else ""
-        pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
-        thermal, tool = (found[0].id if found else 0 for found in pending)
+        thermal, tool, trouble = 0, 0, ""
+        try:
+            pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
+            thermal, tool = (found[0].id if found else 0 for found in pending)
+        except RobocalError as error:
+            trouble = str(error)
         return Status(
             state=self.state,
             cycle_id=named if run is None else run.result.cycle_id,
@@ -258,6 +268,8 @@ class MaintenanceSession:
             tool_pending=tool,
             fault_code=memory.fault_code,
             fault=memory.fault,
+            closed=hands.gap.closed(now_s),
+            trouble=trouble,
         )
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:

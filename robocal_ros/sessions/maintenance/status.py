@@ -33,6 +33,8 @@ class Status:
     last : how the last cycle ended; None before any.
     thermal_pending, tool_pending : newest candidates that wait for a decision; 0: none.
     fault_code, fault : NONE and empty without one.
+    closed : why the gap counts as closed; empty while it is open.
+    trouble : why nobody knows what waits; empty: the pending ids are true.
     """
 
     state: State
@@ -46,3 +48,5 @@ class Status:
     tool_pending: int
     fault_code: Code
     fault: str
+    closed: str = ""
+    trouble: str = ""

@@ -1,0 +1,120 @@
+"""The maintenance of a whole cell over DDS, at the limits as they are set, and how long calls take.
+
+Not of ``make test``, which shares its machine: a part of ``make soak``, or
+
+    tools/with_ros python -m pytest -s test/nodes/soak_maintenance.py
+"""
+
+import os
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from maintenance_live import SERIAL, LiveCell
+from robocal_msgs.action import MeasureTool
+from robocal_msgs.msg import AccuracyState, MaintenanceStatus
+from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
+from std_srvs.srv import Trigger
+from test_maintenance_calls import HOME_DEG, Plc, process, proposed
+
+from robocal_ros.core.codes import Code
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+GAP_S = 150.0
+COUNT = 30
+PATIENCE_S = 0.5  # what docs/plc.md tells a PLC to wait
+
+
+def test_a_whole_gap_at_the_limits_as_they_are_set(graph: Any, tmp_path: Path) -> None:
+    print("load", os.getloadavg())
+    cell = LiveCell(graph, tmp_path, busy=False, tool_bend_mm="[1.5, -0.8, 0.4]")
+    cell.capture_reference()
+    begin = time.monotonic()
+    first = cell.run("c1", GAP_S)
+    print(f"first gap: {time.monotonic() - begin:.1f} s: {first.message}")
+    assert first.success, first.message
+    assert first.result.complete, first.message
+    assert first.result.tool_answer == MeasureTool.Result.RECALIBRATE
+    assert cell.at_home()
+    answer = graph.call(Decide, "/maintenance_node/accept", id=first.result.tool_id, by="plc")
+    assert answer.success, answer.message
+    begin = time.monotonic()
+    second = cell.run("c2", GAP_S)
+    print(f"second gap: {time.monotonic() - begin:.1f} s: {second.message}")
+    assert second.success, second.message
+    assert second.result.tool_answer == MeasureTool.Result.PASS, second.message
+    assert cell.state(AccuracyState.OK).bound_mm > 0.0
+    print("load", os.getloadavg())
+
+
+def test_calls_do_their_work_in_time(graph: Any, tmp_path: Path) -> None:
+    took_s: dict[str, list[float]] = defaultdict(list)
+    cell = LiveCell(graph, tmp_path)
+    cell.capture_reference()
+    arm = load_robot("ur10")
+    with CalibrationHistory.open(
+        SERIAL, model_hash=arm.model_hash, state_dir=graph.state
+    ) as history:
+
+        def timed(kind: type, name: str, **fields: Any) -> Any:
+            answer, seconds = cell.timed_once(kind, name, **fields)
+            assert answer.success, (name, answer.message)
+            took_s[name].append(seconds)
+            return answer
+
+        for kind, name in {
+            Decide: ("accept", "reject", "rollback"),
+            GetMaintenance: ("status",),
+            RunMaintenanceCycle: ("run",),
+            Trigger: ("cancel_trigger",),
+        }.items():
+            for each in name:
+                graph.call(kind, f"/maintenance_node/{each}")  # discovers it
+        base = proposed(history, 0)
+        assert graph.call(Decide, "/maintenance_node/accept", id=base).success
+        for number in range(COUNT):
+            sent = len(cell.sent)
+            timed(RunMaintenanceCycle, "run", cycle_id=f"c{number}", gap_s=GAP_S)
+            graph.spin_until(lambda sent=sent: len(cell.sent) > sent, "a motion", within_s=30.0)
+            graph.spin_until(lambda: not cell.at_home(), "it moves")
+            timed(GetMaintenance, "status")
+            in_force = history.head().revision
+            good, bad = proposed(history, in_force), proposed(history, in_force)
+            timed(Decide, "reject", id=bad)
+            timed(Decide, "accept", id=good)
+            timed(Decide, "rollback", id=base)
+            assert history.head().calibration_id == base
+            timed(Trigger, "cancel_trigger")
+            graph.spin_until(
+                lambda: cell.statuses[-1].state == MaintenanceStatus.IDLE, "home", within_s=60.0
+            )
+    show(took_s)
+    assert max(max(times) for times in took_s.values()) < PATIENCE_S
+
+
+def test_an_acknowledgement_is_in_time(graph: Any) -> None:
+    """The robot stands: it is a fault that ends."""
+    plc = Plc(graph, lambda: process(graph))
+    plc.call(Acknowledge, "acknowledge")
+    took_s = []
+    for number in range(COUNT):
+        plc.q = np.radians(HOME_DEG) + 0.1
+        graph.spin_for(0.2)
+        assert plc.run(f"c{number}").status == Code.LIMIT_EXCEEDED
+        plc.q = np.radians(HOME_DEG)
+        graph.spin_for(0.2)
+        begin = time.monotonic()
+        assert plc.call(Acknowledge, "acknowledge", by="plc").success
+        took_s.append(time.monotonic() - begin)
+    show({"acknowledge": took_s})
+    assert max(took_s) < PATIENCE_S
+
+
+def show(took_s: dict[str, list[float]]) -> None:
+    print(time.strftime("%Y-%m-%d %H:%M"), "load", os.getloadavg(), "cores", os.cpu_count())
+    for name, times in took_s.items():
+        ms = 1e3 * np.array(times)
+        print(f"{name}: n {len(ms)}, median {np.median(ms):.1f} ms, longest {ms.max():.1f} ms")

@@ -1,0 +1,54 @@
+"""The state of a robot beside its history: whole, on the disk, and missed when it is gone."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from robocal_ros.core.errors import StateLostError, StorageError
+from robocal_ros.storage.state_files import StateFile
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Path:
+    return tmp_path / "K1.sqlite"
+
+
+def test_a_document_comes_back(history):
+    keeper = StateFile(history, "maintenance")
+    assert keeper.load() is None
+    keeper.save({"a": 1})
+    assert StateFile(history, "maintenance").load() == {"a": 1}
+
+
+def test_a_power_cut_loses_nothing_that_was_saved(history, monkeypatch):
+    """The file is on the disk before it takes its name, and its name before save returns."""
+    keeper = StateFile(history, "maintenance")
+    before = keeper.path.stat().st_ino
+    synced: list[tuple[int, int]] = []  # what was brought to the disk; what had the name then
+    sync = os.fsync
+
+    def spied(descriptor: int) -> None:
+        sync(descriptor)
+        synced.append((os.fstat(descriptor).st_ino, keeper.path.stat().st_ino))
+
+    monkeypatch.setattr(os, "fsync", spied)
+    keeper.save({"a": 1})
+    saved, folder = keeper.path.stat().st_ino, keeper.path.parent.stat().st_ino
+    assert synced == [(saved, before), (folder, saved)]
+
+
+def test_a_state_that_was_there_once_is_missed(history):
+    keeper = StateFile(history, "maintenance")
+    keeper.path.unlink()
+    for each in (keeper, StateFile(history, "maintenance")):
+        with pytest.raises(StateLostError, match=r"state\.json is gone"):
+            each.load()
+
+
+def test_a_state_that_is_no_document_is_refused(history):
+    keeper = StateFile(history, "maintenance")
+    for text in ("", "{", "[1]"):
+        keeper.path.write_text(text)
+        with pytest.raises(StorageError):
+            keeper.load()
