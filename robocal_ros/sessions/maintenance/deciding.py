@@ -9,7 +9,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, State
 from robocal_ros.core.tool.judging import KnownTool, change_between
 from robocal_ros.sessions.decisions import decide
-from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command, Outcome
+from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
@@ -153,3 +153,9 @@ class Decider:
         taught = np.array(model["made_with"]["taught"])
         change = change_between(taught, KnownTool.of_document(model).T_flange_tool)
         return change.tip_m, change.axis_rad
+
+
+def withholding(kind: str, calibration_id: int, why: str) -> Outcome:
+    """A candidate is left to a person, for the record."""
+    words = f"{kind} candidate {calibration_id} waits for a decision: {why}"
+    return Outcome(Command(WITHHOLD, {"id": calibration_id, "kind": kind}), Code.ACCEPT, words)
