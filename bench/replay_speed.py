@@ -24,7 +24,7 @@ from robocal_ros.storage.robots import load_robot
 
 HOURS = (2.0, 8.0)
 TURNS = 3
-BAGS, BAG_HOURS = 8, 1.0  # validated one after the other, then beside each other
+BAGS = 8  # of the shorter length, validated one after the other, then beside each other
 CORES = 2
 LEAST_RATIO = 5.0  # to the decoded rate
 LEAST_TIMES = 500.0  # real time
@@ -36,7 +36,7 @@ def tables() -> list[Table]:
     """Ingestion of joint states, whole replays of two lengths, many bags beside each other."""
     with tempfile.TemporaryDirectory() as name:
         shifts = [write_shift(Path(name) / f"{hours:g}h.mcap", hours) for hours in HOURS]
-        return [_ingestion(shifts[0]), _replays(shifts), _many(Path(name))]
+        return [_ingestion(shifts[0]), _replays(shifts), _many(shifts[0])]
 
 
 def _ingestion(shift: LongShift) -> Table:
@@ -163,33 +163,35 @@ def _replayed(shift: LongShift) -> _Cost:
     return _Cost(wall_s, cpu_s, float(done.stderr.split()[-1]) / 1024.0)
 
 
-def _many(folder: Path) -> Table:
+def _many(shift: LongShift) -> Table:
+    hours = shift.duration_s / 3600.0
     table = Table(
         "many_bags",
-        f"robocal validate of {BAGS} bags of {BAG_HOURS:g} h each",
-        ("processes", "took, s", "hours of recording per minute", "gain", "goal"),
+        f"robocal validate of {BAGS} bags of {hours:.2f} h each",
+        ("processes", "took, s", "times real time", "gain", "goal"),
         "From the start of the command to its report, the start of the processes included.",
     )
-    bags = _copies(write_shift(folder / "bag-1.mcap", BAG_HOURS).path)
-    alone_s = _validated(bags, 1, folder)
-    for jobs, took_s in ((1, alone_s), (CORES, _validated(bags, CORES, folder))):
+    bags = _copies(shift.path)
+    alone_s = _validated(bags, 1)
+    for jobs, took_s in ((1, alone_s), (CORES, _validated(bags, CORES))):
         gain = alone_s / took_s
         goal = Goal(gain, LEAST_GAIN, at_least=True) if jobs > 1 else None
-        table.add(jobs, took_s, BAGS * BAG_HOURS * 60.0 / took_s, gain, goal)
+        table.add(jobs, took_s, BAGS * shift.duration_s / took_s, gain, goal)
     return table
 
 
 def _copies(bag: Path) -> list[Path]:
-    others = [bag.with_name(f"bag-{number}.mcap") for number in range(2, BAGS + 1)]
-    for other in others:
-        shutil.copyfile(bag, other)
-    return [bag, *others]
+    copies = [bag.with_name(f"bag-{number}.mcap") for number in range(1, BAGS + 1)]
+    for copy in copies:
+        shutil.copyfile(bag, copy)
+    return copies
 
 
-def _validated(bags: list[Path], jobs: int, folder: Path) -> float:
+def _validated(bags: list[Path], jobs: int) -> float:
     """Time, s, of the command in a process of its own."""
     command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *map(str, bags)]
-    command += ["--robot", ROBOT, "--jobs", str(jobs), "--report", str(folder / f"report-{jobs}")]
+    report = bags[0].with_name(f"report-{jobs}")
+    command += ["--robot", ROBOT, "--jobs", str(jobs), "--report", str(report)]
     start = time.perf_counter()
     subprocess.run(command, capture_output=True, text=True, check=True)
     return time.perf_counter() - start
