@@ -129,6 +129,7 @@ class _Session:
         self._job, self._reader, self._topic = job, reader, topic
         self._given = {} if topic is None else {EVENTS: topic}
         self._recording = open_recording(reader, self._given)
+        self._mark = " (simulated)" if is_simulated(reader) else ""
         self._forecasts = Forecasts()
         self._warnings: list[str] = []
         self._arm: SerialArm | None = None
@@ -142,7 +143,7 @@ class _Session:
             if is_tool_session(configured):
                 runs = tool_runs(replayed, true_transforms(reader, TOOL, "T_flange_tool"))
                 found = {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
-                return common | found, tool_figures(runs)
+                return common | found, tool_figures(runs, self._mark)
             if is_hand_eye_session(configured):
                 truth = true_transforms(reader, HAND_EYE, "T_flange_sensor")
                 made = {"calibrations": calibrations(replayed, truth)}
@@ -188,7 +189,9 @@ class _Session:
             cycles = made.cycles(self._forecasts, check_points(self._reader), sigma_m)
         document = thermal_document(cycles, arm)
         truth = drift_report(self._job.name, cycles, arm)
-        return {"kind": "thermal", **document}, thermal_figures(document["cycles"], truth)
+        return {"kind": "thermal", **document}, thermal_figures(
+            document["cycles"], truth, self._mark
+        )
 
     def _common(self, replayed: Document) -> Document:
         configured, recorded = self._recording.configured, bool(self._recording.commands)

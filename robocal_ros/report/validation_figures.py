@@ -77,8 +77,10 @@ def cell_figures(course: CellCourse) -> tuple[Drawn, ...]:
     return (Drawn.of("cell", CELL_CAPTION, cell_figure(course)),)
 
 
-def thermal_figures(cycles: Sequence[Document], truth: DriftReport | None) -> list[Drawn]:
-    """Figures of a thermal session: errors, and how the model moved."""
+def thermal_figures(
+    cycles: Sequence[Document], truth: DriftReport | None, mark: str = ""
+) -> list[Drawn]:
+    """Figures of a thermal session: errors, and how the model moved; ``mark`` ends their titles."""
     found = []
     if truth is not None:
         caption = "True error at poses that were never measured"
@@ -86,7 +88,7 @@ def thermal_figures(cycles: Sequence[Document], truth: DriftReport | None) -> li
         found.append(Drawn.of("poses", "True error of each check pose", error_by_pose(truth)))
     if not cycles:
         return found
-    found.append(Drawn.of("cycles", CYCLES_CAPTION, accuracy_by_cycle(cycles)))
+    found.append(Drawn.of("cycles", CYCLES_CAPTION, accuracy_by_cycle(cycles, mark)))
     names = list(cycles[0]["drift"])
     moved = ModelDrift(
         hours=np.array([cycle["hours"] for cycle in cycles]),
@@ -98,7 +100,7 @@ def thermal_figures(cycles: Sequence[Document], truth: DriftReport | None) -> li
     return found
 
 
-def accuracy_by_cycle(cycles: Sequence[Document]) -> Figure:
+def accuracy_by_cycle(cycles: Sequence[Document], mark: str = "") -> Figure:
     """Rms errors of each cycle without correction, in force and candidate, and the bound."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.6), layout="constrained")
@@ -128,11 +130,11 @@ def accuracy_by_cycle(cycles: Sequence[Document]) -> Figure:
             xlabel += "   (triangle: a new model came into force)"
         axes.axhline(TOLERANCE_MM, color=FAINT, lw=0.8, ls=(0, (4, 3)))
         axes.set(xlabel=xlabel, ylabel="rms error, mm", ylim=(0.0, None))
-        titled(axes, "Held-out error at each cycle's poses")
+        titled(axes, f"Held-out error at each cycle's poses{mark}")
     return figure
 
 
-def tool_figures(runs: Sequence[Document]) -> list[Drawn]:
+def tool_figures(runs: Sequence[Document], mark: str = "") -> list[Drawn]:
     """The history of a tool: by how much each run found it moved."""
     known = [run for run in runs if run["change_mm"] is not None]
     if not known:
@@ -162,6 +164,6 @@ def tool_figures(runs: Sequence[Document]) -> list[Drawn]:
             axes.margins(x=0.1)
         else:
             axes.set_xlabel("hours since the first run")
-        titled(axes, "Change of the tool that each run found")
+        titled(axes, f"Change of the tool that each run found{mark}")
     caption = "Against the tool in force at the run, with two standard deviations."
     return [Drawn.of("tool", caption, figure)]
