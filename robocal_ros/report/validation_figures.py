@@ -122,8 +122,11 @@ def accuracy_by_cycle(cycles: Sequence[Document], mark: str = "") -> Figure:
             )  # fmt: skip
         faults = [cycle for cycle in cycles if cycle["verdict"]["code"] not in _NO_FAULT]
         if faults:
-            hours, rms = zip(*((c["hours"], c["candidate"]["rms_mm"]) for c in faults), strict=True)
-            axes.plot(hours, rms, "x", color=BEFORE, ms=9, mew=1.6, ls="none", label="refused")
+            axes.plot(
+                [cycle["hours"] for cycle in faults],
+                [cycle["candidate"]["rms_mm"] for cycle in faults],
+                "x", color=BEFORE, ms=9, mew=1.6, ls="none", label="refused",
+            )  # fmt: skip
         xlabel = "hours since the cold reference"
         if taken := [cycle["hours"] for cycle in cycles if cycle["revision"]]:
             axes.plot(taken, [0.0] * len(taken), "^", color=AFTER, ms=5, clip_on=False, zorder=5)
