@@ -8,6 +8,7 @@ closed loop (`bench.closed_loop`). The bag holds:
   ``beam_events``: what the cell says;
 - ``/thermal_node/session_events``, ``/tcf_node/session_events``: what the sessions made of it, for
   ``robocal replay``; ``/maintenance_node/session_events``: what was run and decided;
+- ``/accuracy_state``: what the line reads;
 - ``/truth/state``: for judging only: warmth, faults, true error of the tool at the working poses.
 
 ``--excerpt`` makes ``golden_excerpt.mcap`` beside this script instead: ten minutes of it, with the
@@ -30,6 +31,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # for the bench
 
 from bench.closed_loop import setting  # noqa: E402
+from bench.closed_loop.judging import Figures  # noqa: E402
 from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
 from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
 from robocal_ros.core.samples import (  # noqa: E402
@@ -57,7 +59,7 @@ AHEAD_S = 2.0 * PASS_S  # the sessions hear every reading from so long before it
 NODES = {"thermal": "thermal_node", "tool": "tcf_node", "maintenance": "maintenance_node"}
 THERMAL = {kind: f"/{kind}" for kind in (JOINTS, SPHERE_CLOUD, REFERENCE_SPHERE, TEMPERATURES)}
 TOOL = {kind: f"/{kind}" for kind in (JOINTS, EDGES)}
-TRUTH = "/truth/state"
+ACCURACY, TRUTH = "/accuracy_state", "/truth/state"
 CLOUD_FIELDS = [
     {"name": name, "offset": 4 * i, "datatype": 7, "count": 1} for i, name in enumerate("xyz")
 ]
@@ -102,13 +104,18 @@ class Recorder:
             self._write_sample(sample, shots)
         if int(self.plant.now_s) != self._second:
             self._second = int(self.plant.now_s)
-            self._write(TRUTH, "std_msgs/msg/String", {"data": json.dumps(self._truth())})
+            told = {"data": json.dumps(self._truth())}
+            self._write(TRUTH, "std_msgs/msg/String", told, self.plant.clock.now_ns)
+            self._write_accuracy()
 
     def record(self, node: str, command: Command, outcome: Outcome | None) -> None:
         """Write what a session was told, and what came of it."""
         if not self._inside():
             return
-        self._logs[node].write(command, outcome, self.plant.clock.now_ns)
+        now_ns = self.plant.clock.now_ns
+        if command.stamp_ns is None:  # the maintenance has no clock
+            command = replace(command, stamp_ns=now_ns)
+        self._logs[node].write(command, outcome, now_ns)
         self._show_in_force()
 
     def _show_in_force(self) -> None:
@@ -134,20 +141,40 @@ class Recorder:
 
     def _truth(self) -> dict[str, Any]:
         cell = self.plant.cell
-        error = np.linalg.norm(cell.tcp_error(WORK), axis=1)
         told = {
             "simulated": True,
             "cell_time_s": cell.now_s,
             "faults": dict(cell.faults.sizes),
             "motor_k": cell.warmth.motor.tolist(),
             "link_k": cell.warmth.link.tolist(),
-            "tcp_error_rms_m": float(np.sqrt(np.mean(error**2))),
             "T_flange_tool": cell.tool.T_flange_tool.tolist(),
         }
-        if self.plant.commanded is not None:
-            off = np.linalg.norm(cell.tcp_error(self.plant.commanded), axis=1)
-            told["commanded_tcp_error_rms_m"] = float(np.sqrt(np.mean(off**2)))
+        for name, q in (("", WORK), ("commanded_", self.plant.commanded)):
+            if q is not None:
+                found = Figures.of(cell.tcp_error(q))
+                told[f"{name}tcp_error_rms_m"] = found.rms_m
+                told[f"{name}tcp_error_p95_m"] = found.p95_m
+                told[f"{name}within_share"] = found.within
         return told
+
+    def _write_accuracy(self) -> None:
+        suite = self.plant.suite
+        if suite is None:
+            return
+        found = suite.accuracy()
+        error = found.error
+        message = {
+            "header": {"stamp": ros_time(self.plant.clock.now_ns), "frame_id": "base"},
+            "robot": suite.thermal.nominal.name,
+            "serial": setting.SERIAL,
+            "state": int(found.level),
+            "predicted_error_mm": -1.0 if error is None else error.rms_m * 1e3,
+            "bound_mm": -1.0 if error is None else error.bound_m * 1e3,
+            "tolerance_mm": setting.TOLERANCE_M * 1e3,
+            "due_in_s": found.due_in_s,
+            "reason": found.reason,
+        }
+        self._write(ACCURACY, "robocal_msgs/msg/AccuracyState", message, self.plant.clock.now_ns)
 
     def _write_sample(self, sample: Sample, shots: Mapping[int, np.ndarray]) -> None:
         header: dict[str, Any] = {"stamp": ros_time(sample.stamp_ns)}
@@ -158,7 +185,7 @@ class Recorder:
                     "name": list(sample.names),
                     "position": sample.position,
                 }
-                self._write(f"/{JOINTS}", "sensor_msgs/msg/JointState", message)
+                self._write(f"/{JOINTS}", "sensor_msgs/msg/JointState", message, sample.stamp_ns)
             case EdgeSample():
                 edge = {
                     "header": header | {"frame_id": sample.station},
@@ -166,13 +193,15 @@ class Recorder:
                     "edge": BREAK if sample.blocked else RESTORE,
                     "stamp_sigma_s": sample.sigma_s,
                 }
-                self._write(f"/{EDGES}", "robocal_msgs/msg/BeamEvent", edge)
+                self._write(f"/{EDGES}", "robocal_msgs/msg/BeamEvent", edge, sample.stamp_ns)
             case TemperatureSample():
                 told = {
                     "header": header | {"frame_id": sample.joint},
                     "temperature": sample.celsius,
                 }
-                self._write(f"/{TEMPERATURES}", "sensor_msgs/msg/Temperature", told)
+                self._write(
+                    f"/{TEMPERATURES}", "sensor_msgs/msg/Temperature", told, sample.stamp_ns
+                )
             case PointSample():
                 header["frame_id"] = f"{sample.frame}/{sample.target}"
                 self._write_sphere(sample, header, shots)
@@ -183,7 +212,9 @@ class Recorder:
         if sample.topic == REFERENCE_SPHERE:
             x, y, z = sample.position_m.tolist()
             message = {"header": header, "point": {"x": x, "y": y, "z": z}}
-            self._write(f"/{REFERENCE_SPHERE}", "geometry_msgs/msg/PointStamped", message)
+            self._write(
+                f"/{REFERENCE_SPHERE}", "geometry_msgs/msg/PointStamped", message, sample.stamp_ns
+            )
             return
         data = shots[sample.stamp_ns].astype("<f4")
         cloud = {
@@ -197,10 +228,10 @@ class Recorder:
             "data": np.frombuffer(data.tobytes(), dtype=np.uint8),
             "is_dense": True,
         }
-        self._write(f"/{SPHERE_CLOUD}", "sensor_msgs/msg/PointCloud2", cloud)
+        self._write(f"/{SPHERE_CLOUD}", "sensor_msgs/msg/PointCloud2", cloud, sample.stamp_ns)
 
-    def _write(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
-        self._bag.write(topic, kind, message, self.plant.clock.now_ns)
+    def _write(self, topic: str, kind: str, message: Mapping[str, Any], at_ns: int) -> None:
+        self._bag.write(topic, kind, message, at_ns)
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """How fast a bag is replayed, beside the library that decodes it. The shift is simulated."""
 
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -23,16 +24,19 @@ from robocal_ros.storage.robots import load_robot
 
 HOURS = (2.0, 8.0)
 TURNS = 3
+BAGS = 8  # of the shorter length, validated one after the other, then beside each other
+CORES = 2
 LEAST_RATIO = 5.0  # to the decoded rate
 LEAST_TIMES = 500.0  # real time
 MOST_GROWTH = 1.1  # of memory and of cost per hour, from the shorter bag to the longer
+LEAST_GAIN = 1.7  # of two cores over one
 
 
 def tables() -> list[Table]:
-    """Ingestion of joint states, and whole replays of two lengths."""
+    """Ingestion of joint states, whole replays of two lengths, many bags beside each other."""
     with tempfile.TemporaryDirectory() as name:
         shifts = [write_shift(Path(name) / f"{hours:g}h.mcap", hours) for hours in HOURS]
-        return [_ingestion(shifts[0]), _replays(shifts)]
+        return [_ingestion(shifts[0]), _replays(shifts), _many(shifts[0])]
 
 
 def _ingestion(shift: LongShift) -> Table:
@@ -157,3 +161,37 @@ def _replayed(shift: LongShift) -> _Cost:
     wall_s, after = time.perf_counter() - start, os.times()
     cpu_s = sum(after[2:4]) - sum(before[2:4])  # of children that have ended
     return _Cost(wall_s, cpu_s, float(done.stderr.split()[-1]) / 1024.0)
+
+
+def _many(shift: LongShift) -> Table:
+    hours = shift.duration_s / 3600.0
+    table = Table(
+        "many_bags",
+        f"robocal validate of {BAGS} bags of {hours:.2f} h each",
+        ("processes", "took, s", "times real time", "gain", "goal"),
+        "From the start of the command to its report, the start of the processes included.",
+    )
+    bags = _copies(shift.path)
+    alone_s = _validated(bags, 1)
+    for jobs, took_s in ((1, alone_s), (CORES, _validated(bags, CORES))):
+        gain = alone_s / took_s
+        goal = Goal(gain, LEAST_GAIN, at_least=True) if jobs > 1 else None
+        table.add(jobs, took_s, BAGS * shift.duration_s / took_s, gain, goal)
+    return table
+
+
+def _copies(bag: Path) -> list[Path]:
+    copies = [bag.with_name(f"bag-{number}.mcap") for number in range(1, BAGS + 1)]
+    for copy in copies:
+        shutil.copyfile(bag, copy)
+    return copies
+
+
+def _validated(bags: list[Path], jobs: int) -> float:
+    """Time, s, of the command in a process of its own."""
+    command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *map(str, bags)]
+    report = bags[0].with_name(f"report-{jobs}")
+    command += ["--robot", ROBOT, "--jobs", str(jobs), "--report", str(report)]
+    start = time.perf_counter()
+    subprocess.run(command, capture_output=True, text=True, check=True)
+    return time.perf_counter() - start

@@ -28,6 +28,7 @@ from robocal_ros.sim.production import programme
 Array = NDArray[np.float64]
 
 STEP_S = 0.016
+WORK_STEP_S = 0.5  # while nothing is measured
 BEAT_S = 0.2  # of gap_open
 LISTEN_S = 0.5  # readings before a gap and before a programme
 ROUNDS = 3  # of the cold robot
@@ -111,9 +112,9 @@ class Plant:
         """Let the robot follow a plan at once."""
         self.cell.follow(self.now_s + plan.time_s, plan.q, plan.qd)
 
-    def step(self) -> None:
+    def step(self, step_s: float = STEP_S) -> None:
         """A step of time with everything listening."""
-        came = self.cell.advance(self.now_s + STEP_S)
+        came = self.cell.advance(self.now_s + step_s)
         if self.suite is None:
             return
         if self.now_s >= self._beat_s + BEAT_S:
@@ -126,10 +127,10 @@ class Plant:
         self.heard(came, samples)
         suite.step(samples, self.clock)
 
-    def listen(self, until_s: float) -> None:
+    def listen(self, until_s: float, step_s: float = STEP_S) -> None:
         """Step until a time."""
         while self.now_s < until_s - 1e-9:
-            self.step()
+            self.step(step_s)
 
     def work(self, until_s: float) -> None:
         """Let time pass in which the robot produces; without readings where none are wanted."""
@@ -137,8 +138,8 @@ class Plant:
             self.cell.advance(until_s, readings=False)
             return
         if self.every_reading:
-            self.listen(until_s)
-        if until_s - LISTEN_S > self.now_s:
+            self.listen(until_s - LISTEN_S - WORK_STEP_S, WORK_STEP_S)
+        elif until_s - LISTEN_S > self.now_s:
             self._take(self.suite, self.cell.advance(until_s - LISTEN_S, readings=False))
         self.listen(until_s)
 

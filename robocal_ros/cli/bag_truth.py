@@ -13,6 +13,7 @@ from robocal_ros.storage.bags import BagReader
 Array = NDArray[np.float64]
 
 CHECK_POINTS, TOOL, HAND_EYE = "/truth/check_points", "/truth/tool", "/truth/hand_eye"
+STATE = "/truth/state"  # of whichever node tells it
 NEAREST_NS = 120_000_000_000  # a truth is told within two minutes of its cycle
 
 
@@ -78,10 +79,24 @@ def true_transforms(reader: BagReader, topic: str, name: str) -> list[tuple[int,
     InputError
         When they cannot be read.
     """
+    states = [(stamp, state) for stamp, state in told_states(reader) if name in state]
     try:
-        return [(stamp, np.array(truth[name])) for stamp, truth in _told(reader, topic)]
+        told = _told(reader, topic) or states
+        return [(stamp, np.array(truth[name])) for stamp, truth in told]
     except (KeyError, ValueError) as error:
         raise _unreadable(reader, topic, error) from error
+
+
+def told_states(reader: BagReader) -> list[tuple[int, dict[str, Any]]]:
+    """Stamps, ns, and states of a simulated cell; empty where a bag tells none.
+
+    Raises
+    ------
+    InputError
+        When they cannot be read.
+    """
+    topics = [topic for topic in reader.info.topics if topic.endswith(STATE)]
+    return _told(reader, topics[0]) if topics else []
 
 
 def _told(reader: BagReader, topic: str) -> list[tuple[int, dict[str, Any]]]:

@@ -21,6 +21,7 @@ from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.found_cycles import accepting, automatic_commands, window_commands
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.inputs import take_message
+from robocal_ros.sessions.maintenance.session import RUN as MAINTAIN
 from robocal_ros.sessions.replay import (
     ReplayReport,
     feed,
@@ -85,15 +86,17 @@ def replay_bag(request: Request, watch: Watch) -> Document:
     """
     with BagReader(request.bag) as reader:
         recording = open_recording(reader, request.topics)
-        if not (request.auto or request.cold or request.warm or recording.commands):
+        if not (_given(request) or recording.commands):
             words = _NO_COMMANDS if request.robot_named else _NO_COMMANDS + _NO_ROBOT
             raise InputError(words, file=str(request.bag))
+        if not _given(request) and any(c.name == MAINTAIN for c, _ in recording.commands):
+            raise InputError(_NOT_REPLAYED, file=str(request.bag))
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
             for is_of, replayed, node in _OF_OTHER_NODES:
                 if not is_of(recording.configured):
                     continue
-                if request.auto or request.cold or request.warm:
+                if _given(request):
                     raise InputError(
                         f"the bag is of a {node} node: --auto, --cold and --warm are for thermal "
                         "ones"
@@ -119,7 +122,17 @@ _NO_COMMANDS = (
 )
 _NO_ROBOT = "; and name its robot with --robot"
 
+_NOT_REPLAYED = (
+    "these are the decisions of a maintenance_node: they cannot be replayed; 'robocal validate' "
+    "lists each with its reason"
+)
+
 _GOES_ON = "{} already holds calibrations: the replay went on from there"
+
+
+def _given(request: Request) -> bool:
+    """Whether the user says what to carry out, in place of the recorded commands."""
+    return bool(request.auto or request.cold or request.warm)
 
 
 @contextmanager

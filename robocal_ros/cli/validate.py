@@ -71,11 +71,11 @@ def run(args: argparse.Namespace) -> Outcome:
     jobs = _jobs(args.bags, args.robot)
     workers = args.jobs or len(os.sched_getaffinity(0))
     results: dict[int, Document] = {}
-    figures: dict[str, tuple[tuple[Drawn, ...], ...]] = {}
+    figures: dict[str, Sequence[Sequence[Drawn]]] = {}
     with _progress(len(jobs)) as shown:
         for number, result in validated(jobs, workers, args.scheduler):
             results[number] = result.document
-            figures[jobs[number].name] = result.figures
+            figures[jobs[number].name] = (result.cell, *result.figures)
             _keep_figures(args.report, jobs[number].name, result)
             shown.advance()
     bags = [results[number] for number in range(len(jobs))]
@@ -137,7 +137,7 @@ def _failure(bags: Sequence[Document]) -> Document:
 
 
 def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
-    for number, session in enumerate(result.figures, start=1):
+    for number, session in enumerate((result.cell, *result.figures)):
         which = f"-{number}" if number > 1 else ""
         for drawn in session:
             (folder / f"{Path(name).stem}{which}-{drawn.name}.png").write_bytes(drawn.png)
@@ -146,7 +146,12 @@ def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
 def _write(folder: Path, report: Document, html: str) -> None:
     import json
 
-    from robocal_ros.report.validation import bags_table, cycles_table, decisions_table
+    from robocal_ros.report.validation import (
+        bags_table,
+        cycles_table,
+        decisions_table,
+        hours_table,
+    )
 
     bags = report["bags"]
     write_text(folder / "report.html", html)
@@ -154,6 +159,7 @@ def _write(folder: Path, report: Document, html: str) -> None:
     write_text(folder / "bags.csv", bags_table(bags))
     write_text(folder / "cycles.csv", cycles_table(bags))
     write_text(folder / "decisions.csv", decisions_table(bags))
+    write_text(folder / "hours.csv", hours_table(bags))
 
 
 class _Progress(Protocol):

@@ -20,13 +20,14 @@ from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
 from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.cli.replaying import Request, replay_bag
+from robocal_ros.cli.validating_cell import cell_course
 from robocal_ros.cli.validating_cycles import drift_report, thermal_document
 from robocal_ros.cli.validating_parts import as_recorded, calibrations, decisions, tool_runs
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.report.validation_figures import Drawn, thermal_figures, tool_figures
+from robocal_ros.report.validation_figures import Drawn, cell_figures, thermal_figures, tool_figures
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
@@ -52,10 +53,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Validated:
-    """What a bag gave: its document, in it ``error`` or ``sessions``; each session's figures."""
+    """What a bag gave: its document, in it ``error`` or ``sessions``; each session's figures.
+
+    ``cell``: figures of the cell as a whole.
+    """
 
     document: Document
     figures: tuple[tuple[Drawn, ...], ...] = ()
+    cell: tuple[Drawn, ...] = ()
 
 
 def validate_bag(job: Job) -> Validated:
@@ -67,6 +72,7 @@ def validate_bag(job: Job) -> Validated:
             replayable, others = _event_topics(reader)
             topics: list[str | None] = [*replayable] or [None]
             sessions = [_Session(job, reader, topic).judged() for topic in topics]
+            course = cell_course(reader)
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:
@@ -74,7 +80,9 @@ def validate_bag(job: Job) -> Validated:
         return Validated(head | {"error": refusal(RobocalError.code, words)["error"]})
     documents = [document for document, _ in sessions]
     head |= {"sessions": documents, "other_decisions": others}
-    return Validated(head, tuple(tuple(drawn) for _, drawn in sessions))
+    head["cell"] = None if course is None else course.document()
+    cell = () if course is None else cell_figures(course)
+    return Validated(head, tuple(tuple(drawn) for _, drawn in sessions), cell)
 
 
 def _about(reader: BagReader) -> Document:
@@ -121,6 +129,7 @@ class _Session:
         self._job, self._reader, self._topic = job, reader, topic
         self._given = {} if topic is None else {EVENTS: topic}
         self._recording = open_recording(reader, self._given)
+        self._mark = " (simulated)" if is_simulated(reader) else ""
         self._forecasts = Forecasts()
         self._warnings: list[str] = []
         self._arm: SerialArm | None = None
@@ -134,7 +143,7 @@ class _Session:
             if is_tool_session(configured):
                 runs = tool_runs(replayed, true_transforms(reader, TOOL, "T_flange_tool"))
                 found = {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
-                return common | found, tool_figures(runs)
+                return common | found, tool_figures(runs, self._mark)
             if is_hand_eye_session(configured):
                 truth = true_transforms(reader, HAND_EYE, "T_flange_sensor")
                 made = {"calibrations": calibrations(replayed, truth)}
@@ -180,7 +189,9 @@ class _Session:
             cycles = made.cycles(self._forecasts, check_points(self._reader), sigma_m)
         document = thermal_document(cycles, arm)
         truth = drift_report(self._job.name, cycles, arm)
-        return {"kind": "thermal", **document}, thermal_figures(document["cycles"], truth)
+        return {"kind": "thermal", **document}, thermal_figures(
+            document["cycles"], truth, self._mark
+        )
 
     def _common(self, replayed: Document) -> Document:
         configured, recorded = self._recording.configured, bool(self._recording.commands)
@@ -208,4 +219,4 @@ class _ReplayError(RobocalError):
 
 
 def _silent(what: str, recording: Recording) -> Iterator[BagMessage]:
-    return recording.samples()
+    return recording.blocks()

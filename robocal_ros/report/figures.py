@@ -175,6 +175,15 @@ def _title(words: str, report: DriftReport) -> str:
     return f"{words} (simulated)" if report.origin.simulated else words
 
 
+def titled(axes: Axes, words: str) -> None:
+    """A title, and between it and the axes the legend: there it covers nothing."""
+    axes.set_title(words, pad=28)
+    axes.legend(
+        loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, fontsize=8, borderpad=0.2,
+        borderaxespad=0.2, columnspacing=1.4, handletextpad=0.5,
+    )  # fmt: skip
+
+
 def svg(figure: Figure) -> str:
     """The figure as an SVG element for a page."""
     stream = io.StringIO()

@@ -145,6 +145,12 @@ def decisions_table(bags: Sequence[Document]) -> str:
     )
 
 
+def hours_table(bags: Sequence[Document]) -> str:
+    """Every hour of each simulated cell as CSV."""
+    cells = [(bag["bag"], bag["cell"]) for bag in bags if bag.get("cell")]
+    return _csv([{"bag": name, **hour} for name, cell in cells for hour in cell["by_hour"]])
+
+
 def _decided(bag: Document) -> list[tuple[str | None, Sequence[Document]]]:
     """Each node of a bag with its decisions."""
     sessions = [(session["node"], session["decisions"]) for session in bag.get("sessions", [])]

@@ -30,7 +30,8 @@ ERRORS_NOTE = (
 def page(report: Document, figures: Figures) -> str:
     """The whole page.
 
-    ``report``: what report.json holds; ``figures``: by the bag's name, of each of its sessions.
+    ``report``: what report.json holds; ``figures``: by the bag's name, of its cell as a whole, then
+    of each of its sessions.
     """
     rows, bags = summary_rows(report["bags"]), report["bags"]
     simulated = any(bag.get("simulated") for bag in bags)
@@ -38,7 +39,7 @@ def page(report: Document, figures: Figures) -> str:
     parts = [
         f"<h1>{escape(report['title'])}</h1>",
         f'<p class="faint">{escape(report["created"])} · {escape(report["software"])} {mark}</p>',
-        f'<p class="lead">{_answer(rows)}</p>',
+        f'<p class="lead">{_answer(rows, bags)}</p>',
         *_overview(rows),
     ]
     for bag in bags:
@@ -47,10 +48,10 @@ def page(report: Document, figures: Figures) -> str:
     return whole(report["title"], parts)
 
 
-def _answer(rows: Sequence[Document]) -> str:
+def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
     """Is it good, in mm? In one or two sentences."""
     failed = sum("error" in row for row in rows)
-    told = []
+    told = [_cell_answer(bag) for bag in bags if bag.get("cell")]
     for row in rows:
         if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
             true = "true " if row["judged_by"] == "truth" else ""
@@ -61,6 +62,16 @@ def _answer(rows: Sequence[Document]) -> str:
     if failed:
         told.append(f"{failed} of {len({row['bag'] for row in rows})} bags could not be validated.")
     return "<br>".join(told) or "No thermal cycle in these bags."
+
+
+def _cell_answer(bag: Document) -> str:
+    cell = bag["cell"]
+    share = f", {_share(cell['lambda_with'])} of all directions within {TOLERANCE_MM:g} mm"
+    return (
+        f"{escape(bag['bag'])}: true rms error of the tool {_mm(cell['rms_without_mm'])} mm "
+        f"without correction, <b>{_mm(cell['rms_with_mm'])} mm</b> with it"
+        f"{share if cell['lambda_with'] is not None else ''}."
+    )
 
 
 def _overview(rows: Sequence[Document]) -> list[str]:
@@ -127,13 +138,43 @@ def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
         f"<h2>{escape(bag['bag'])}{mark}</h2>",
         f'<p class="faint">{bag["from"]} to {bag["to"]}, {bag["duration_s"] / 3600.0:.2f} h</p>',
     ]
-    for session, shown in zip(bag["sessions"], figures, strict=True):
+    cell, *sessions = figures
+    if bag["cell"] is not None:
+        parts += ["<h3>The cell, by the truth</h3>"]
+        parts += [figure(drawn.svg, drawn.caption) for drawn in cell]
+        parts += _cell(bag["cell"])
+    for session, shown in zip(bag["sessions"], sessions, strict=True):
         parts.append(f"<h3>{TITLES[session['kind']]}</h3>")
         parts += [figure(drawn.svg, drawn.caption) for drawn in shown]
         parts += _session(session)
     for node, decisions in bag["other_decisions"].items():
         parts += [f"<h3>Decisions of {escape(node)}</h3>", _decisions(decisions)]
     return parts
+
+
+def _cell(cell: Document) -> list[str]:
+    head = ["hour", "rms without", "rms with", "λ without", "λ with", "bound", "p95", "below bound"]
+    body = [
+        [str(row["hour"]), _mm(row["rms_without_mm"]), _mm(row["rms_with_mm"]),
+         _share(row["lambda_without"]), _share(row["lambda_with"]), _mm(row["bound_mm"]),
+         _mm(row["p95_mm"]), _share(row["time_below_bound"])]
+        for row in cell["by_hour"]
+    ]  # fmt: skip
+    note = (
+        '<p class="faint">mm, of the tool at the working poses. Bound: 95 % of the errors were '
+        "expected below it; p95: 95 % truly were; below bound: share of the time in which p95 was. "
+        f"λ: share of all directions within {TOLERANCE_MM:g} mm.</p>"
+    )
+    faults = [
+        (f"{one['hours']:.2f} h", f"{one['fault'].replace('_', ' ')} {_size(one)}")
+        for one in cell["faults"]
+    ]
+    told = ["<h3>Faults that were simulated</h3>", listed(faults)] if faults else []
+    return [table(head, body), note, *told]
+
+
+def _size(fault: Document) -> str:
+    return f"{fault['size']:.4g} (SI)" if fault["size"] else "ends"
 
 
 def _session(session: Document) -> list[str]:

@@ -388,6 +388,18 @@ class TestDamage:
         assert status == 2
         assert words in document["error"]["message"]
 
+    def test_decisions_of_a_maintenance(self, folder: Path, visits, replay) -> None:
+        path = folder / "maintained.mcap"
+        arguments = json.dumps({"version": 1, "arguments": {"cycle_id": "c1"}, "marks": {}})
+        stamp_ns = visits[0][-1].stamp_ns
+        event = {"stamp": ros_time(stamp_ns), "command": "run_maintenance", "outcome": "{}"}
+        with BagWriter(path) as bag:
+            write_samples(bag, visits[0])
+            bag.write(EVENTS, TYPES[EVENTS], event | {"arguments": arguments}, stamp_ns)
+        status, document = replay(path, "--robot", ROBOT)
+        assert status == 2
+        assert "robocal validate" in document["error"]["message"]
+
     def test_a_cold_window_without_measurements(self, plain: Path, replay) -> None:
         """No drift without its reference: the warm window must not pass for a calibration."""
         status, document = replay(

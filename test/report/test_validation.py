@@ -13,10 +13,17 @@ from robocal_ros.report.validation import (
     bags_table,
     cycles_table,
     decisions_table,
+    hours_table,
     pooled_rms_mm,
     summary_rows,
 )
-from robocal_ros.report.validation_figures import accuracy_by_cycle, thermal_figures, tool_figures
+from robocal_ros.report.validation_cell import CellCourse
+from robocal_ros.report.validation_figures import (
+    accuracy_by_cycle,
+    cell_figures,
+    thermal_figures,
+    tool_figures,
+)
 from robocal_ros.report.validation_page import page
 
 
@@ -59,6 +66,7 @@ def bag(name, *sessions, simulated=False):
     return {
         "bag": name, "path": f"/x/{name}", "from": "a", "to": "b", "duration_s": 7200.0,
         "topics": {}, "simulated": simulated, "sessions": list(sessions), "other_decisions": OTHER,
+        "cell": None,
     }  # fmt: skip
 
 
@@ -131,7 +139,9 @@ def test_the_tables():
 
 
 def test_the_page_needs_nothing_else_and_says_all():
-    shown = {"one.mcap": [thermal_figures(CYCLES, None)], "two.mcap": [tool_figures([RUN])]}
+    shown = {
+        "one.mcap": [(), thermal_figures(CYCLES, None)], "two.mcap": [(), tool_figures([RUN])]
+    }  # fmt: skip
     html = page(REPORT, shown)
     assert html.count("<svg") == 3
     assert not re.search(r"<(script|link|img|iframe|object)\b|@import", html)
@@ -145,7 +155,7 @@ def test_the_page_needs_nothing_else_and_says_all():
 
 
 def test_what_is_measured_is_not_called_simulated():
-    html = page(REPORT | {"bags": [bag("one.mcap", THERMAL)]}, {"one.mcap": [[]]})
+    html = page(REPORT | {"bags": [bag("one.mcap", THERMAL)]}, {"one.mcap": [[], []]})
     assert "simulated" not in html
 
 
@@ -159,3 +169,47 @@ def test_the_curves_are_the_numbers_of_the_cycles():
     accepted = next(line for line in axes.lines if line.get_marker() == "^")
     np.testing.assert_allclose(np.asarray(accepted.get_xdata()), [1.0])
     assert figures.svg(accuracy_by_cycle(CYCLES)) == figures.svg(accuracy_by_cycle(CYCLES))
+
+
+COURSE = CellCourse(
+    hours=np.array([0.0, 0.5, 1.0, 1.5]),
+    without_mm=np.array([0.3, 0.4, 2.0, 2.0]),
+    with_mm=np.array([0.03, 0.04, 2.0, np.nan]),
+    p95_mm=np.array([0.05, 0.07, 2.5, np.nan]),
+    lambda_without=np.array([0.2, 0.4, 0.0, 0.0]),
+    lambda_with=np.array([1.0, 0.9, 0.0, np.nan]),
+    bound_mm=np.array([np.nan, 0.2, 0.2, 0.2]),
+    tolerance_mm=0.3,
+    faults=[{"hours": 1.0, "fault": "collision", "size": 2e-3}],
+)
+
+
+def test_the_course_of_a_cell_hour_by_hour():
+    found = COURSE.document()
+    first, second = found["by_hour"]
+    assert (first["hour"], second["hour"]) == (1, 2)
+    assert first["minutes"] == pytest.approx(60.0)
+    assert first["rms_without_mm"] == pytest.approx(np.sqrt((0.09 + 0.16) / 2))
+    assert first["rms_with_mm"] == pytest.approx(np.sqrt((0.0009 + 0.0016) / 2))
+    assert (first["lambda_without"], first["lambda_with"]) == pytest.approx((0.3, 0.95))
+    assert (first["bound_mm"], first["p95_mm"], first["time_below_bound"]) == (0.2, 0.07, 1.0)
+    assert (second["rms_with_mm"], second["time_below_bound"]) == (2.0, 0.0)
+    assert found["time_below_bound"] == 0.5
+    json.dumps(found, allow_nan=False)
+
+
+def test_the_page_tells_of_the_cell():
+    told = bag("one.mcap", simulated=True) | {"cell": COURSE.document()}
+    html = page(REPORT | {"bags": [told]}, {"one.mcap": [cell_figures(COURSE)]})
+    assert html.count("<svg") == 1
+    for said in ("collision 0.002 (SI)", "95.0%", "1.00 h", "<b>1.155 mm</b> with it"):
+        assert said in html
+    (row, _) = csv.DictReader(io.StringIO(hours_table([told])))
+    assert float(row["lambda_with"]) == pytest.approx(0.95)
+
+
+def test_many_runs_are_drawn_over_time():
+    runs = [RUN | {"run": i, "stamp": 1e9 + 1800.0 * i} for i in range(40)]
+    (drawn,) = tool_figures(runs)
+    assert "run 39" not in drawn.svg
+    assert drawn.svg != tool_figures(runs[:39])[0].svg

@@ -27,6 +27,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, LimitError, StorageError
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.sessions.events import LEAVE
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
@@ -123,6 +124,10 @@ def test_a_full_measurement_that_did_not_fit_comes_next(cell):
     cell.check = bent()
     cell.run("c1", 33.0)
     assert cell.finish().left == ("tool measurement (full)",)
+    (left,) = (outcome for name, outcome in cell.events if name == LEAVE)
+    assert left.command.arguments["what"] == "tool measurement (full)"
+    worst_s = cell.session.worst_cases()["tool measurement (full)"]
+    assert 0.0 < left.command.arguments["left_s"] < worst_s + TIMES.reserve_s
     cell.log.clear()
     cell.run("c2", LONG_S)
     cell.finish()

@@ -28,7 +28,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions.events import ACCEPT, ROLLBACK
+from robocal_ros.sessions.events import ACCEPT, ROLLBACK, WITHHOLD
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.deciding import Decider
@@ -197,6 +197,9 @@ def test_a_tool_without_a_thermal_result_waits(history, how):
     number = measured_in_full(cell)
     result = cell.finish()
     assert f"tool candidate {number} waits" in result.message
+    (withheld,) = (outcome for name, outcome in cell.events if name == WITHHOLD)
+    assert withheld.command.arguments == {"id": number, "kind": TOOL}
+    assert withheld.message in result.message
     assert result.accepted == ()
     assert cell.history.head(TOOL).revision == 0
 

@@ -13,7 +13,7 @@ from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, Head, State
 from robocal_ros.core.tool.judging import KnownTool, change_between
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions.decisions import decide, require_thermal
-from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command, Outcome
+from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
@@ -214,3 +214,9 @@ class Decider:
 
 def _nothing_to_do(command: Command, words: str) -> Outcome:
     return Outcome(command, Code.ACCEPT, words, repeated=True)
+
+
+def withholding(kind: str, calibration_id: int, why: str) -> Outcome:
+    """A candidate is left to a person, for the record."""
+    words = f"{kind} candidate {calibration_id} waits for a decision: {why}"
+    return Outcome(Command(WITHHOLD, {"id": calibration_id, "kind": kind}), Code.ACCEPT, words)

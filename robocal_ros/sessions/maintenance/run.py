@@ -6,9 +6,9 @@ from dataclasses import replace
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions.events import ACCEPT, Outcome
+from robocal_ros.sessions.events import ACCEPT, LEAVE, Command, Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.deciding import BY, Decider
+from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
 from robocal_ros.sessions.maintenance.mover import FaultError
@@ -90,7 +90,9 @@ class Run:
         # EXPIRED was said before this measurement, and must not keep its result waiting.
         why = self._decider.withheld(answer.candidate_id) or self._unsound(AccuracyLevel.FAULT)
         if why:
-            self._tell(f"thermal candidate {answer.candidate_id} waits for a decision: {why}")
+            withheld = withholding(THERMAL, answer.candidate_id, why)
+            self._decided(withheld)
+            self._tell(withheld.message)
             return
         within = "within the configured bounds"
         done = self._decider.decide(ACCEPT, answer.candidate_id, BY, within, self.wall_ns)
@@ -144,6 +146,9 @@ class Run:
 
     def _left(self, what: str) -> None:
         self.result = replace(self.result, left=(*self.result.left, what))
+        left_s = max(self._hands.gap.left_s(self._hands.now_s), 0.0)
+        words = f"{what}: left for the next gap, {left_s:.1f} s before the end of this one"
+        self._decided(Outcome(Command(LEAVE, {"what": what, "left_s": left_s}), Code.ACCEPT, words))
 
     def _tell(self, words: str) -> None:
         self._words.append(words)

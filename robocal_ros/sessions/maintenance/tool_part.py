@@ -8,7 +8,7 @@ from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.config import Times
-from robocal_ros.sessions.maintenance.deciding import BY, Decider
+from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.requests import Answer
@@ -136,7 +136,9 @@ class ToolPart:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
         if why := self._withheld(answer.candidate_id):
-            outcome.told = f"tool candidate {answer.candidate_id} waits for a decision: {why}"
+            withheld = withholding(TOOL, answer.candidate_id, why)
+            self._decided(withheld)
+            outcome.told = withheld.message
             return
         done = self._decider.decide(
             "accept", answer.candidate_id, BY, "within the configured bounds", self.wall_ns
