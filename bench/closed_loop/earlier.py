@@ -1,4 +1,4 @@
-"""What a robot's earlier shifts have taught: at the pace of its measuring cycles, quickly."""
+"""Shifts of a robot at the pace of its measuring cycles, and what earlier ones have taught."""
 
 from dataclasses import replace
 
@@ -7,25 +7,27 @@ import numpy as np
 from bench.thermal_shifts import Measured
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.thermal.process_learning import EarlierShift, LearnedProcess, learn_gains
-from robocal_ros.sim.drift import PLANS, DriftingCell, record
+from robocal_ros.sim.drift import PLANS, DriftingCell, DriftPlan, record
 from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.robot import TrueRobot
 
-SHIFTS = 3
+
+def seen(
+    nominal: SerialArm, robot: TrueRobot, plan: DriftPlan, rng: np.random.Generator
+) -> EarlierShift:
+    """What the six measuring poses of the cell show of a shift; how noisy it is not told."""
+    cycle = poses("cycle")
+    shift = record(DriftingCell(robot, (plan,), cycle, cycle, ()), plan, rng)
+    measured = Measured.of(nominal, shift, range(len(cycle)))
+    cycles = [replace(one, sigma=None) for one in measured.cycles]
+    return EarlierShift(measured.spots, cycles, measured.time_s, shift.temperature)
 
 
 def taught(nominal: SerialArm, robot: TrueRobot, seed: int) -> LearnedProcess:
-    """Learn as ``thermal_node`` does with ``prior: learned``, from shifts of other work.
+    """Learn as ``thermal_node`` does with ``prior: learned``, from three shifts of other work.
 
     Each motor's duty is drawn anew for each shift; of what will be judged nothing is used.
     """
-    rng, cycle = np.random.default_rng([seed, 2]), poses("cycle")
-    cell = DriftingCell(replace(robot, nominal=nominal), PLANS, cycle, cycle, ())
-    shifts = []
-    for course in PLANS[:SHIFTS]:
-        plan = replace(course, duty=rng.uniform(0.3, 1.0, nominal.n))
-        shift = record(cell, plan, rng)
-        seen = Measured.of(nominal, shift, range(len(cycle)))
-        cycles = [replace(one, sigma=None) for one in seen.cycles]  # how noisy it is not told
-        shifts.append(EarlierShift(seen.spots, cycles, seen.time_s, shift.temperature))
-    return learn_gains(shifts)
+    rng = np.random.default_rng([seed, 2])
+    plans = [replace(course, duty=rng.uniform(0.3, 1.0, nominal.n)) for course in PLANS]
+    return learn_gains([seen(nominal, robot, plan, rng) for plan in plans])

@@ -27,7 +27,7 @@ from robocal_ros.sim.production import programme
 
 Array = NDArray[np.float64]
 
-STEP_S = 0.016
+STEP_S = 0.032
 BEAT_S = 0.2  # of gap_open
 LISTEN_S = 0.5  # readings before a gap and before a programme
 ROUNDS = 3  # of the cold robot

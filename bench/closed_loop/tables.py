@@ -6,6 +6,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 from bench.closed_loop import setting
+from bench.closed_loop.drift_bound import drift_bound_table
 from bench.closed_loop.faults import (
     HARMLESS,
     Report,
@@ -29,6 +30,7 @@ CLEAN_RMS_M, CLEAN_P99_M, FAULTY_RMS_M = 3e-5, 8e-5, 1e-4
 QUIET = replace(GOLDEN, hours=2.0, pauses=(), incidents=())
 LEARNED = replace(QUIET, prior="learned")
 KNOCKED_S = GOLDEN.incidents[1].at_s  # from then on the line reads FAULT, rightly
+ROBOTS = range(1, 13)  # of the bound at the pace of the cycles
 MM = 1e3
 
 
@@ -189,6 +191,7 @@ def detection_table(reports: Sequence[Report]) -> Table:
 def tables(amount: Amount = SHORT) -> Sequence[Table]:
     """All of them, on all cores."""
     with ProcessPoolExecutor(os.cpu_count()) as pool:
+        bound = pool.submit(drift_bound_table, ROBOTS)
         golden = _both(pool, [(GOLDEN, seed) for seed in amount.golden])
         quiet = _both(pool, [(QUIET, seed) for seed in amount.quiet])
         learned = list(pool.map(_run, [(LEARNED, seed, True) for seed in amount.quiet]))
@@ -205,6 +208,7 @@ def tables(amount: Amount = SHORT) -> Sequence[Table]:
                 "the same, learned prior": learned,
             }
         ),
+        bound.result(),
         harm_table({"default": quiet, "learned": learned_pairs}),
         faults_table(reports),
     ]
