@@ -43,13 +43,12 @@ def per_hour(record: ShiftRecord) -> list[Figures]:
 class Stated:
     """What the line was told, beside what was true.
 
-    Every working pose of each pass counts for which it was told a bound.
-
     Attributes
     ----------
-    below : share of the true errors that lie below the stated 95 % bound.
-    bound_m, p95_m : mean of the stated bounds; 95 % quantile of the true errors.
-    levels : share of the passes at each level, of those before ``until_s``.
+    below : share of the true errors that lie below the stated 95 % bound, in all passes.
+    bound_m, p95_m : mean of the stated bounds and 95 % quantile of the true errors, before
+        ``until_s``.
+    levels : share of the passes at each level, before ``until_s``.
     """
 
     below: float
@@ -59,26 +58,25 @@ class Stated:
 
 
 def stated(records: Sequence[ShiftRecord], until_s: float = np.inf) -> Stated:
-    """Of several shifts together."""
+    """Of several shifts together: every working pose of each pass for which a bound was told."""
     told = [
-        (one, one.accuracy.error)
+        (one.time_s, np.linalg.norm(one.error, axis=1), one.accuracy.error.bound_m)
         for record in records
         for one in record.passes
         if one.error is not None and one.accuracy is not None and one.accuracy.error is not None
     ]
-    error = np.array([np.linalg.norm(one.error, axis=1) for one, _ in told])
-    bound = np.array([said.bound_m for _, said in told])
-    early = [
+    early = [(error, bound_m) for time_s, error, bound_m in told if time_s < until_s]
+    levels = [
         one.accuracy.level
         for record in records
         for one in record.passes
         if one.accuracy is not None and one.time_s < until_s
     ]
     return Stated(
-        float(np.mean(error < bound[:, None])),
-        float(np.mean(bound)),
-        float(np.quantile(error, 0.95)),
-        {level: early.count(level) / len(early) for level in AccuracyLevel},
+        float(np.mean([error < bound_m for _, error, bound_m in told])),
+        float(np.mean([bound_m for _, bound_m in early])),
+        float(np.quantile([error for error, _ in early], 0.95)),
+        {level: levels.count(level) / len(levels) for level in AccuracyLevel},
     )
 
 

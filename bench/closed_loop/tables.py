@@ -114,8 +114,8 @@ def stated_table(shifts: Mapping[str, Sequence[ShiftRecord]]) -> Table:
         ("shifts", "how many", "errors below the stated 95 % bound, %", "goal",
          "mean stated bound, mm", "p95 of the errors, mm", "ratio", "goal ",
          *(f"{level.name}, % of passes" for level in AccuracyLevel)),
-        "The 95 % bound at the end of each pass, beside the errors of its working poses. Levels: "
-        "before the sensor is knocked, from when on it is FAULT.",
+        "The 95 % bound at the end of each pass, beside the errors of its working poses: below it "
+        "in all passes, all else before the sensor is knocked, from when on the line reads FAULT.",
     )  # fmt: skip
     for name, records in shifts.items():
         found = stated(records, KNOCKED_S)
