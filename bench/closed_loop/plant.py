@@ -160,8 +160,7 @@ class Plant:
             self._go(suite, pose)
             self.listen(self.now_s + DWELL_S)
         for name in (events.CALIBRATE_SENSOR, events.CAPTURE_REFERENCE):
-            suite.set_up(name)
-            self._until(lambda: not suite.thermal.waiting)
+            self._thermal(suite, Command(name, {"by": "commissioning"}))
         suite.driver.arm(self.now_s)
         arguments = {"mode": REFERENCE, "cycle_id": "commissioning", "by": "commissioning"}
         suite.tool_command(Command(events.MEASURE_TOOL, arguments))
@@ -176,6 +175,10 @@ class Plant:
     def _go(self, suite: Suite, pose: Array) -> None:
         self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))
         self.listen(self.cell.motion.end_s)
+
+    def _thermal(self, suite: Suite, command: Command) -> None:
+        suite.thermal_command(command)
+        self._until(lambda: not suite.thermal.waiting)
 
     def _until(self, done: Callable[[], bool]) -> None:
         end_s = self.now_s + WITHIN_S

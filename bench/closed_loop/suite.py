@@ -164,16 +164,12 @@ class Suite:
 
     # ---- commands -------------------------------------------------------------------------------
 
-    def set_up(self, name: str) -> None:
-        """Ask for a step of the commissioning."""
-        arguments: dict[str, Any] = {"by": "commissioning"}
-        if self._expected is not None and name == events.CAPTURE_REFERENCE:
-            learned = process_document(self._expected)
-            arguments |= {EXPECTED: learned, "expected_from": "earlier shifts"}
-        self.thermal_command(Command(name, arguments))
-
     def thermal_command(self, command: Command) -> None:
         """Ask the thermal session; carried out once its measurements are complete."""
+        if self._expected is not None and command.name == events.CAPTURE_REFERENCE:
+            learned = process_document(self._expected)
+            known = {EXPECTED: learned, "expected_from": "earlier shifts"}
+            command = replace(command, arguments={**command.arguments, **known})
         self.thermal.submit(command, self._clock.now_ns)
 
     def _thermal_goes_on(self) -> None:

@@ -139,14 +139,11 @@ def harm_table(shifts: Mapping[str, Sequence[Pair]]) -> Table:
     for prior, pairs in shifts.items():
         for on, off in pairs:
             found = harm(on, off)
-            rms, p99 = _worse(found.rms_m, CLEAN_RMS_M), _worse(found.p99_m, CLEAN_P99_M)
-            table.add(prior, on.seed, *rms, *p99)
+            table.add(
+                prior, on.seed, MM * found.rms_m, Goal(MM * found.rms_m, MM * CLEAN_RMS_M),
+                MM * found.p99_m, Goal(MM * found.p99_m, MM * CLEAN_P99_M),
+            )  # fmt: skip
     return table
-
-
-def _worse(by_m: float, most_m: float) -> tuple[float, Goal]:
-    """How much worse in mm, and how much it may be."""
-    return MM * by_m, Goal(MM * by_m, MM * most_m)
 
 
 def faults_table(reports: Sequence[Report]) -> Table:
@@ -164,8 +161,8 @@ def faults_table(reports: Sequence[Report]) -> Table:
         table.add(
             one.trial.fault, named_size(one.trial), one.trial.seed, one.who or "nobody",
             one.code.name if one.who else "", one.gaps if one.who else None,
-            Goal(one.gaps, 1.0) if needs else None, *_worse(one.harm.cycle_m, FAULTY_RMS_M),
-            one.stopped, one.over_s,
+            Goal(one.gaps, 1.0) if needs else None, MM * one.harm.cycle_m,
+            Goal(MM * one.harm.cycle_m, MM * FAULTY_RMS_M), one.stopped, one.over_s,
         )  # fmt: skip
     return table
 
