@@ -1,12 +1,13 @@
 """How accurate the cell was, by the truth, against the same shift without its suite."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.closed_loop.shift import HOUR_S, ShiftRecord
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.core.thermal.drift_history import THRESHOLD_M
 
 Array = NDArray[np.float64]
@@ -38,20 +39,45 @@ def per_hour(record: ShiftRecord) -> list[Figures]:
     return [Figures.of(error[hour == h]) for h in range(round(record.plan.hours))]
 
 
-def below_bound(records: Sequence[ShiftRecord]) -> tuple[float, float]:
-    """Share of errors below the stated 95 % bound, and mean bound in m.
+@dataclass(frozen=True)
+class Stated:
+    """What the line was told, beside what was true.
 
-    Every working pose of each pass counts for which the line was told a bound.
+    Attributes
+    ----------
+    below : share of the true errors that lie below the stated 95 % bound, in all passes.
+    bound_m, p95_m : mean of the stated bounds and 95 % quantile of the true errors, before
+        ``until_s``.
+    levels : share of the passes at each level, before ``until_s``.
     """
-    below, bounds = [], []
-    for record in records:
-        for one in record.passes:
-            if one.error is None or one.accuracy is None or one.accuracy.error is None:
-                continue
-            bound_m = one.accuracy.error.bound_m
-            below.append(np.linalg.norm(one.error, axis=1) < bound_m)
-            bounds.append(bound_m)
-    return float(np.mean(below)), float(np.mean(bounds))
+
+    below: float
+    bound_m: float
+    p95_m: float
+    levels: Mapping[AccuracyLevel, float]
+
+
+def stated(records: Sequence[ShiftRecord], until_s: float = np.inf) -> Stated:
+    """Of several shifts together: every working pose of each pass for which a bound was told."""
+    told = [
+        (one.time_s, np.linalg.norm(one.error, axis=1), one.accuracy.error.bound_m)
+        for record in records
+        for one in record.passes
+        if one.error is not None and one.accuracy is not None and one.accuracy.error is not None
+    ]
+    early = [(error, bound_m) for time_s, error, bound_m in told if time_s < until_s]
+    levels = [
+        one.accuracy.level
+        for record in records
+        for one in record.passes
+        if one.accuracy is not None and one.time_s < until_s
+    ]
+    return Stated(
+        float(np.mean([error < bound_m for _, error, bound_m in told])),
+        float(np.mean([bound_m for _, bound_m in early])),
+        float(np.quantile([error for error, _ in early], 0.95)),
+        {level: levels.count(level) / len(levels) for level in AccuracyLevel},
+    )
 
 
 def cycle_rms(record: ShiftRecord) -> dict[int, float]:

@@ -18,7 +18,13 @@ STATION, FRAME, TARGET = "station", "sensor", "ball"
 FLANGE, TOOL = "tool0", "tool"
 TOLERANCE_M = 3e-4
 
-THERMAL = ThermalConfig(measuring_frame=FRAME, target=TARGET, tolerance_m=TOLERANCE_M)
+THERMAL = ThermalConfig(
+    measuring_frame=FRAME,
+    target=TARGET,
+    tolerance_m=TOLERANCE_M,
+    work_poses=rows_of(poses("work")),
+    tip_m=tuple(TAUGHT[:3, 3].tolist()),
+)
 HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.10, reach_m=0.3)
 LIMITS = MotionLimits(tcp_speed_m_s=0.25)
 DRIVING = DrivingConfig(HOUSING, 0.1, 0.01, 0.06, LIMITS)  # pin, its radius with a bend, flange

@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.closed_loop import setting
+from bench.closed_loop.earlier import taught
 from bench.closed_loop.plant import PASS_S, REST_S, GapReport, Plant
 from bench.closed_loop.suite import Record, Suite
 from robocal_ros.sessions.accuracy import Accuracy
+from robocal_ros.sessions.thermal_config import Prior
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_faults import Fault
 from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.sim.motion import JITTER_RAD
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
@@ -45,6 +46,7 @@ class ShiftPlan:
     pauses : from and to, in which nothing is produced.
     incidents : in their order.
     begins_h : o'clock.
+    prior : what drift to expect: the default, or as earlier shifts of this robot have taught.
     points : of a sphere's cloud; 0: centres alone.
     """
 
@@ -56,6 +58,7 @@ class ShiftPlan:
     incidents: tuple[Incident, ...] = ()
     begins_h: float = 8.0
     points: int = 2000
+    prior: Prior = "default"
 
     @property
     def cycles(self) -> int:
@@ -124,7 +127,7 @@ def run_shift(
 ) -> ShiftRecord:
     """A whole shift; ``watch`` is given the plant before its commissioning."""
     nominal = load_robot(ROBOT)
-    made = kr150_cell(nominal, seed, points=plan.points, reading_noise_rad=JITTER_RAD)
+    made = kr150_cell(nominal, seed, points=plan.points)
     cell = SimulatedCell(made)
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -135,7 +138,8 @@ def run_shift(
         plant = Plant(cell, None)
         if suite:
             laser = setting.laser_of(cell.plan)
-            plant.suite = Suite(nominal, history, laser, plant.send, record)
+            expected = taught(nominal, made.robot, seed) if plan.prior == "learned" else None
+            plant.suite = Suite(nominal, history, laser, plant.send, record, expected)
         watch(plant)
         plant.commission()
         return Worker(plan, seed, plant).run()

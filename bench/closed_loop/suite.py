@@ -15,6 +15,8 @@ from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import MEASURED_POINT, SPHERE_CLOUD, JointSample, PointSample
+from robocal_ros.core.thermal.process_documents import process_document
+from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions import events
@@ -22,6 +24,7 @@ from robocal_ros.sessions.correction import (
     CorrectionSession,
     JointCommand,
 )
+from robocal_ros.sessions.drift_following import EXPECTED
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession
@@ -74,6 +77,7 @@ class Suite:
     send : gives a plan to the robot's controller.
     record : takes each command of a session (``thermal``, ``tool``, ``maintenance``) with its
         outcome.
+    expected : drift that earlier shifts have taught; None: the default.
 
     Attributes
     ----------
@@ -87,9 +91,12 @@ class Suite:
         laser: LaserFrame,
         send: Callable[[JointPlan], None],
         record: Record = lambda node, command, outcome: None,
+        expected: LearnedProcess | None = None,
     ) -> None:
         self._nominal, self._send, self._record = nominal, send, record
-        self.thermal = ThermalSession(nominal, history, setting.THERMAL, __version__)
+        self._expected = expected
+        config = replace(setting.THERMAL, prior="learned" if expected else "default")
+        self.thermal = ThermalSession(nominal, history, config, __version__)
         self.tool = ToolSession(nominal, history, setting.tool_config(laser), __version__)
         self.driver = ToolDriver(self.tool, setting.DRIVING, send, self.tool_command)
         self.maintenance = MaintenanceSession(
@@ -159,6 +166,10 @@ class Suite:
 
     def thermal_command(self, command: Command) -> None:
         """Ask the thermal session; carried out once its measurements are complete."""
+        if self._expected is not None and command.name == events.CAPTURE_REFERENCE:
+            learned = process_document(self._expected)
+            known = {EXPECTED: learned, "expected_from": "earlier shifts"}
+            command = replace(command, arguments={**command.arguments, **known})
         self.thermal.submit(command, self._clock.now_ns)
 
     def _thermal_goes_on(self) -> None:

@@ -5,10 +5,8 @@ import numpy as np
 from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.thermal.accuracy import ToolError
 
-# 97.5 % of errors are shorter than the 95 % bound times this, whatever they are made of: their
-# squared length is taken for a scaled chi-square, and this ratio is largest at one degree of
-# freedom (the squared length of a Gaussian error has no fewer).
-WIDER = float(np.sqrt(chi2_quantile(0.975, 1.0) / chi2_quantile(0.95, 1.0)))
+MOST_FREEDOM = 1e6  # more of it: as good as a fixed length
+HALVINGS = 60
 
 
 def offset_error(offset_m: float, sigma_m: float) -> ToolError:
@@ -17,23 +15,39 @@ def offset_error(offset_m: float, sigma_m: float) -> ToolError:
     Mean and variance of the squared length as in `AccuracyForecast.at`.
     """
     mean = offset_m**2 + 3.0 * sigma_m**2
-    if mean == 0.0:
-        return ToolError(0.0, 0.0)
-    variance = 4.0 * offset_m**2 * sigma_m**2 + 6.0 * sigma_m**4
-    if variance <= 1e-12 * mean**2:
-        return ToolError(float(np.sqrt(mean)), float(np.sqrt(mean)))
-    scale, freedom = variance / (2.0 * mean), 2.0 * mean**2 / variance
-    return ToolError(float(np.sqrt(mean)), float(np.sqrt(scale * chi2_quantile(0.95, freedom))))
+    return ToolError.of_square(mean, 4.0 * offset_m**2 * sigma_m**2 + 6.0 * sigma_m**4)
 
 
 def both_errors(drift: ToolError, tool: ToolError) -> ToolError:
-    """Of both together: they are independent of each other, so that their mean squares add.
+    """Of both together, which are independent: other sensors tell them, in other measurements.
 
-    The bound holds however they are directed, and even where they are not independent: each is
-    beyond its 97.5 % in one case in forty, so that one of them is in at most one in twenty, and
-    no sum of vectors is longer than their lengths together.
+    Their mean squares add. So do the variances of their squared lengths, with that of twice their
+    product: as large as if both lay on one line, this way or that.
     """
-    rms_m = float(np.hypot(drift.rms_m, tool.rms_m))
-    if drift.bound_m == 0.0 or tool.bound_m == 0.0:
-        return ToolError(rms_m, drift.bound_m + tool.bound_m)
-    return ToolError(rms_m, WIDER * (drift.bound_m + tool.bound_m))
+    (one, its), (other, others) = _square(drift), _square(tool)
+    both = ToolError.of_square(one + other, its + others + 4.0 * one * other)
+    return ToolError(float(np.hypot(drift.rms_m, tool.rms_m)), both.bound_m)
+
+
+def _square(error: ToolError) -> tuple[float, float]:
+    """Mean and variance of the squared length, of a scaled chi-square with the same bound.
+
+    One degree of freedom at least: the squared length of a Gaussian error has no fewer.
+    """
+    if error.rms_m == 0.0:
+        return 0.0, 0.0
+    wanted = (error.bound_m / error.rms_m) ** 2
+    few, many = 0.0, float(np.log(MOST_FREEDOM))
+    if wanted <= _over_mean(np.exp(many)):
+        return error.bound_m**2, 0.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (few + many)
+        few, many = (middle, many) if _over_mean(np.exp(middle)) > wanted else (few, middle)
+    freedom = float(np.exp(many))
+    mean = error.bound_m**2 / _over_mean(freedom)
+    return mean, 2.0 * mean**2 / freedom
+
+
+def _over_mean(freedom: float) -> float:
+    """95 % quantile of a chi-square over its mean; falls with the degrees of freedom."""
+    return chi2_quantile(0.95, freedom) / freedom

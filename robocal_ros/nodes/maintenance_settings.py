@@ -1,25 +1,20 @@
 """Parameters of the maintenance node."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.history_settings import STATE_DIR
+from robocal_ros.nodes.joint_poses import MM, joint_poses, joints_of
 from robocal_ros.nodes.motion_settings import MOTION, driving_config, require_limits
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import given_pose, pose_settings
 from robocal_ros.sessions.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.storage.laser_files import read_laser_for
-
-Array = NDArray[np.float64]
-
-MM = 1e-3
 
 
 def _time(name: str, default: float, what: str, high: float, low: float = 0.01) -> Setting:
@@ -123,31 +118,6 @@ SETTINGS = (
 )
 
 
-def joints_of(arm: SerialArm, numbers: Sequence[float], name: str) -> Array:
-    """Joints (n,) in rad (prismatic: m) of degrees (mm).
-
-    Raises
-    ------
-    InputError
-        When there is not one for each joint.
-    """
-    given = np.array(numbers, dtype=np.float64)
-    if given.shape != (arm.n,) or not np.all(np.isfinite(given)):
-        raise InputError(
-            f"{name} has {given.size} numbers, {arm.name} has {arm.n} joints: teach it"
-        )
-    return np.where(arm.prismatic, given * MM, np.radians(given))
-
-
-def _pose(arm: SerialArm, text: str, number: int) -> Array:
-    name = f"measuring_poses_deg, pose {number}"
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError as error:
-        raise InputError(f"{name}: '{text}' is no list of numbers") from error
-    return joints_of(arm, numbers, name)
-
-
 def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceConfig:
     """Settings of the session, in SI.
 
@@ -158,13 +128,12 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
     """
     driving = driving_config(settings)
     require_limits(arm, driving)
-    poses = [_pose(arm, text, i) for i, text in enumerate(settings["measuring_poses_deg"], start=1)]
     laser = settings["laser"]
     taught = given_pose(settings, "taught")
     degree = float(np.radians(1.0))
     return MaintenanceConfig(
         home=joints_of(arm, settings["home_deg"], "home_deg"),
-        poses=np.array(poses, dtype=np.float64).reshape(-1, arm.n),
+        poses=joint_poses(arm, settings["measuring_poses_deg"], "measuring_poses_deg"),
         T_flange_tool=arm.T_flange_tool if taught is None else taught,
         driving=driving,
         T_base_laser=read_laser_for(Path(laser), arm).laser.T_base_laser if laser else None,

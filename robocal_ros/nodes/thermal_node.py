@@ -67,6 +67,7 @@ class ThermalNode(HouseNode):
         settings = self.settings
         self._nominal = load_robot(settings["robot"])
         require_parameters(self._nominal, settings["drift_parameters"])
+        self._config = session_config(settings, self._nominal)
         self._serial_in_use, self._history = open_history(settings, self._nominal)
         self._outputs = ThermalOutputs(
             self.add_output, self._nominal, self._serial_in_use, settings["base_frame"]
@@ -88,8 +89,7 @@ class ThermalNode(HouseNode):
         """Begin a session; it knows nothing of what was measured before."""
         if self._history is None:
             raise ValueError("activated before it was configured")
-        config = session_config(self.settings)
-        self._session = ThermalSession(self._nominal, self._history, config, __version__)
+        self._session = ThermalSession(self._nominal, self._history, self._config, __version__)
         self._desk.session = self._session
         self._shown = ()
         self._show_in_force()

@@ -4,9 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from robocal_ros.core.fitting.sphere import SphereRule
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import DEFAULT_TARGET
 from robocal_ros.nodes.history_settings import STATE_DIR
+from robocal_ros.nodes.joint_poses import MM, joint_poses
 from robocal_ros.nodes.parameters import Setting
+from robocal_ros.nodes.pose_settings import ORIGIN, count_fault
 from robocal_ros.nodes.standstill_settings import STANDSTILL, standstill_rule
 from robocal_ros.sessions.thermal_config import METHODS, PRIORS, SPHERE_RADIUS_M, ThermalConfig
 
@@ -105,6 +108,21 @@ SETTINGS = (
         high=7 * 86400.0,
     ),
     Setting(
+        "work_poses_deg",
+        [""],
+        "Working poses at which accuracy is judged, each a text of numbers, one for each joint "
+        "(sliding joint: mm); none: throughout the joint limits",
+    ),
+    Setting(
+        "tip_mm",
+        ORIGIN,
+        "The tool's tip on the flange, which accuracy is about; at its default: the target",
+        unit="mm",
+        low=-5000.0,
+        high=5000.0,
+        check=count_fault(3),
+    ),
+    Setting(
         "lateness_s",
         0.2,
         "Commands on measurements wait for joint readings so much newer than the call",
@@ -123,25 +141,35 @@ SETTINGS = (
 )
 
 
-def session_config(settings: Mapping[str, Any]) -> ThermalConfig:
-    """Settings of the session, in SI."""
+def session_config(settings: Mapping[str, Any], arm: SerialArm) -> ThermalConfig:
+    """Settings of the session, in SI.
+
+    Raises
+    ------
+    InputError
+        When a working pose has not a number for each joint.
+    """
+    poses = joint_poses(arm, settings["work_poses_deg"], "work_poses_deg").tolist()
+    tip_mm = settings["tip_mm"]
     return ThermalConfig(
         method=settings["method"],
         prior=settings["prior"],
-        sigma_m=settings["sigma_mm"] * 1e-3,
+        sigma_m=settings["sigma_mm"] * MM,
         drift_parameters=tuple(settings["drift_parameters"]),
         hold_out=settings["hold_out"],
         seed=settings["seed"],
         cycle_timeout_s=settings["cycle_timeout_s"],
-        tolerance_m=settings["tolerance_mm"] * 1e-3,
+        tolerance_m=settings["tolerance_mm"] * MM,
         expires_after_s=settings["expires_after_s"],
+        work_poses=tuple(tuple(pose) for pose in poses),
+        tip_m=() if tip_mm == ORIGIN else tuple(value * MM for value in tip_mm),
         lateness_s=settings["lateness_s"],
         measuring_frame=settings["measuring_frame"],
         target=settings["target"],
         standstill=standstill_rule(settings),
         sphere=SphereRule(
-            radius_m=settings["sphere_radius_mm"] * 1e-3,
-            radius_tolerance_m=settings["sphere_tolerance_mm"] * 1e-3,
-            noise_m=settings["sphere_noise_mm"] * 1e-3,
+            radius_m=settings["sphere_radius_mm"] * MM,
+            radius_tolerance_m=settings["sphere_tolerance_mm"] * MM,
+            noise_m=settings["sphere_noise_mm"] * MM,
         ),
     )

@@ -16,7 +16,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Entry
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.accuracy import AccuracyForecast
+from robocal_ros.core.thermal.accuracy import AccuracyForecast, Work
 from robocal_ros.core.thermal.heat import Heat
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess
@@ -42,13 +42,14 @@ class DriftFollower:
     Parameters
     ----------
     expected : how the robot is expected to drift; with temperatures where the reference has them.
+    work : where the forecast is asked for.
     """
 
-    def __init__(self, reference: ColdReference, expected: LearnedProcess) -> None:
+    def __init__(self, reference: ColdReference, expected: LearnedProcess, work: Work) -> None:
         if reference.temperature is None:  # what the motors' warmth is against is not known
             expected = replace(expected, gains=None)
         self._tracker = expected.tracker(reference.spots)
-        self._reference = reference
+        self._reference, self._work = reference, work
         self._forecast: tuple[SerialArm, AccuracyForecast] | None = None
         cold_ns = reference.data.middle_ns
         self.read_ns = cold_ns
@@ -187,7 +188,7 @@ class DriftFollower:
     def forecast(self, in_force: SerialArm) -> AccuracyForecast:
         """What to expect of a model in force."""
         if self._forecast is None or self._forecast[0] is not in_force:
-            self._forecast = (in_force, AccuracyForecast(self._tracker, in_force))
+            self._forecast = (in_force, AccuracyForecast(self._tracker, in_force, self._work))
         return self._forecast[1]
 
     def time_s(self, stamp_ns: int) -> float:
@@ -218,11 +219,12 @@ def default_process(nominal: SerialArm, sigma_m: float) -> LearnedProcess:
 class Following:
     """The follower of the cold reference in force, made anew where another one comes into force.
 
-    ``sigma_m``: of one visit, where none was learned.
+    ``sigma_m``: of one visit, where none was learned; ``work``: where the robot works.
     """
 
-    def __init__(self, history: History, current: InForce, sigma_m: float) -> None:
-        self._history, self._current, self._sigma_m = history, current, sigma_m
+    def __init__(self, history: History, current: InForce, sigma_m: float, work: Work) -> None:
+        self._history, self._current = history, current
+        self._sigma_m, self._work = sigma_m, work
         self._followed: tuple[int | None, DriftFollower] | None = None
 
     @property
@@ -246,7 +248,7 @@ class Following:
         if current.reference is None:
             return None
         if self._followed is None or self._followed[0] != current.reference_id:
-            follower = DriftFollower(current.reference, self.expected)
+            follower = DriftFollower(current.reference, self.expected, self._work)
             follower.catch_up(self._history, current.reference_id or 0)
             self._followed = (current.reference_id, follower)
         return self._followed[1]

@@ -109,7 +109,9 @@ def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
         values = dict(arguments["config"])
         rule = StandstillRule(**values.pop("standstill"))
         sphere = SphereRule(**values.pop("sphere"))
-        names = tuple(values.pop("drift_parameters"))
-        return ThermalConfig(standstill=rule, sphere=sphere, drift_parameters=names, **values)
+        for name in ("drift_parameters", "tip_m"):
+            values[name] = tuple(values.get(name, ()))
+        values["work_poses"] = tuple(tuple(q) for q in values.get("work_poses", ()))
+        return ThermalConfig(standstill=rule, sphere=sphere, **values)
     except (KeyError, TypeError) as error:
         raise InputError(f"the recorded configuration cannot be read: {error}") from error

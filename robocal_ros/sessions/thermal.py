@@ -77,7 +77,7 @@ class ThermalSession:
         self.cycle = CycleBook()
         self.windows = Windows(self.desk, self.cycle, self._current, config)
         self._bounds = Bounds(self.desk, self.cycle, self.windows, config)
-        self._following = Following(history, self._current, config.sigma_m)
+        self._following = Following(history, self._current, config.sigma_m, config.work)
         keeper = Keeper(nominal, history, software, self._current)
         self._set_up = SetUp(nominal, history, config, self._current, keeper)
         self._proposer = Proposer(nominal, config, self._current, self._following, keeper)

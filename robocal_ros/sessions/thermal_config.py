@@ -1,12 +1,16 @@
 """Settings of the thermal session."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
+
+import numpy as np
 
 from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.identification import Method
 from robocal_ros.core.samples import DEFAULT_TARGET
 from robocal_ros.core.streams import StandstillRule
+from robocal_ros.core.thermal.accuracy import Work
 
 Prior = Literal["default", "learned"]
 
@@ -29,6 +33,8 @@ class ThermalConfig:
     cycle_timeout_s : a cycle ends when nothing was measured for so long.
     tolerance_m, expires_after_s : error that the process allows, and age at which a measurement
         says nothing any more.
+    work_poses, tip_m : where accuracy is judged: joints of the working poses, rad (prismatic: m),
+        and the tool's tip on the flange; empty: throughout the joint limits, and the target.
     lateness_s : a command waits for joint readings this much newer, so that measurements
         under way still count.
     measuring_frame : frame of the measurements; empty: that of the first one used.
@@ -45,8 +51,16 @@ class ThermalConfig:
     cycle_timeout_s: float = 300.0
     tolerance_m: float = 3e-4
     expires_after_s: float = 8.0 * 3600.0
+    work_poses: tuple[tuple[float, ...], ...] = ()
+    tip_m: tuple[float, ...] = ()
     lateness_s: float = 0.2
     measuring_frame: str = ""
     target: str = DEFAULT_TARGET
     standstill: StandstillRule = field(default_factory=StandstillRule)
     sphere: SphereRule = field(default_factory=lambda: SphereRule(SPHERE_RADIUS_M))
+
+    @cached_property
+    def work(self) -> Work:
+        """Where accuracy is judged."""
+        q, tip = (np.array(given) if given else None for given in (self.work_poses, self.tip_m))
+        return Work(q, tip)

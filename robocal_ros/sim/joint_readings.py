@@ -1,5 +1,7 @@
 """Joint readings at their own rate, and what faults make of them."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,7 @@ from robocal_ros.sim.motion import COUNT_RAD
 Array = NDArray[np.float64]
 
 PAGE = 128  # readings whose random numbers belong together
+KEPT = 4  # pages
 
 
 class JointReadings:
@@ -23,6 +26,7 @@ class JointReadings:
         self._faults, self._draws = faults, draws
         self._next, self._stamp_s = 0, 0.0
         self._stuck: float | None = None
+        self._page = lru_cache(KEPT)(self._page_of)
 
     def due(self, now_s: float) -> NDArray[np.int64]:
         """Numbers of the readings since the last call."""
@@ -72,9 +76,11 @@ class JointReadings:
         """Random numbers (k, width) that belong to these readings."""
         rows = np.empty((len(number), width))
         pages = number // PAGE
-        for page in np.unique(pages):
-            rng = self._draws.of(stream, int(page))
-            shape = (PAGE, width)
-            drawn = rng.random(shape) if uniform else rng.standard_normal(shape)
+        for page in np.unique(pages).tolist():
+            drawn = self._page(stream, page, width, uniform)
             rows[pages == page] = drawn[number[pages == page] % PAGE]
         return rows
+
+    def _page_of(self, stream: Stream, page: int, width: int, uniform: bool) -> Array:
+        rng, shape = self._draws.of(stream, page), (PAGE, width)
+        return rng.random(shape) if uniform else rng.standard_normal(shape)

@@ -21,6 +21,7 @@ from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, 
 from robocal_ros.sim.cell_plan import CellPlan
 from robocal_ros.sim.drift import UNCORRECTED
 from robocal_ros.sim.heating import HeatPlan
+from robocal_ros.sim.motion import JITTER_RAD
 from robocal_ros.sim.poses import read_poses
 from robocal_ros.sim.profile_sensor import ProfileSensor
 from robocal_ros.sim.profile_station import ProfileStation
@@ -58,16 +59,14 @@ def kr150_cell(
     seed: int = 1,
     effects: Effects | None = None,
     points: int = 2000,
-    reading_noise_rad: float = 0.0,
     profile: bool = False,
 ) -> CellPlan:
     """The cell with an individual robot, at home.
 
     ``nominal``: the type's arm; ``points`` of a sphere's cloud, 0: centres alone;
-    ``reading_noise_rad``: of the encoders, which then show whole counts too;
-    ``profile``: with a line laser on the flange. The robot's drift has
-    the published size: with the programme all day, 45 % of the tip's coordinates at the working
-    poses stay within 0.1 mm.
+    ``profile``: with a line laser on the flange. With ``effects.noise`` the encoders are noisy too,
+    and show whole counts. The robot's drift has the published size: with the programme all day,
+    45 % of the tip's coordinates at the working poses stay within 0.1 mm.
     """
     arm = replace(nominal, T_flange_tool=TAUGHT)
     robot = kr150.true_robot(arm, np.random.default_rng([seed, 0]), effects)
@@ -76,7 +75,7 @@ def kr150_cell(
         station=BeamStation(beams_of(T_BASE_LASER, BEAM_ANGLE_RAD, BEAM_GAP_M), INPUT, NOISE),
         tool=RoundTool.cylinder(TAUGHT, PIN_RADIUS_M),
         q_start=poses("home")[0],
-        reading_noise_rad=reading_noise_rad,
+        reading_noise_rad=JITTER_RAD if robot.effects.noise else 0.0,
         heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),
         profile=_line_laser() if profile else None,

@@ -10,7 +10,9 @@ from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.sim.kr150_cell import SPIN_RAD, TAUGHT
+from robocal_ros.nodes.thermal_settings import session_config
+from robocal_ros.sim.kr150_cell import SPIN_RAD, TAUGHT, poses
+from robocal_ros.storage.robots import load_robot
 
 CELLS = sorted((Path(__file__).parents[2] / "config" / "cells").glob("*.yaml"))
 NODES = {f"/**/{n.NAME}": n for n in (CellSimNode, ThermalNode, TcfNode, JointCorrectionNode)}
@@ -26,6 +28,14 @@ def test_each_node_takes_its_values(path):
         settings = {s.name: s for s in (AUTOSTART, SERIAL, *NODES[name].SETTINGS)}
         for parameter, value in given["ros__parameters"].items():
             assert settings[parameter].accept(value) == value
+
+
+def test_accuracy_is_judged_where_the_robot_works():
+    given = yaml.safe_load(CELLS[0].read_text())["/**/thermal_node"]["ros__parameters"]
+    settings = {s.name: s.default for s in ThermalNode.SETTINGS} | given
+    work = session_config(settings | {"drift_parameters": []}, load_robot(given["robot"])).work
+    assert work.q == pytest.approx(poses("work"))
+    assert work.tip == pytest.approx(TAUGHT[:3, 3])
 
 
 def test_the_tool_is_the_cells():

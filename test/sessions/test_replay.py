@@ -232,7 +232,10 @@ def test_a_clock_that_jumped_back_in_the_recording(nominal, visits, tmp_path, ju
 
 
 def test_a_configuration_comes_back_whole(nominal, tmp_path):
-    config = ThermalConfig(method="lsq", sigma_m=1.23e-5, target="cube", lateness_s=0.5, seed=7)
+    poses, tip = ((0.1, -1.2, 1.3, 0.0, 0.4, 0.5),) * 2, (0.0, 0.01, 0.4)
+    config = ThermalConfig(
+        "lsq", sigma_m=1.23e-5, work_poses=poses, tip_m=tip, target="cube", lateness_s=0.5, seed=7
+    )
     session = session_in(tmp_path, nominal, config)
     command = configuration(session, {JOINTS: "/a/joint_states"})
     read = read_command(CONFIGURE, 0, arguments_text(command))

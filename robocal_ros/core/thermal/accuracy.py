@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.descent import chi2_quantile
+from robocal_ros.core.identification.solve import random_postures
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.cycle_verdict import workspace_rows
+from robocal_ros.core.thermal.spots import ColdSpots
 from robocal_ros.core.thermal.tracking import DriftTracker
 
 Array = NDArray[np.float64]
@@ -28,9 +29,30 @@ class AccuracyLevel(IntEnum):
     FAULT = 5
 
 
+@dataclass(frozen=True, eq=False)
+class Work:
+    """Where the tool is to be accurate.
+
+    Attributes
+    ----------
+    q : (m, n) working poses, rad (prismatic: m); None: throughout the joint limits.
+    tip : (3,) of the tool, flange, m; None: the first measured target.
+    """
+
+    q: Array | None = None
+    tip: Array | None = None
+
+    def rows(self, spots: ColdSpots) -> Array:
+        """Displacement (m, 3, k) of the tip by the arm's parameters, base."""
+        arm = spots.cell.arm
+        q = random_postures(arm) if self.q is None else self.q
+        tip = spots.cell.T_flange_target[0, :3, 3] if self.tip is None else self.tip
+        return arm.parameter_jacobian(q, tip)[:, :3]
+
+
 @dataclass(frozen=True)
 class ToolError:
-    """Expected error of the tool throughout the workspace, m.
+    """Expected error of the tool at all poses of the work, m.
 
     Attributes
     ----------
@@ -41,6 +63,18 @@ class ToolError:
     rms_m: float
     bound_m: float
 
+    @classmethod
+    def of_square(cls, mean: float, variance: float) -> "ToolError":
+        """From mean, m^2, and variance of the squared length.
+
+        It is taken for a scaled chi-square of these two moments (Satterthwaite 1946).
+        """
+        rms_m = float(np.sqrt(mean))
+        if variance <= 1e-12 * mean**2:  # a fixed length
+            return cls(rms_m, rms_m)
+        scale, freedom = variance / (2.0 * mean), 2.0 * mean**2 / variance
+        return cls(rms_m, float(np.sqrt(scale * chi2_quantile(0.95, freedom))))
+
 
 class AccuracyForecast:
     """Expected error of a model in force, from what the tracker knows.
@@ -48,16 +82,17 @@ class AccuracyForecast:
     Parameters
     ----------
     in_force : an arm of the cold model's type.
+    work : where the error is asked for.
     """
 
-    def __init__(self, tracker: DriftTracker, in_force: SerialArm) -> None:
+    def __init__(self, tracker: DriftTracker, in_force: SerialArm, work: Work) -> None:
         cold = tracker.spots.cell.arm
-        self._tracker = tracker
+        self._tracker, self._work = tracker, work
         self._in_force = cold.parameters.read(in_force.mdh - cold.mdh)
 
     @cached_property
     def _rows(self) -> Array:
-        return workspace_rows(self._tracker.spots)
+        return self._work.rows(self._tracker.spots)
 
     def drift_at(self, time_s: float) -> tuple[Array, Array]:
         """Expected drift (k,) since the cold visit and its covariance (k, k), SI."""
@@ -67,23 +102,19 @@ class AccuracyForecast:
         """Expected error at a time of the tracker's.
 
         At one posture the squared length of a Gaussian error of mean m and covariance C has mean
-        m'm + tr C and variance 4 m'Cm + 2 tr C^2; over all postures it is taken for a scaled
-        chi-square of the same two moments (Satterthwaite 1946).
+        m'm + tr C and variance 4 m'Cm + 2 tr C^2; `ToolError.of_square` takes both over all
+        postures. The scatter of one visit belongs to it, as large as that of a measured one.
         """
         drift, covariance = self.drift_at(time_s)
         rows = self._rows
         miss = rows @ (drift - self._in_force)
-        C = rows @ covariance @ rows.transpose(0, 2, 1)
+        C = rows @ covariance @ rows.transpose(0, 2, 1) + self._tracker.sigma_m**2 * np.eye(3)
         mean = np.einsum("pi,pi->p", miss, miss) + np.trace(C, axis1=1, axis2=2)
         variance = 4.0 * np.einsum("pi,pij,pj->p", miss, C, miss)
         variance += 2.0 * np.einsum("pij,pij->p", C, C)
         all_mean = float(mean.mean())
-        if all_mean == 0.0:  # at the cold visit itself
-            return ToolError(0.0, 0.0)
         all_variance = float(np.mean(variance + mean**2)) - all_mean**2
-        scale, freedom = all_variance / (2.0 * all_mean), 2.0 * all_mean**2 / all_variance
-        bound = scale * chi2_quantile(0.95, freedom)
-        return ToolError(float(np.sqrt(all_mean)), float(np.sqrt(bound)))
+        return ToolError.of_square(all_mean, all_variance)
 
     def due_in_s(self, time_s: float, tolerance_m: float) -> float:
         """Time from ``time_s`` until the bound exceeds a tolerance: zero where it does already.
