@@ -78,6 +78,9 @@ def endurance(amount: Amount) -> Table:
     restarts = "test/nodes/test_joint_correction_restarts.py"
     add("all nodes of a correction killed together, in each order", 6,
         lambda: not _pytest(restarts, ROBOCAL_RESTARTS="6"))  # fmt: skip
+    matrix = "test/nodes/test_fault_matrix.py"
+    add("all faults of a cell over DDS, each with its code", 1,
+        lambda: not _pytest(matrix, ROBOCAL_FAULTS="all"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test/core", "test/storage", "test/sessions")
