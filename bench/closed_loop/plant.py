@@ -175,11 +175,11 @@ class Plant:
         RobocalError
             When it is refused, or does not end.
         """
-        suite.last_tool = None
+        before = suite.last_tool
         suite.driver.arm(self.now_s)
         arguments = {"mode": mode, "cycle_id": cycle_id, "by": "commissioning"}
         suite.tool_command(Command(events.MEASURE_TOOL, arguments))
-        self._until(lambda: suite.last_tool is not None and not suite.driver.armed)
+        self._until(lambda: suite.last_tool is not before and not suite.driver.armed)
         if suite.last_tool is None:
             raise RobocalError(f"{cycle_id}: no answer")
         return suite.last_tool

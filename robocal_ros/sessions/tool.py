@@ -132,7 +132,7 @@ class ToolSession(Commanded):
             where = "ahead of" if ahead_s > 0.0 else "behind"
             self._end_early(
                 f"edges come stamped {abs(ahead_s):.2f} s {where} the joint states: a clock has "
-                "jumped; stamp both on one clock",
+                "jumped, or one of them comes late; stamp both on one clock",
                 Code.CLOCK_WRONG,
             )
 

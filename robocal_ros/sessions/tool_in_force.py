@@ -1,6 +1,5 @@
 """The tool in force and the thermal model that its flange poses come from."""
 
-from collections.abc import Mapping
 from typing import Any
 
 from robocal_ros.core.documents import arm_of
@@ -58,6 +57,6 @@ class ToolInForce(Followed):
         return None if traits is None else RunTraits.of_document(traits)
 
     @property
-    def _healthy_model(self) -> Mapping[str, Any] | None:
+    def _healthy_model(self) -> dict[str, Any] | None:
         model = self.healthy.model
         return None if model is None or model["made_with"] != self._made_with else model

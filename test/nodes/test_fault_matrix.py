@@ -54,8 +54,12 @@ class FaultCell:
         self.graph, self.cell = graph, LiveCell(graph, folder)
         self.until(lambda: self.told("/tcf_node/arm", SetBool, data=True), "armed")
         self.until(lambda: self.told("/tcf_node/measure_reference_trigger"), "it measures")
-        self.until(lambda: self.told("/tcf_node/result_trigger"), "the healthy tool is measured")
+        self.until(lambda: " NONE " not in self.result(), "the healthy tool is measured")
+        assert " ACCEPT " in self.result(), self.result()
         self.drive_home()
+
+    def result(self) -> str:
+        return str(self.graph.call(Trigger, "/tcf_node/result_trigger").message)
 
     def told(self, name: str, kind: type = Trigger, **fields: Any) -> bool:
         return bool(self.graph.call(kind, name, **fields).success)
@@ -99,7 +103,7 @@ class FaultCell:
         self.set_fault("none")
         if faulty:
             self.drive_home()
-            self.until(lambda: self.acknowledged(), f"{fault} is acknowledged")
+            self.until(self.acknowledged, f"{fault} is acknowledged")
         print(f"{fault}: {sorted(c.name for c in codes)}, {end}: {result.message} {state.fault}")
         return codes, end
 
