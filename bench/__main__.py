@@ -41,6 +41,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         thermal,
         tool,
     )
+    from bench.closed_loop import checks
     from bench.closed_loop import tables as closed_loop
 
     def times() -> Sequence[Table]:
@@ -71,6 +72,7 @@ def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
         "startup": start,
         "correction_stream": streams,
         "closed_loop": closed_loop.tables,
+        "fault_checks": checks.tables,
         "files": lambda: [files.file_times()],
         "replay_speed": replay_speed.tables,
     }

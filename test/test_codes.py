@@ -27,5 +27,5 @@ def test_numbers_are_never_reused():
         "RANK_DEFICIENT": 4, "TOO_FEW_SAMPLES": 5, "RESIDUAL_TOO_LARGE": 6,
         "POSES_NOT_INFORMATIVE": 7, "STALE": 8, "WRONG_ROBOT": 9, "LIMIT_EXCEEDED": 10,
         "BAD_INPUT": 11, "CONFLICT": 12, "STORAGE_FAILED": 13, "SENSOR_OR_ROBOT_MOVED": 14,
-        "BEAM_EDGES_WRONG": 15,
+        "BEAM_EDGES_WRONG": 15, "WRONG_TOOL": 16, "CLOCK_WRONG": 17,
     }.items() <= CODES.items()  # fmt: skip

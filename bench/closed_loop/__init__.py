@@ -7,5 +7,6 @@ plant     robot, PLC and suite on one clock: commissioning, gaps, production
 shift     the golden shift and shorter ones, and what came of them
 judging   how accurate that was, against the same shift without the suite
 faults    what each fault costs, and from which size on it is reported
+checks    the tool's check alone, with faults of many sizes
 tables    all of it as the tables of the bench
 """

@@ -15,7 +15,7 @@ from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.travel import joint_way
 from robocal_ros.sessions import events
 from robocal_ros.sessions.correction import TrajectoryCommand
-from robocal_ros.sessions.events import Command
+from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import CycleResult
 from robocal_ros.sessions.maintenance.ways import STATION
 from robocal_ros.sessions.tool_results import REFERENCE
@@ -162,16 +162,34 @@ class Plant:
             self.listen(self.now_s + DWELL_S)
         for name in (events.CALIBRATE_SENSOR, events.CAPTURE_REFERENCE):
             self._thermal(suite, Command(name, {"by": "commissioning"}))
+        measured = self.measure_tool(suite, REFERENCE, "commissioning")
+        if not measured.done:
+            raise RobocalError(f"commissioning of the tool: {measured}")
+        self.home_from_station(suite)
+        suite.enable()
+
+    def measure_tool(self, suite: Suite, mode: str, cycle_id: str) -> Outcome:
+        """Let the tool's driver measure, outside any gap; the robot stays where that ends.
+
+        Raises
+        ------
+        RobocalError
+            When it is refused, or does not end.
+        """
+        before = suite.last_tool
         suite.driver.arm(self.now_s)
-        arguments = {"mode": REFERENCE, "cycle_id": "commissioning", "by": "commissioning"}
+        arguments = {"mode": mode, "cycle_id": cycle_id, "by": "commissioning"}
         suite.tool_command(Command(events.MEASURE_TOOL, arguments))
-        self._until(lambda: suite.last_tool is not None and not suite.driver.armed)
-        if suite.last_tool is None or not suite.last_tool.done:
-            raise RobocalError(f"commissioning of the tool: {suite.last_tool}")
+        self._until(lambda: suite.last_tool is not before and not suite.driver.armed)
+        if suite.last_tool is None:
+            raise RobocalError(f"{cycle_id}: no answer")
+        return suite.last_tool
+
+    def home_from_station(self, suite: Suite) -> None:
+        """Drive home from wherever the tool's driver left the robot."""
         self.listen(self.now_s + 1.0)
         self.send(suite.maintenance.ways.home(STATION, self._q).plan)
         self.listen(self.cell.motion.end_s + 1.0)
-        suite.enable()
 
     def _go(self, suite: Suite, pose: Array) -> None:
         self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))

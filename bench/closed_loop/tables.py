@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from bench.closed_loop import setting
 from bench.closed_loop.drift_bound import drift_bound_table
 from bench.closed_loop.faults import (
-    HARMLESS,
+    RIGHT,
     Report,
     Trial,
     named_size,
@@ -151,16 +151,17 @@ def faults_table(reports: Sequence[Report]) -> Table:
     table = Table(
         "closed_loop_faults",
         "Faults: who reports them, and what they cost",
-        ("fault", "size", "seed", "reported by", "code", "gaps until then", "goal",
+        ("fault", "size", "seed", "reported by", "code", "right code", "gaps until it", "goal",
          "worst cycle worse by, mm", "goal ", "passes refused", "overrun, s"),
         "One gap, then the fault, then two gaps. Worse: rms error of the production after a gap, "
         "with the suite less without it. Refused: the correction put nothing out, the robot stood.",
     )  # fmt: skip
     for one in reports:
-        needs = one.trial.fault not in HARMLESS and not one.trial.size
+        right = RIGHT.get(one.trial.fault)
+        needs = right is not None and not one.trial.size
         table.add(
             one.trial.fault, named_size(one.trial), one.trial.seed, one.who or "nobody",
-            one.code.name if one.who else "", one.gaps if one.who else None,
+            one.code.name if one.who else "", right.name if right else "", one.gaps,
             Goal(one.gaps, 1.0) if needs else None, MM * one.harm.cycle_m,
             Goal(MM * one.harm.cycle_m, MM * FAULTY_RMS_M), one.stopped, one.over_s,
         )  # fmt: skip

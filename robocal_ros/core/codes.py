@@ -26,3 +26,5 @@ class Code(IntEnum):
     STORAGE_FAILED = 13
     SENSOR_OR_ROBOT_MOVED = 14
     BEAM_EDGES_WRONG = 15
+    WRONG_TOOL = 16
+    CLOCK_WRONG = 17

@@ -15,14 +15,18 @@ from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
 from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import Commanded, Handler
-from robocal_ros.sessions.edge_log import EDGES, MOST_EDGES, EdgeLog
+from robocal_ros.sessions.edge_log import AHEAD_NS, EDGES, MOST_EDGES, EdgeLog
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool_config import ToolConfig
 from robocal_ros.sessions.tool_in_force import ToolInForce
-from robocal_ros.sessions.tool_results import MODES, QUICK, ToolResults
+from robocal_ros.sessions.tool_results import MODES, QUICK, REFERENCE, ToolResults
 from robocal_ros.sessions.tool_run import ToolRun
+
+AHEAD_S = AHEAD_NS * 1e-9
+BEHIND_S = 0.15  # a gateway brings an edge sooner; smaller offsets the edges themselves show
+STRAYS = 2
 
 
 class ToolSession(Commanded):
@@ -46,6 +50,7 @@ class ToolSession(Commanded):
         self._laser = config.laser
         self._edges = EdgeLog()
         self._runs = 0
+        self._strays = 0  # edges of the run that came with a stamp far from the joints'
         self._over: Command | None = None
         self.run: ToolRun | None = None
 
@@ -80,7 +85,7 @@ class ToolSession(Commanded):
         jumped, run, newest = self._take_joints(sample), self.run, self.newest_joints_ns
         if jumped:
             self._edges.clear()
-            self._end_early("the clock jumped back")
+            self._end_early("the clock jumped back", Code.CLOCK_WRONG)
         elif run is not None and self._over is None and newest > run.from_ns:
             _, q = self.stream.window(newest, newest)
             waited_s, limit_s = run.waited_s(newest), self.config.step_timeout_s
@@ -100,9 +105,9 @@ class ToolSession(Commanded):
     def _watches_joints(self) -> bool:
         return self.run is not None and self._over is None
 
-    def _end_early(self, reason: str) -> None:
+    def _end_early(self, reason: str, code: Code = Code.BEAM_EDGES_WRONG) -> None:
         if self.run is not None:
-            arguments = {"code": int(Code.BEAM_EDGES_WRONG), "reason": reason}
+            arguments = {"code": int(code), "reason": reason}
             self._over = Command(events.BREAK_OFF, arguments, self.newest_joints_ns)
 
     def _add_edge(self, sample: EdgeSample) -> None:
@@ -113,10 +118,23 @@ class ToolSession(Commanded):
             )
             self._end_early(words)
             raise InputError(words)
+        if self.run is not None and self.newest_joints_ns:
+            self._watch_clocks((sample.stamp_ns - self.newest_joints_ns) * 1e-9)
         self._edges.add(sample, self.newest_ns, self.newest_joints_ns)
         self.received[EDGES] += 1
         if self.run is not None:
             self.run.watch_edge(sample)
+
+    def _watch_clocks(self, ahead_s: float) -> None:
+        """One edge that is stamped far from the joints may be a mistake, a second one is none."""
+        self._strays += not -BEHIND_S <= ahead_s <= AHEAD_S
+        if self._strays == STRAYS:
+            where = "ahead of" if ahead_s > 0.0 else "behind"
+            self._end_early(
+                f"edges come stamped {abs(ahead_s):.2f} s {where} the joint states: a clock has "
+                "jumped, or one of them comes late; stamp both on one clock",
+                Code.CLOCK_WRONG,
+            )
 
     # ---- commands -------------------------------------------------------------------------------
 
@@ -157,11 +175,12 @@ class ToolSession(Commanded):
         self._runs += 1
         begun_ns = command.stamp_ns or 0
         arm, revision = current.arm, current.thermal.revision
+        healthy = None if mode == REFERENCE else current.healthy_traits
         self.run = ToolRun(
-            self._runs, mode, cycle_id, plan, config, arm, revision, begun_ns, begun_ns
+            self._runs, mode, cycle_id, plan, config, arm, revision, begun_ns, begun_ns, healthy
         )
         self._edges.clear()
-        self._over = None
+        self._over, self._strays = None, 0
         words = f"run {self._runs} ({mode}): {', '.join(plan.names)}"
         return Outcome(command, Code.ACCEPT, words)
 

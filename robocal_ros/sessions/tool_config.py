@@ -15,6 +15,7 @@ from robocal_ros.core.tool.judging import ToolLimits
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
+from robocal_ros.core.tool.run_traits import TraitLimits
 
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, ...], ...]
@@ -50,6 +51,7 @@ class ToolConfig:
     noise: RobotNoise = field(default_factory=RobotNoise)
     check: CheckRule = field(default_factory=CheckRule)
     limits: ToolLimits = field(default_factory=ToolLimits)
+    traits: TraitLimits = field(default_factory=TraitLimits)
 
     @property
     def laser(self) -> LaserFrame:
@@ -80,9 +82,10 @@ class ToolConfig:
             "noise": RobotNoise,
             "check": CheckRule,
             "limits": ToolLimits,
+            "traits": TraitLimits,
         }
         try:
-            values: dict[str, Any] = dict(document)
+            values: dict[str, Any] = {"traits": {}} | dict(document)  # older ones have none
             rows: dict[str, Any] = {
                 key: tuple(map(tuple, values.pop(key))) for key in ("points_m", "taught")
             }

@@ -1,9 +1,12 @@
 """The tool in force and the thermal model that its flange poses come from."""
 
+from typing import Any
+
 from robocal_ros.core.documents import arm_of
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL, Head
 from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.core.tool.run_traits import RunTraits
 from robocal_ros.sessions.followed import Followed
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig, made_with
@@ -43,7 +46,17 @@ class ToolInForce(Followed):
     @property
     def measured_healthy(self) -> KnownTool | None:
         """How the healthy tool was measured; None without, or with another tool or station."""
+        model = self._healthy_model
+        return None if model is None else KnownTool.of_document(model)
+
+    @property
+    def healthy_traits(self) -> RunTraits | None:
+        """What its run showed beside the tool; None where that is not known."""
+        model = self._healthy_model
+        traits = None if model is None else model.get("traits")
+        return None if traits is None else RunTraits.of_document(traits)
+
+    @property
+    def _healthy_model(self) -> dict[str, Any] | None:
         model = self.healthy.model
-        if model is None or model["made_with"] != self._made_with:
-            return None
-        return KnownTool.of_document(model)
+        return None if model is None or model["made_with"] != self._made_with else model

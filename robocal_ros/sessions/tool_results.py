@@ -94,6 +94,7 @@ class ToolResults:
 
     def _full(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         estimate = run.estimate(Held())
+        run.require_like_healthy(estimate)
         found = KnownTool(estimate.T_flange_tool, estimate.covariance)
         taught, healthy = self._config.T_flange_taught, self._current.measured_healthy
         absolute = healthy is None
@@ -116,7 +117,10 @@ class ToolResults:
         verdict = judge_healthy(found, estimate, taught)
         document = run_document(found, estimate, run.circles, verdict)
         document["change"] = change_document(change_between(taught, found.T_flange_tool))
-        kept = self._keep(HEALTHY_TOOL, run, command, wall_ns, verdict, document, found)
+        traits = run.traits(estimate).document()
+        kept = self._keep(
+            HEALTHY_TOOL, run, command, wall_ns, verdict, document, found, traits=traits
+        )
         if verdict.accept:
             by = str(command.arguments.get("by", ""))
             self._history.accept(
@@ -137,7 +141,7 @@ class ToolResults:
         return self._answer(self._checked(quick_check, run), command)
 
     def _checked(self, check: Callable[..., QuickCheck], run: ToolRun) -> QuickCheck:
-        return check(
+        found = check(
             run.plan.laser,
             run.path,
             run.steps,
@@ -146,6 +150,8 @@ class ToolResults:
             noise=run.config.noise,
             stored_covariance=self._tip_covariance(),
         )
+        run.require_like_healthy(found.measured)
+        return found
 
     def _answer(self, check: QuickCheck, command: Command) -> Outcome:
         verdict = Verdict(CODE_OF[check.answer], f"{check.answer}: {check.reason}")
@@ -173,6 +179,7 @@ class ToolResults:
         verdict: Verdict,
         document: Document,
         found: KnownTool,
+        **beside: Any,
     ) -> int:
         return self._history.propose(
             Proposal(
@@ -188,7 +195,8 @@ class ToolResults:
                 reason=verdict.reason,
                 document=document,
                 model=found.document()
-                | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)},
+                | {"thermal_revision": run.thermal_revision, "made_with": made_with(self._config)}
+                | beside,
                 inputs=run.arrays(),
             )
         )

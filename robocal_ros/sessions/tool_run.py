@@ -14,6 +14,7 @@ from robocal_ros.core.tool.crossed_run import ToolEstimate, estimate_tool, run_p
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
+from robocal_ros.core.tool.run_traits import RunTraits
 from robocal_ros.core.tool.step_watch import StepWatch
 from robocal_ros.sessions.tool_config import ToolConfig
 
@@ -33,6 +34,7 @@ class ToolRun:
     arm, thermal_revision : the model in force when it began.
     begun_ns : origin of its times.
     from_ns : the step that is awaited counts from here.
+    healthy : traits of the healthy tool's run, which this one must share; None: none are known.
     """
 
     number: int
@@ -44,6 +46,7 @@ class ToolRun:
     thermal_revision: int
     begun_ns: int
     from_ns: int
+    healthy: RunTraits | None = None
     seen: Array | None = None
     steps: list[BeamStep] = field(default_factory=list)
     _time: list[Array] = field(default_factory=list)
@@ -96,7 +99,8 @@ class ToolRun:
         Raises
         ------
         RobocalError
-            When the edges make no sense, or no tool explains the steps so far.
+            When the edges make no sense, no tool explains the steps so far, or they differ from the
+            healthy tool's in what no bend changes.
         """
         step, rule = self.awaited, self.config.input
         beams: list[Beam] = [sample.beam for sample in edges]
@@ -105,13 +109,16 @@ class ToolRun:
             first, last = edges[0].stamp_ns - BEFORE_NS, edges[-1].stamp_ns + AFTER_NS
             near = (stamps >= first) & (stamps <= last)
             stamps, q = stamps[near], q[near]
+        self._require_readings(stamps)
         self.steps.append(BeamStep(step.name, step.kind, debounced(found, rule.debounce_s)))
         self._time.append(1e-9 * (stamps - self.begun_ns).astype(np.float64))
         self._q.append(q)
         if self.complete:
             return
         if self.plan.needs_tool(len(self.steps) + 1):
-            self.seen = self.estimate(PLANNING).T_flange_tool
+            tool = self.estimate(PLANNING)
+            self.require_like_healthy(tool)
+            self.seen = tool.T_flange_tool
         else:
             self._check()
 
@@ -131,6 +138,22 @@ class ToolRun:
             taper=self.config.taper,
             held=held,
         )
+
+    def traits(self, estimate: ToolEstimate) -> RunTraits:
+        """What the run shows beside the tool that it found."""
+        count = sum(len(time) - 1 for time in self._time)
+        span_s = sum(float(time[-1] - time[0]) for time in self._time)
+        return RunTraits.of(estimate, self.circles, count / span_s)
+
+    def require_like_healthy(self, estimate: ToolEstimate) -> None:
+        """Refuse what is no bend, see `RunTraits.require_like`."""
+        if self.healthy is not None:
+            self.traits(estimate).require_like(self.healthy, self.config.traits)
+
+    def _require_readings(self, stamps: NDArray[np.int64]) -> None:
+        if self.healthy is not None and len(stamps) > 1:
+            span_s = 1e-9 * float(stamps[-1] - stamps[0])
+            self.healthy.require_readings(len(stamps) - 1, span_s, self.config.traits)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that was measured, for keeping."""
