@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 TRUTH_S = 1.0  # between two states of the truth
 CENTRE = "sphere_center"
 
+Commanded = tuple[NDArray[np.int64], Array]
+
 
 class CellOutputs:
     """Publishers of a cell.
@@ -40,7 +42,8 @@ class CellOutputs:
     Attributes
     ----------
     told : number of messages sent on each topic.
-    commanded : (k, n) joints for the working poses that the truth judges, None for the taught ones.
+    commanded : which (k,) working poses were commanded last, and the joints (k, n) for them; None
+        before.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class CellOutputs:
         self._tool = add_output(TransformStamped, "~/truth", qos.LATCHED)
         self._state = add_output(String, "~/truth/state", qos.LATCHED)
         self.told = dict.fromkeys(kinds, 0)
-        self.commanded: Array | None = None
+        self.commanded: Commanded | None = None
         self.forget()
 
     def forget(self) -> None:
@@ -116,7 +119,7 @@ class CellOutputs:
         self.told[topic] += 1
 
 
-def truth_of(cell: SimulatedCell, commanded: Array | None) -> dict[str, Any]:
+def truth_of(cell: SimulatedCell, commanded: Commanded | None) -> dict[str, Any]:
     """What is true now, for judging alone; K, m, and the size of each fault in SI."""
     warmth, working = cell.warmth, cell.plan.working
     told = {
@@ -129,7 +132,8 @@ def truth_of(cell: SimulatedCell, commanded: Array | None) -> dict[str, Any]:
     if len(working):
         told["tcp_error_rms_m"] = _rms(cell.tcp_error(working))
     if commanded is not None:
-        told["commanded_tcp_error_rms_m"] = _rms(cell.tcp_error(commanded))
+        which, q = commanded
+        told["commanded_tcp_error_rms_m"] = _rms(cell.tcp_error(q, which))
     return told
 
 
