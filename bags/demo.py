@@ -3,8 +3,8 @@
 ``make demo`` runs it. A simulated KR 150 has worked for three hours since its cold cell was
 commissioned. The cell, thermal_node, tcf_node, joint_correction_node, maintenance_node and
 recorder_node run as processes of their own; this script is the bridge of the PLC: a heartbeat,
-service calls, the programme. In a gap the drift is measured, in the middle of the work that follows
-a collision bends the tool by 2 mm, and the next gap finds and mends it. At the end the recorded bag is
+service calls, the programme. In a gap the drift is measured; in the middle of the work after it a
+collision bends the tool by 2 mm, and the next gap finds and mends that. At the end the bag is
 replayed, judged and told in one page.
 """
 
@@ -14,7 +14,7 @@ import sys
 import time
 from pathlib import Path
 
-from demo_cell import PARAMETERS, commission, settings, wiring
+from demo_cell import PARAMETERS, commission, wiring, write_settings
 from demo_graph import ROOT, CellController, DemoError
 from demo_output import Moment, Story, show, tell, validate
 from demo_plc import Judge, Plc
@@ -88,9 +88,10 @@ def play(folder: Path, recordings: Path) -> Story:
     made = commission(folder)
     controller, plc = CellController(), None
     try:
-        wires = wiring()
-        for name, given in settings(made, recordings).items():
-            controller.start(folder, name, wires.get(name), [PARAMETERS], **given)
+        files = PARAMETERS, folder / "demo.yaml"
+        write_settings(made, recordings, files[1])
+        for name, wires in wiring().items():
+            controller.start(folder, name, {}, wires, files)
         plc = Plc(controller, tell)
         tell("waiting for six nodes, three hours of work later")
         plc.take_over()

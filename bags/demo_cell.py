@@ -5,6 +5,7 @@ What a person does once in a real cell is done by the sessions of the nodes on t
 the healthy tool measured. It is left in a state folder, as the nodes would leave it.
 """
 
+import json
 import sys
 import time
 from collections.abc import Mapping
@@ -15,15 +16,15 @@ from demo_graph import ROOT
 
 sys.path.insert(0, str(ROOT))  # for the bench
 
-from bench.closed_loop import setting  # noqa: E402
-from bench.closed_loop.plant import Plant  # noqa: E402
-from bench.closed_loop.suite import Suite  # noqa: E402
-from robocal_ros.sim.cell import SimulatedCell  # noqa: E402
-from robocal_ros.sim.cell_samples import CellSamples  # noqa: E402
-from robocal_ros.sim.kr150_cell import kr150_cell  # noqa: E402
-from robocal_ros.storage.calibrations import CalibrationHistory  # noqa: E402
-from robocal_ros.storage.laser_files import LaserFile, write_laser  # noqa: E402
-from robocal_ros.storage.robots import load_robot, save_robot  # noqa: E402
+from bench.closed_loop import setting
+from bench.closed_loop.plant import Plant
+from bench.closed_loop.suite import Suite
+from robocal_ros.sim.cell import SimulatedCell
+from robocal_ros.sim.cell_samples import CellSamples
+from robocal_ros.sim.kr150_cell import kr150_cell
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.laser_files import LaserFile, write_laser
+from robocal_ros.storage.robots import load_robot, save_robot
 
 ROBOT, SERIAL = "kr150_r3100", setting.SERIAL
 PARAMETERS = ROOT / "config" / "cells" / "kr150_shift.yaml"
@@ -32,8 +33,7 @@ WARM_H = 3.0  # so long ago the cell was commissioned and began to work
 PROGRAM, CONTROLLER = "/program/joint_trajectory", "/robot/joint_trajectory"
 TRUTH = "/cell_sim_node/truth/state"
 TOLERANCE_MM = 1.0
-# Motion is supervised by joint states that a busy machine may deliver late.
-PATIENT = {"motion_silence_s": 0.5, "motion_late_s": 0.6, "joint_velocity_deg_s": "[115.0]"}
+LATE_S = 1.0  # joint states may come so late: this machine may have other work too
 
 
 @dataclass(frozen=True)
@@ -77,34 +77,38 @@ def commission(folder: Path) -> Commissioned:
     return made
 
 
-def settings(made: Commissioned, recordings: Path) -> Mapping[str, Mapping[str, object]]:
-    """Parameters of each node beside `PARAMETERS`."""
+def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
+    """Write the parameters of each node beside `PARAMETERS`."""
     from robocal_ros.nodes.recorder_node import TOPICS
 
-    laser = {"laser": made.laser} | PATIENT
-    recorded = [*TOPICS, TRUTH]
-    return {
-        "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": "''"},
-        "recorder_node": {"folder": recordings, "topics": f"[{', '.join(recorded)}]"},
+    motion: dict[str, object] = {"motion_silence_s": 0.5, "motion_late_s": LATE_S}
+    motion |= {"laser": str(made.laser), "joint_velocity_deg_s": [115.0]}
+    nodes: dict[str, dict[str, object]] = {
+        "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": ""},
+        "recorder_node": {"folder": str(recordings), "topics": [*TOPICS, TRUTH]},
         "thermal_node": {"tolerance_mm": TOLERANCE_MM},
-        "tcf_node": laser,
-        "joint_correction_node": {"reference": made.reference},
-        "maintenance_node": laser
+        "tcf_node": motion | {"joint_silence_s": LATE_S},
+        "joint_correction_node": {"reference": str(made.reference), "joint_state_age_s": LATE_S},
+        "maintenance_node": motion
         | {"auto_accept": True, "tolerance_mm": TOLERANCE_MM, "travel_speed_mm_s": 1500.0},
     }
+    document = {f"/**/{name}": {"ros__parameters": given} for name, given in nodes.items()}
+    path.write_text(json.dumps(document, indent=1), encoding="utf-8")  # which is YAML too
 
 
 def wiring() -> Mapping[str, Mapping[str, str]]:
-    """Where the topics of each node lead."""
+    """The nodes, and where their topics lead."""
     out = {"~/joint_trajectory": CONTROLLER}
+    corrects = {
+        "joint_trajectory": PROGRAM,
+        "kinematic_model": "/thermal_node/model",
+        "tool_frame": "/tcf_node/tool",
+    }
     return {
         "cell_sim_node": {"joint_trajectory": CONTROLLER, "~/truth/commanded": CONTROLLER},
+        "recorder_node": {},
+        "thermal_node": {},
         "tcf_node": out,
+        "joint_correction_node": out | corrects,
         "maintenance_node": out,
-        "joint_correction_node": out
-        | {
-            "joint_trajectory": PROGRAM,
-            "kinematic_model": "/thermal_node/model",
-            "tool_frame": "/tcf_node/tool",
-        },
     }

@@ -106,9 +106,9 @@ class CellController:
         self,
         folder: Path,
         name: str,
+        parameters: Mapping[str, object],
         remap: Mapping[str, str] | None = None,
         files: Sequence[Path] = (),
-        **parameters: object,
     ) -> None:
         """Start an executable."""
         self._executables.append(Executable(name, parameters, remap or {}, folder, files))

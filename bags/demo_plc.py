@@ -28,7 +28,8 @@ from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.production import programme
 from robocal_ros.storage.robots import load_robot
 
-BEAT_S = 0.2
+BEAT_S = 0.1
+START_S = 120.0  # of all nodes, on a machine with much else to do
 ASK_S = 0.2  # between two calls of ~/status
 LEAD = 2  # rests at home, a second each: after a gap the correction blends in from there
 EACH = 3  # of the cell's working poses one in so many is visited
@@ -83,7 +84,7 @@ class Plc:
     def take_over(self) -> None:
         """Wait until all nodes are there, and switch the correction on."""
         controller = self._controller
-        controller.wait(lambda: self._accuracy, "accuracy_state")
+        controller.wait(lambda: self._accuracy, "accuracy_state", START_S)
         controller.wait(lambda: self._correction, "the joint correction")
         controller.wait(lambda: self._status("").state.at_home, "a robot at home")
         controller.wait(lambda: self._status("").state.disarmed, "a disarmed tcf_node")
@@ -100,25 +101,24 @@ class Plc:
     # ---- production -----------------------------------------------------------------------------
 
     def produce(self, halfway: Callable[[], None] | None = None) -> None:
-        """A pass of the programme, as taught; what corrects it stands between here and the robot."""
+        """A pass of the programme as taught; what corrects it stands on its way to the robot."""
         message = JointTrajectory(joint_names=self._names)
         for at, q in zip(self._time, self._q, strict=True):
             zero = [0.0] * len(q)
-            point = JointTrajectoryPoint(
-                positions=q.tolist(), velocities=zero, accelerations=zero
-            )
+            point = JointTrajectoryPoint(positions=q.tolist(), velocities=zero, accelerations=zero)
             seconds, rest = divmod(float(at), 1.0)
             point.time_from_start.sec = int(seconds)
             point.time_from_start.nanosec = int(rest * 1e9)
             message.points.append(point)
-        refused = sum(self._correction[-1].refused_counts) if self._correction else 0
+        refused = sum(self._correction[-1].refused) if self._correction else 0
         begin_s, end_s = time.monotonic(), float(self._time[-1])
         self._program.publish(message)
         if halfway is not None:
             self._until(begin_s + 0.5 * end_s)
             halfway()
         self._until(begin_s + end_s + REST_S)
-        now = sum(self._correction[-1].refused_counts)
+        self._controller.wait(lambda: self._status("").state.at_home, "the robot at home")
+        now = sum(self._correction[-1].refused)
         if now > refused:
             raise DemoError(f"the correction refused the programme: {self._correction[-1]}")
 
@@ -141,13 +141,13 @@ class Plc:
                 if told.state.doing and told.state.doing != said:
                     said = told.state.doing
                     self._tell(f"{time.monotonic() - begin_s:5.1f} s  {said}")
+                if told.state.state == MaintenanceStatus.FAULT:
+                    raise DemoError(f"{name}: {told.state.fault}")
                 if told.result.code != Code.NONE and told.state.at_home:
                     result = told.result
             used_s = time.monotonic() - begin_s
         finally:
             self._is_open = False
-        if told.state.state != MaintenanceStatus.IDLE:
-            raise DemoError(f"{name}: {told.state.fault}")
         return Gap(name, length_s, used_s, result)
 
     def _begin(self, name: str, end_s: float) -> Any:

@@ -12,8 +12,8 @@ from collections import deque
 from pathlib import Path
 
 from demo_graph import ROOT, CellController, DemoError
-from make_demo_shift import ROBOT
 from diagnostic_msgs.msg import DiagnosticArray
+from make_demo_shift import ROBOT
 from make_thermal_shift import BAG, PERIOD_S
 from robocal_msgs.msg import AccuracyState, SessionEvent
 from robocal_msgs.srv import BeginCycle, CaptureReference, Decide, EndCycle
@@ -50,22 +50,21 @@ class Player:
 
     def start(self, folder: Path) -> None:
         """Start thermal_node and replay_node; the replay waits."""
-        reliable = {
+        reliable: dict[str, object] = {
             f"qos_overrides./{topic}.subscription.{policy}": value
             for topic in INPUTS
             for policy, value in (("reliability", "reliable"), ("history", "keep_all"))
         }
         settings: dict[str, object] = {"robot": ROBOT, "serial": SERIAL, "use_sim_time": True}
         settings |= {"lateness_s": 0.0, "cycle_timeout_s": 1.5 * PERIOD_S}
-        self._controller.start(folder, "thermal_node", **settings, **reliable)
-        self._controller.start(
-            folder,
-            "replay_node",
-            bag=BAG,
-            rate=RATE,
-            start_paused=True,
-            wait_for_subscribers=f"[{', '.join((*INPUTS, 'cycle_done'))}]",
-        )
+        self._controller.start(folder, "thermal_node", settings | reliable)
+        replayed = {
+            "bag": BAG,
+            "rate": RATE,
+            "start_paused": True,
+            "wait_for_subscribers": f"[{', '.join((*INPUTS, 'cycle_done'))}]",
+        }
+        self._controller.start(folder, "replay_node", replayed)
 
     def run(self) -> None:
         """Play the bag; act at each mark."""

@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState, PointCloud2, Temperature
 from std_msgs.msg import String
 
 from robocal_ros.core.samples import REFERENCE_SPHERE, SPHERE_CLOUD
+from robocal_ros.core.thermal.drift_history import THRESHOLD_M
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.cell_sim_messages import (
     beam_event,
@@ -130,13 +131,15 @@ def truth_of(cell: SimulatedCell, commanded: Commanded | None) -> dict[str, Any]
         "link_k": warmth.link.tolist(),
     }
     if len(working):
-        told["tcp_error_rms_m"] = _rms(cell.tcp_error(working))
+        told |= _error("", cell.tcp_error(working))
     if commanded is not None:
         which, q = commanded
-        told["commanded_tcp_error_rms_m"] = _rms(cell.tcp_error(q, which))
+        told |= _error("commanded_", cell.tcp_error(q, which))
     return told
 
 
-def _rms(error: Array) -> float:
-    """Of distances (k, 3)."""
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+def _error(which: str, error: Array) -> dict[str, float]:
+    """Of the tool at working poses (k, 3), m: its rms, and the share of its coordinates within."""
+    rms_m = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+    within = float(np.mean(np.abs(error) <= THRESHOLD_M))
+    return {f"{which}tcp_error_rms_m": rms_m, f"{which}within_share": within}

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from robocal_ros.report.drift import TOLERANCE_MM, DriftReport
+from robocal_ros.report.drift import TOLERANCE_MM, ShiftErrors
 from robocal_ros.report.figures import (
     AFTER,
     BEFORE,
@@ -64,7 +64,7 @@ class ModelDrift:
     sigma: Array
 
 
-def thermal_figures(cycles: Sequence[Document], truth: DriftReport | None) -> list[Drawn]:
+def thermal_figures(cycles: Sequence[Document], truth: ShiftErrors | None) -> list[Drawn]:
     """Figures of a thermal session: errors, and how the model moved."""
     found = []
     if truth is not None:

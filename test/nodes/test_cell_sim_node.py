@@ -376,7 +376,9 @@ def test_the_truth_says_what_is_wrong_and_by_how_much(graph):
     cell.graph.spin_until(lambda: key in cell.truth(), "it is judged")
     wanted = cell.node._cell.tcp_error(work + 1e-3 * np.eye(6)[0])
     assert cell.truth()[key] == pytest.approx(np.sqrt(np.mean(np.sum(wanted**2, axis=1))), rel=0.01)
-    some = np.vstack([poses("home"), work[[7, 3]], poses("cycle")[:1], work[7] + 2e-3, poses("home")])
+    some = np.vstack(
+        [poses("home"), work[[7, 3]], poses("cycle")[:1], work[7] + 2e-3, poses("home")]
+    )
     cell.to_judge.publish(cell.trajectory(some))
     wanted = np.vstack([work[7] + 2e-3, work[3]])
     error = cell.node._cell.tcp_error(wanted, np.array([7, 3]))
