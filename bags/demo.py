@@ -9,6 +9,7 @@ replayed, judged and told in one page.
 """
 
 import argparse
+import json
 import shutil
 import sys
 import time
@@ -120,6 +121,8 @@ def main() -> int:
     try:
         story = play(folder, recordings)
         tell("the recorded bag, replayed and judged")
+        document = json.dumps(story.document(), indent=1, allow_nan=False) + "\n"
+        (folder / "story.json").write_text(document, encoding="utf-8")
         page = validate(recordings, folder / "report")
     except (DemoError, RobocalError) as error:
         print(f"demo: {error}", file=sys.stderr)

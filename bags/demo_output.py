@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import webbrowser
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from demo_graph import ROOT, DemoError
@@ -32,6 +32,27 @@ class Story:
 
     moments: list[Moment] = field(default_factory=list)
     gaps: list[Gap] = field(default_factory=list)
+
+    def document(self) -> dict[str, object]:
+        """Plain values."""
+        moments = [asdict(moment) for moment in self.moments]
+        return {"simulated": True, "moments": moments, "gaps": [_gap(gap) for gap in self.gaps]}
+
+
+def _gap(gap: Gap) -> dict[str, object]:
+    result = gap.result
+    codes = {
+        name: Code(getattr(result, name)).name for name in ("code", "thermal_code", "tool_code")
+    }
+    return {
+        "gap": gap.name,
+        "length_s": gap.length_s,
+        "used_s": gap.used_s,
+        **codes,
+        "complete": result.complete,
+        "accepted": list(result.accepted),
+        "message": result.message,
+    }
 
 
 def tell(words: str) -> None:
