@@ -82,9 +82,10 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
     from robocal_ros.nodes.recorder_node import TOPICS
 
     motion: dict[str, object] = {"motion_silence_s": 0.5, "motion_late_s": LATE_S}
+    motion |= {"deviation_mm": 50.0, "deviation_deg": 5.0}  # what comes late looks astray
     motion |= {"laser": str(made.laser), "joint_velocity_deg_s": [115.0]}
     nodes: dict[str, dict[str, object]] = {
-        "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": ""},
+        "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": "", "rate_hz": 62.5},
         "recorder_node": {"folder": str(recordings), "topics": [*TOPICS, TRUTH]},
         "thermal_node": {"tolerance_mm": TOLERANCE_MM},
         "tcf_node": motion | {"joint_silence_s": LATE_S},

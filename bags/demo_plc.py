@@ -28,7 +28,7 @@ from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.production import programme
 from robocal_ros.storage.robots import load_robot
 
-BEAT_S = 0.1
+BEAT_S = 0.05
 START_S = 120.0  # of all nodes, on a machine with much else to do
 ASK_S = 0.2  # between two calls of ~/status
 LEAD = 2  # rests at home, a second each: after a gap the correction blends in from there
