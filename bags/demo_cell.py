@@ -88,7 +88,8 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
         "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": "", "rate_hz": 62.5},
         "recorder_node": {"folder": str(recordings), "topics": [*TOPICS, TRUTH]},
         "thermal_node": {"tolerance_mm": TOLERANCE_MM},
-        "tcf_node": motion | {"joint_silence_s": LATE_S},
+        "tcf_node": motion
+        | {"joint_silence_s": LATE_S, "circle_speed_mm_s": 80.0, "plunge_speed_mm_s": 20.0},
         "joint_correction_node": {"reference": str(made.reference), "joint_state_age_s": LATE_S},
         "maintenance_node": motion
         | {"auto_accept": True, "tolerance_mm": TOLERANCE_MM, "travel_speed_mm_s": 1500.0},
