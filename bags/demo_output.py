@@ -1,68 +1,117 @@
-"""What the demo leaves behind: the page with its numbers, and a summary on the terminal."""
+"""What the demo leaves behind: the validated bag's page, and a summary on the terminal."""
 
-import json
+import os
 import subprocess
+import sys
+import webbrowser
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import numpy as np
-from demo_graph import ROOT
+from demo_graph import ROOT, DemoError
+from demo_plc import Gap
 
-from robocal_ros import __version__
 from robocal_ros.core.codes import Code
-from robocal_ros.report.drift import TOLERANCE_MM, DriftReport
+
+VALIDATED_WITHIN_S = 120.0
 
 
-def commit() -> str:
-    """Version of the software, with its commit where git knows it."""
-    words = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=10"]
-    found = subprocess.run(words, capture_output=True, text=True, check=False)
-    return f"robocal_ros {__version__} {found.stdout.strip()}".strip()
+@dataclass(frozen=True)
+class Moment:
+    """True rms error of the tool at the working poses, mm, and what the line read then."""
+
+    words: str
+    without_mm: float
+    with_mm: float
+    state: str
+    reason: str
 
 
-def write(report: DriftReport, folder: Path) -> None:
-    """Write the page, the figures' numbers as JSON, and every error as CSV."""
-    from robocal_ros.report.html import page
+@dataclass
+class Story:
+    """What came of the demo."""
 
-    (folder / "report.html").write_text(page(report), encoding="utf-8")
-    document = json.dumps(report.document(), indent=1, allow_nan=False)
-    (folder / "report.json").write_text(document + "\n", encoding="utf-8")
-    (folder / "errors.csv").write_text(report.table(), encoding="utf-8")
+    moments: list[Moment] = field(default_factory=list)
+    gaps: list[Gap] = field(default_factory=list)
+
+    def document(self) -> dict[str, object]:
+        """Plain values."""
+        moments = [asdict(moment) for moment in self.moments]
+        return {"simulated": True, "moments": moments, "gaps": [_gap(gap) for gap in self.gaps]}
 
 
-def show(report: DriftReport, folder: Path, seconds: float) -> None:
-    """Print the summary."""
+def _gap(gap: Gap) -> dict[str, object]:
+    result = gap.result
+    codes = {
+        name: Code(getattr(result, name)).name for name in ("code", "thermal_code", "tool_code")
+    }
+    return {
+        "gap": gap.name,
+        "length_s": gap.length_s,
+        "used_s": gap.used_s,
+        **codes,
+        "complete": result.complete,
+        "accepted": list(result.accepted),
+        "message": result.message,
+    }
+
+
+def tell(words: str) -> None:
+    """Say what goes on."""
+    print(f"  {words}", flush=True)
+
+
+def validate(recordings: Path, report: Path) -> Path:
+    """The page of ``robocal validate`` of what was recorded.
+
+    Raises
+    ------
+    DemoError
+        When there is no recording, or it cannot be validated.
+    """
+    bags = sorted(recordings.glob("robocal_*"))
+    if not bags:
+        raise DemoError(f"nothing was recorded in {recordings}")
+    command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *map(str, bags)]
+    done = subprocess.run(
+        [*command, "--report", str(report)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=VALIDATED_WITHIN_S,
+        check=False,
+    )
+    if done.returncode != 0:
+        raise DemoError(f"the recording cannot be validated:\n{done.stdout}{done.stderr}")
+    return report / "report.html"
+
+
+def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
+    """Print the summary; open the page where there is a desktop."""
     from rich.console import Console
     from rich.table import Table
 
     console = Console(highlight=False)
-    cycles, poses, _ = report.before.shape
-    console.print(f"\n[bold]{report.title}[/bold]  [red]simulated[/red]")
-    console.print(
-        f"{cycles} measuring cycles in {report.hours[-1]:.1f} h; true error of the tool at {poses} "
-        "poses that were never measured:\n"
-    )
+    console.print("\n[bold]A cell that keeps itself accurate[/bold]  [red]simulated[/red]\n")
     table = Table(box=None, header_style="dim")
-    table.add_column("mm", no_wrap=True)
-    for head in ("mean", "rms", "p95", "max", f"within {TOLERANCE_MM:g} mm"):
+    table.add_column("true error at the working poses, rms mm", no_wrap=True)
+    for head in ("without", "with"):
         table.add_column(head, justify="right")
-    for i, (name, found) in enumerate(report.rows()):
-        keys = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
-        cells = [f"{found[key]:.3f}" for key in keys] + [f"{found['share_within_tolerance']:.1%}"]
-        table.add_row(name, *cells, style="bold green" if i == 1 else None)
+    table.add_column("the line reads")
+    for moment in story.moments:
+        figures = f"{moment.without_mm:.3f}", f"{moment.with_mm:.3f}"
+        table.add_row(moment.words, *figures, moment.state)
     console.print(table)
-    accepted = sum(decided.code == Code.ACCEPT.name for decided in report.decisions)
-    predicted = [d.predicted_mm for d in report.decisions if d.predicted_mm is not None]
-    if predicted:
+    console.print()
+    for gap in story.gaps:
+        result = gap.result
+        brought = ", ".join(map(str, result.accepted)) or "nothing"
         console.print(
-            f"\npredicted there from the models' own covariance: "
-            f"{np.sqrt(np.mean(np.square(predicted))):.3f} mm rms"
+            f"{gap.name}: {gap.used_s:.0f} of {gap.length_s:.0f} s; thermal "
+            f"{Code(result.thermal_code).name}, tool {Code(result.tool_code).name}; "
+            f"came into force: {brought}"
         )
-    console.print(f"{accepted} of {cycles} candidates accepted; the report says why:")
-    page = folder / "report.html"
-    console.print(str(page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page))
-    console.print(
-        "[dim]The same from the bag alone: .venv/bin/robocal validate bags/demo_shift.mcap "
-        "--robot kr150_r3100 --report out/validation[/dim]",
-        soft_wrap=True,
-    )
-    console.print(f"[dim]{seconds:.0f} s, through three nodes as processes over DDS[/dim]")
+    near = page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page
+    console.print(f"\n{near}", soft_wrap=True)
+    console.print(f"[dim]{seconds:.0f} s, six nodes as processes over DDS[/dim]")
+    if opened and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        webbrowser.open(page.as_uri())

@@ -6,15 +6,18 @@ of its session is written beside the measurements, so that ``robocal replay`` ca
 """
 
 import argparse
+import json
 import sys
 from collections import deque
 from pathlib import Path
 
 from demo_graph import ROOT, CellController, DemoError
+from diagnostic_msgs.msg import DiagnosticArray
 from make_demo_shift import ROBOT
 from make_thermal_shift import BAG, PERIOD_S
 from robocal_msgs.msg import AccuracyState, SessionEvent
 from robocal_msgs.srv import BeginCycle, CaptureReference, Decide, EndCycle
+from std_msgs.msg import String
 
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
@@ -38,25 +41,30 @@ class Player:
         self.accuracy: deque[AccuracyState] = deque(maxlen=1)
         controller.listen(SessionEvent, EVENT_TOPIC, self.events, EVENTS)
         controller.listen(AccuracyState, "/thermal_node/accuracy", self.accuracy, qos.LATCHED)
+        self._done: deque[String] = deque()
+        self._status: deque[String] = deque(maxlen=1)
+        self._diagnostics: deque[DiagnosticArray] = deque(maxlen=30)
+        controller.listen(String, "cycle_done", self._done, qos.RELIABLE)
+        controller.listen(String, "/replay_node/status", self._status, qos.LATCHED)
+        controller.listen(DiagnosticArray, "/diagnostics", self._diagnostics, qos.RELIABLE)
 
     def start(self, folder: Path) -> None:
         """Start thermal_node and replay_node; the replay waits."""
-        reliable = {
+        reliable: dict[str, object] = {
             f"qos_overrides./{topic}.subscription.{policy}": value
             for topic in INPUTS
             for policy, value in (("reliability", "reliable"), ("history", "keep_all"))
         }
         settings: dict[str, object] = {"robot": ROBOT, "serial": SERIAL, "use_sim_time": True}
         settings |= {"lateness_s": 0.0, "cycle_timeout_s": 1.5 * PERIOD_S}
-        self._controller.start(folder, "thermal_node", **settings, **reliable)
-        self._controller.start(
-            folder,
-            "replay_node",
-            bag=BAG,
-            rate=RATE,
-            start_paused=True,
-            wait_for_subscribers=f"[{', '.join((*INPUTS, 'cycle_done'))}]",
-        )
+        self._controller.start(folder, "thermal_node", settings | reliable)
+        replayed = {
+            "bag": BAG,
+            "rate": RATE,
+            "start_paused": True,
+            "wait_for_subscribers": f"[{', '.join((*INPUTS, 'cycle_done'))}]",
+        }
+        self._controller.start(folder, "replay_node", replayed)
 
     def run(self) -> None:
         """Play the bag; act at each mark."""
@@ -64,9 +72,9 @@ class Player:
         cycles = marks()
         for number, expected in enumerate(cycles):
             controller.trigger("/replay_node/play")
-            controller.wait(lambda: controller.done, "the end of a cycle")
-            controller.pause("thermal_node", INPUTS)
-            if (name := controller.done.popleft().data) != expected:
+            controller.wait(lambda: self._done, "the end of a cycle")
+            self._pause()
+            if (name := self._done.popleft().data) != expected:
                 raise DemoError(f"the mark of {name} came, not that of {expected}")
             if name == REFERENCE:
                 self._capture()
@@ -74,6 +82,30 @@ class Player:
                 self._end(name)
             if number + 1 < len(cycles):
                 self._begin(cycles[number + 1])
+
+    def _pause(self) -> None:
+        """Pause the replay and wait until thermal_node has taken in all that was played.
+
+        A cell that runs in real time needs no such wait: here an hour passes in seconds.
+        """
+        controller = self._controller
+        self._status.clear()
+        controller.trigger("/replay_node/pause")
+        controller.wait(lambda: self._status, "the replay's status")
+        sent = json.loads(self._status[-1].data)["sent"]
+        controller.wait(
+            lambda: all(self._taken(topic) >= sent[topic] for topic in INPUTS),
+            "thermal_node to take in what was played",
+        )
+
+    def _taken(self, topic: str) -> int:
+        """How many messages thermal_node says it has received or lost."""
+        for array in reversed(self._diagnostics):
+            for status in array.status:
+                if status.name == "thermal_node":
+                    values = {pair.key: pair.value for pair in status.values}
+                    return int(values[f"{topic} received"]) + int(values[f"{topic} lost"])
+        return -1
 
     def _capture(self) -> None:
         answer = self._controller.call(CaptureReference, "/thermal_node/capture_reference")

@@ -21,7 +21,7 @@ from robocal_ros.cli.recorded_robot import find_robot
 from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.cli.replaying import Request, replay_bag
 from robocal_ros.cli.validating_cell import cell_course
-from robocal_ros.cli.validating_cycles import drift_report, thermal_document
+from robocal_ros.cli.validating_cycles import shift_errors, thermal_document
 from robocal_ros.cli.validating_parts import as_recorded, calibrations, decisions, tool_runs
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
 from robocal_ros.core.codes import Code
@@ -188,10 +188,8 @@ class _Session:
             sigma_m = float(common["settings"]["sigma_m"])
             cycles = made.cycles(self._forecasts, check_points(self._reader), sigma_m)
         document = thermal_document(cycles, arm)
-        truth = drift_report(self._job.name, cycles, arm)
-        return {"kind": "thermal", **document}, thermal_figures(
-            document["cycles"], truth, self._mark
-        )
+        shown = thermal_figures(document["cycles"], shift_errors(cycles), self._mark)
+        return {"kind": "thermal", **document}, shown
 
     def _common(self, replayed: Document) -> Document:
         configured, recorded = self._recording.configured, bool(self._recording.commands)

@@ -5,11 +5,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros import __version__
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.validating_thermal import CycleErrors, ReplayedCycle
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.report.drift import TOLERANCE_MM, Decided, DriftReport, Origin
+from robocal_ros.report.drift import TOLERANCE_MM, ShiftErrors
 
 Array = NDArray[np.float64]
 
@@ -84,27 +83,15 @@ def _share(
     return float(np.mean(np.concatenate(below))) if below else None
 
 
-def drift_report(title: str, cycles: Sequence[ReplayedCycle], arm: SerialArm) -> DriftReport | None:
-    """The cycles that a truth judges, as a report of their true errors; None without any.
-
-    Only what is simulated has a truth.
-    """
+def shift_errors(cycles: Sequence[ReplayedCycle]) -> ShiftErrors | None:
+    """Errors of the cycles that a truth judges; None without any."""
     judged = [(c, c.true) for c in cycles if c.true is not None and c.true.after is not None]
     if not judged:
         return None
-    unit = arm.parameters.to_display
-    return DriftReport(
-        title=title,
-        origin=Origin(True, title, arm.name, "", arm.model_hash, __version__, ""),
+    return ShiftErrors(
         hours=np.array([c.hours for c, _ in judged]),
-        decisions=[
-            Decided(c.entry.cycle_id, c.entry.code.name, c.entry.reason, c.entry.revision)
-            for c, _ in judged
-        ],
+        accepted=[c.entry.revision > 0 for c, _ in judged],
         before=np.array([true.without for _, true in judged]),
         after=np.array([true.after for _, true in judged]),
         held=np.array([true.in_force for _, true in judged]),
-        parameter_names=arm.parameters.names,
-        drift=np.array([c.drift * unit for c, _ in judged]),
-        sigma=np.array([c.sigma * unit for c, _ in judged]),
     )

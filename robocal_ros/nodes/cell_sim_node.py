@@ -7,7 +7,7 @@ import numpy as np
 from robocal_msgs.msg import ToolStep
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
@@ -25,6 +25,7 @@ from robocal_ros.nodes.run import run
 from robocal_ros.sessions.correction.inputs import trajectory_command
 from robocal_ros.sim.cell import TICK_S, SimulatedCell
 from robocal_ros.sim.cell_plan import known_laser
+from robocal_ros.sim.kr150_cell import worked_for
 from robocal_ros.storage.files import write_text
 
 BEHIND_S = 1.0  # a longer pause of the process, or a jump of its clock, is none of the cell's
@@ -45,6 +46,8 @@ class CellSimNode(HouseNode):
         settings = self.settings
         plan = cell_plan(settings)
         self._cell = SimulatedCell(plan)
+        if self._cell.heating:
+            self._cell.heating.warmth = worked_for(settings["warm_h"])
         if settings["laser_csv"]:
             rng = np.random.default_rng([settings["seed"], 2])
             there = at_station(settings, plan)
@@ -108,14 +111,17 @@ class CellSimNode(HouseNode):
         cell.follow(start_s + command.time_from_start_s, q, qd, qdd)
 
     def _judge(self, message: Any) -> None:
-        """Joints commanded at the working poses: the truth tells what would come of them."""
+        """A trajectory of the programme: the truth tells what would come of it.
+
+        A point belongs to the working pose that it is near to; others are on the way.
+        """
         cell = self._cell
         if cell is None:
             return
         q, _, _ = in_joint_order(trajectory_command(message), cell.plan.arm)
-        if q.shape != cell.plan.working.shape:
-            raise InputError(f"{len(q)} points for {len(cell.plan.working)} working poses")
-        self._out.commanded = q
+        which, points = cell.plan.at_work(q)
+        if len(which):
+            self._out.commanded = which, q[points]
 
     def _await_step(self, message: Any) -> None:
         if message.kind == ToolStep.NONE:

@@ -12,6 +12,7 @@ from sensor_msgs.msg import JointState, PointCloud2, Temperature
 from std_msgs.msg import String
 
 from robocal_ros.core.samples import REFERENCE_SPHERE, SPHERE_CLOUD
+from robocal_ros.core.thermal.drift_history import THRESHOLD_M
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.cell_sim_messages import (
     beam_event,
@@ -33,6 +34,8 @@ Array = NDArray[np.float64]
 TRUTH_S = 1.0  # between two states of the truth
 CENTRE = "sphere_center"
 
+Commanded = tuple[NDArray[np.int64], Array]
+
 
 class CellOutputs:
     """Publishers of a cell.
@@ -40,7 +43,8 @@ class CellOutputs:
     Attributes
     ----------
     told : number of messages sent on each topic.
-    commanded : (k, n) joints for the working poses that the truth judges, None for the taught ones.
+    commanded : which (k,) working poses were commanded last, and the joints (k, n) for them; None
+        before.
     """
 
     def __init__(
@@ -62,7 +66,7 @@ class CellOutputs:
         self._tool = add_output(TransformStamped, "~/truth", qos.LATCHED)
         self._state = add_output(String, "~/truth/state", qos.LATCHED)
         self.told = dict.fromkeys(kinds, 0)
-        self.commanded: Array | None = None
+        self.commanded: Commanded | None = None
         self.forget()
 
     def forget(self) -> None:
@@ -116,7 +120,7 @@ class CellOutputs:
         self.told[topic] += 1
 
 
-def truth_of(cell: SimulatedCell, commanded: Array | None) -> dict[str, Any]:
+def truth_of(cell: SimulatedCell, commanded: Commanded | None) -> dict[str, Any]:
     """What is true now, for judging alone; K, m, and the size of each fault in SI."""
     warmth, working = cell.warmth, cell.plan.working
     told = {
@@ -127,12 +131,18 @@ def truth_of(cell: SimulatedCell, commanded: Array | None) -> dict[str, Any]:
         "link_k": warmth.link.tolist(),
     }
     if len(working):
-        told["tcp_error_rms_m"] = _rms(cell.tcp_error(working))
+        told |= _error("", cell.tcp_error(working))
     if commanded is not None:
-        told["commanded_tcp_error_rms_m"] = _rms(cell.tcp_error(commanded))
+        which, q = commanded
+        told |= _error("commanded_", cell.tcp_error(q, which))
     return told
 
 
-def _rms(error: Array) -> float:
-    """Of distances (k, 3)."""
-    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+def _error(which: str, error: Array) -> dict[str, float]:
+    """Of the tool at working poses (k, 3), m; the share is of its coordinates."""
+    far = np.linalg.norm(error, axis=1)
+    return {
+        f"{which}tcp_error_rms_m": float(np.sqrt(np.mean(far**2))),
+        f"{which}tcp_error_p95_m": float(np.quantile(far, 0.95)),
+        f"{which}within_share": float(np.mean(np.abs(error) <= THRESHOLD_M)),
+    }

@@ -67,6 +67,14 @@ SETTINGS = (
     _mm("repeatability_mm", 0.03, "Scatter of a motion in each axis", 2.0),
     _mm("edge_noise_mm", 0.01, "Further scatter at each edge", 2.0),
     Setting("ripple", 0.02, "Relative ripple of the program's speed", low=0.0, high=0.5),
+    Setting(
+        "warm_h",
+        0.0,
+        "The kr150 has worked for so long when it begins",
+        unit="h",
+        low=0.0,
+        high=100.0,
+    ),
     Setting("warm_up", 1.0, "Heat of the kr150, over the usual", low=0.0, high=10.0, live=True),
     Setting(
         "cloud_points",

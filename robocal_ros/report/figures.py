@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy.typing import NDArray
 
-from robocal_ros.report.drift import TOLERANCE_MM, DriftReport
+from robocal_ros.report.drift import TOLERANCE_MM, ShiftErrors
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def distances_mm(error: Array) -> Array:
     return np.asarray(np.linalg.norm(error, axis=-1) * 1e3)
 
 
-def drift_over_time(report: DriftReport) -> Figure:
+def drift_over_time(report: ShiftErrors) -> Figure:
     """Error at the check poses over the shift, without and with correction."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.6), layout="constrained")
@@ -67,9 +67,8 @@ def drift_over_time(report: DriftReport) -> Figure:
         both = np.stack([distances_mm(report.held), distances_mm(report.after)], axis=1)
         x = np.append(0.0, np.repeat(hours, 2))
         _band(axes, x, np.vstack([cold, both.reshape(-1, poses)]), AFTER, "with correction")
-        for hour, decided in zip(hours, report.decisions, strict=True):
-            if decided.code == "ACCEPT":
-                axes.plot(hour, 0.0, marker="^", color=AFTER, ms=5, clip_on=False, zorder=5)
+        taken = hours[np.asarray(report.accepted, dtype=bool)]
+        axes.plot(taken, np.zeros(len(taken)), "^", color=AFTER, ms=5, clip_on=False, zorder=5)
         axes.axhline(TOLERANCE_MM, color=FAINT, lw=0.8, ls=(0, (4, 3)))
         axes.set(
             xlabel="hours of production   (triangle: a new model came into force)",
@@ -78,7 +77,7 @@ def drift_over_time(report: DriftReport) -> Figure:
             xlim=(0.0, float(hours[-1]) * 1.001),
         )
         axes.yaxis.set_major_locator(MultipleLocator(TOLERANCE_MM))
-        axes.set_title(_title("Tool error over the shift: mean, and 5 to 95 % of poses", report))
+        axes.set_title("Tool error over the shift: mean, and 5 to 95 % of poses (simulated)")
     return figure
 
 
@@ -95,7 +94,7 @@ def _band(axes: Axes, x: Array, values: Array, color: str, label: str) -> None:
     )  # fmt: skip
 
 
-def error_by_pose(report: DriftReport) -> Figure:
+def error_by_pose(report: ShiftErrors) -> Figure:
     """Error of each check pose: mean over the shift, and its range."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.4), layout="constrained")
@@ -120,12 +119,12 @@ def error_by_pose(report: DriftReport) -> Figure:
         axes.yaxis.set_major_locator(MultipleLocator(TOLERANCE_MM))
         axes.legend(loc="upper left", ncols=2, handletextpad=0.2)
         axes.grid(visible=False, axis="x")
-        axes.set_title(_title("Each check pose: mean and range over the shift", report))
+        axes.set_title("Each check pose: mean and range over the shift (simulated)")
     return figure
 
 
 class Drifted(Protocol):
-    """How a model moved: parts of a `DriftReport`."""
+    """How a model moved."""
 
     @property
     def hours(self) -> Array:
@@ -169,10 +168,6 @@ def _symbol(name: str) -> str:
     for word, letter in GREEK.items():
         name = name.replace(word, letter)
     return name
-
-
-def _title(words: str, report: DriftReport) -> str:
-    return f"{words} (simulated)" if report.origin.simulated else words
 
 
 def titled(axes: Axes, words: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from robocal_ros.report.drift import TOLERANCE_MM, DriftReport
+from robocal_ros.report.drift import TOLERANCE_MM, ShiftErrors
 from robocal_ros.report.figures import (
     AFTER,
     BEFORE,
@@ -78,7 +78,7 @@ def cell_figures(course: CellCourse) -> tuple[Drawn, ...]:
 
 
 def thermal_figures(
-    cycles: Sequence[Document], truth: DriftReport | None, mark: str = ""
+    cycles: Sequence[Document], truth: ShiftErrors | None, mark: str = ""
 ) -> list[Drawn]:
     """Figures of a thermal session: errors, and how the model moved; ``mark`` ends their titles."""
     found = []

@@ -173,15 +173,15 @@ class SimulatedCell:
         T[:, :3, 3] += off[:, :3]
         return T
 
-    def tcp_error(self, q: ArrayLike) -> Array:
-        """True error (k, 3) of the tool's tip at the working poses, base, m.
+    def tcp_error(self, q: ArrayLike, which: Index | slice = slice(None)) -> Array:
+        """True error (k, 3) of the tool's tip at the working poses, or at some of them, base, m.
 
         For joints (k, n) commanded there: where they put the tip, mean over visits, with robot
         and tool as they are now, from where the cold robot put the taught tool at the taught pose.
         """
         plan, now = self.plan, self.tool.T_flange_tool[:3, 3]
         tip = plan.robot.point(q, self.warmth, now) + self._hand
-        return np.asarray(tip - self._taught)
+        return np.asarray(tip - self._taught[which])
 
     @cached_property
     def _taught(self) -> Array:

@@ -16,6 +16,9 @@ from robocal_ros.sim.sphere_station import SphereStation
 from robocal_ros.sim.thermal import Warmth
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+NEAR = float(np.radians(8.0))  # corrections are smaller, working poses further apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +56,18 @@ class CellPlan:
     def arm(self) -> SerialArm:
         """The nominal robot."""
         return self.robot.nominal
+
+    def at_work(self, q: Array) -> tuple[Index, Index]:
+        """Which working poses (k,) joints (m, n) go to, and the point of each; the last one counts.
+
+        A point goes to the pose that it is nearest to, where no joint is further than `NEAR` away.
+        """
+        if not len(self.working):
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        far = np.max(np.abs(q[:, None] - self.working[None]), axis=2)
+        nearest, points = np.argmin(far, axis=1), np.flatnonzero(np.min(far, axis=1) < NEAR)
+        last = {int(nearest[point]): int(point) for point in points}
+        return np.array(list(last), dtype=np.int64), np.array(list(last.values()), dtype=np.int64)
 
 
 def rigid_robot(nominal: SerialArm, error_m: float, rng: np.random.Generator) -> TrueRobot:

@@ -47,6 +47,7 @@ FLOOR = np.array([-0.28, 0.22, 0.84])  # sphere on a post, in the sensor's frame
 DUTY = np.array([0.5, 1.0, 1.0, 0.8, 0.6, 0.6])  # of the programme at its usual speed
 PROGRAMME_RAD_S = np.array([0.296, 0.216, 0.172, 0.358, 0.300, 0.466])  # its mean joint speeds
 SHIFT_H = 8.0
+HOUR_S = 3600.0
 
 
 def poses(kind: str) -> Array:
@@ -82,6 +83,11 @@ def kr150_cell(
         working=poses("work"),
         seed=seed,
     )
+
+
+def worked_for(hours: float) -> Warmth:
+    """As warm as the robot is after so long with its programme, from cold."""
+    return kr150.WARM_UP.step(Warmth.cold(len(DUTY)), DUTY, hours * HOUR_S)
 
 
 def _line_laser() -> ProfileStation:

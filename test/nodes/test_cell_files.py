@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
 from robocal_ros.nodes.thermal_settings import session_config
@@ -15,7 +17,11 @@ from robocal_ros.sim.kr150_cell import SPIN_RAD, TAUGHT, poses
 from robocal_ros.storage.robots import load_robot
 
 CELLS = sorted((Path(__file__).parents[2] / "config" / "cells").glob("*.yaml"))
-NODES = {f"/**/{n.NAME}": n for n in (CellSimNode, ThermalNode, TcfNode, JointCorrectionNode)}
+SHARED = "/**"
+NODES = {
+    f"/**/{n.NAME}": n
+    for n in (CellSimNode, ThermalNode, TcfNode, MaintenanceNode, JointCorrectionNode)
+}
 
 
 def test_there_is_one():
@@ -24,9 +30,12 @@ def test_there_is_one():
 
 @pytest.mark.parametrize("path", CELLS, ids=lambda path: path.stem)
 def test_each_node_takes_its_values(path):
-    for name, given in yaml.safe_load(path.read_text()).items():
+    sections = yaml.safe_load(path.read_text())
+    shared = sections.pop(SHARED)["ros__parameters"]
+    assert set(sections) == set(NODES)
+    for name, given in sections.items():
         settings = {s.name: s for s in (AUTOSTART, SERIAL, *NODES[name].SETTINGS)}
-        for parameter, value in given["ros__parameters"].items():
+        for parameter, value in (shared | given["ros__parameters"]).items():
             assert settings[parameter].accept(value) == value
 
 
@@ -38,7 +47,16 @@ def test_accuracy_is_judged_where_the_robot_works():
     assert work.tip == pytest.approx(TAUGHT[:3, 3])
 
 
-def test_the_tool_is_the_cells():
-    given = yaml.safe_load(CELLS[0].read_text())["/**/tcf_node"]["ros__parameters"]
-    assert given["taught_xyz_mm"] == pytest.approx((1e3 * TAUGHT[:3, 3]).tolist())
+def test_tool_and_poses_are_the_cells():
+    sections = yaml.safe_load(CELLS[0].read_text())
+    for name in ("/**/tcf_node", "/**/maintenance_node"):
+        given = sections[name]["ros__parameters"]
+        assert given["taught_xyz_mm"] == pytest.approx((1e3 * TAUGHT[:3, 3]).tolist())
+    given = sections["/**/tcf_node"]["ros__parameters"]
     assert given["spin_deg"] == pytest.approx(SPIN_RAD * 57.29577951308232)
+    tool = sections["/**/joint_correction_node"]["ros__parameters"]["taught_tool"]
+    assert tool == [*TAUGHT[:3, 3].tolist(), 0.0, 0.0, 0.0, 1.0]
+    given = sections["/**/maintenance_node"]["ros__parameters"]
+    assert given["home_deg"] == pytest.approx(np.degrees(poses("home")[0]).tolist())
+    taught = [[float(word) for word in text.split()] for text in given["measuring_poses_deg"]]
+    assert np.array(taught) == pytest.approx(np.degrees(poses("cycle")))

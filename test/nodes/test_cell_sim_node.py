@@ -376,8 +376,17 @@ def test_the_truth_says_what_is_wrong_and_by_how_much(graph):
     cell.graph.spin_until(lambda: key in cell.truth(), "it is judged")
     wanted = cell.node._cell.tcp_error(work + 1e-3 * np.eye(6)[0])
     assert cell.truth()[key] == pytest.approx(np.sqrt(np.mean(np.sum(wanted**2, axis=1))), rel=0.01)
-    cell.to_judge.publish(cell.trajectory(work[:3]))
-    judged = cell.node.inputs["~/truth/commanded"]
-    cell.graph.spin_until(lambda: judged.invalid == 1, "too few poses")
+    some = np.vstack(
+        [poses("home"), work[[7, 3]], poses("cycle")[:1], work[7] + 2e-3, poses("home")]
+    )
+    cell.to_judge.publish(cell.trajectory(some))
+    wanted = np.vstack([work[7] + 2e-3, work[3]])
+    error = cell.node._cell.tcp_error(wanted, np.array([7, 3]))
+    two = pytest.approx(np.sqrt(np.mean(np.sum(error**2, axis=1))), rel=0.01)
+    cell.graph.spin_until(lambda: cell.truth()[key] == two, "those of the working poses alone")
+    cell.to_judge.publish(cell.trajectory(poses("cycle")))  # none of them is judged
+    states = len(cell.told["/cell_sim_node/truth/state"])
+    cell.wait_for("/cell_sim_node/truth/state", states + 2)
+    assert cell.truth()[key] == two
     cell.set(fault="none")
     cell.graph.spin_until(lambda: not cell.truth()["faults"], "all is well again")

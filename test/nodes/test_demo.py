@@ -1,4 +1,4 @@
-"""The whole demo: three executables and a cell controller over DDS, from the bag to the page."""
+"""The whole demo: a PLC bridge drives a cell of six processes by service calls alone."""
 
 import csv
 import json
@@ -7,64 +7,87 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from robocal_ros.core.codes import Code
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
 
 ROOT = Path(__file__).parent.parent.parent
-LONGEST_S = 85.0
+LONGEST_S = 240.0
+WITHIN_MM = 0.3  # what docs/cell.md calls recovered
+BENT_MM = 2.0
+NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what it was measured with
 
 
-@pytest.fixture
-def demo(graph, tmp_path) -> tuple[str, Path]:
-    """What the demo printed, and the folder of its report."""
-    out = tmp_path / "out"
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "bags" / "demo.py"), "--out", str(out)],
-        env=os.environ | {"ROS_DOMAIN_ID": str(graph.domain), "COLUMNS": "120"},
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_S,
-    )
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> tuple[str, dict, Path]:
+    """What the demo printed, what it told of its story, and its folder."""
+    from conftest import free_domain
+
+    out = tmp_path_factory.mktemp("demo")
+    with free_domain() as domain:
+        done = subprocess.run(
+            [sys.executable, str(ROOT / "bags" / "demo.py"), "--out", str(out), "--no-open"],
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain), "COLUMNS": "120"},
+            capture_output=True,
+            text=True,
+            timeout=LONGEST_S,
+            check=False,
+        )
     assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout, out
+    return done.stdout, json.loads((out / "story.json").read_text()), out
 
 
-def test_the_demo_says_in_mm_what_it_brought(demo):
-    printed, out = demo
-    report = json.loads((out / "report.json").read_text())
-    before, after, oldest = report["errors"].values()
-    # a robot of this size drifts by tenths of a millimetre; at least half of it must go
-    assert 0.1 < before["mean_mm"] < 0.9
-    assert after["mean_mm"] < 0.5 * before["mean_mm"]
-    assert after["mean_mm"] <= oldest["mean_mm"] < before["mean_mm"]
-    assert after["share_within_tolerance"] > before["share_within_tolerance"]
-    for found in (before, after, oldest):
-        assert f"{found['mean_mm']:.3f}" in printed
+def test_the_shift_goes_as_it_should(demo):
+    printed, story, _ = demo
+    drifted, corrected, bent, recovered = story["moments"]
+    # The correction takes more away than measuring it again could explain.
+    assert corrected["with_mm"] < drifted["with_mm"] - NOISE_MM
+    # The bend is seen across its direction and added to what was there.
+    assert abs(bent["with_mm"] - BENT_MM) < 2.0 * WITHIN_MM
+    assert recovered["with_mm"] < WITHIN_MM
+    assert recovered["without_mm"] > BENT_MM - 2.0 * WITHIN_MM
+    for moment in story["moments"]:
+        assert f"{moment['with_mm']:.3f}" in printed
     assert "simulated" in printed
-    assert report["simulated"] is True
 
-    page = (out / "report.html").read_text()
+
+def test_the_gaps_are_kept_and_used(demo):
+    _, story, _ = demo
+    first, second = story["gaps"]
+    for gap in (first, second):
+        assert gap["used_s"] <= gap["length_s"]
+        assert (gap["code"], gap["complete"]) == (Code.ACCEPT.name, True)
+    assert first["thermal_code"] == Code.ACCEPT.name
+    assert second["tool_code"] == Code.ACCEPT.name
+    assert first["accepted"]
+    assert second["accepted"]
+
+
+def test_the_line_reads_what_is_known(demo):
+    """Nothing measured yet; then right; the collision is not known before the next gap."""
+    _, story, _ = demo
+    states = [moment["state"] for moment in story["moments"]]
+    assert states[0] == "EXPIRED"
+    assert states[1] == states[2] != "EXPIRED"
+    assert states[3] in ("OK", "DUE", "DEGRADED")
+
+
+def test_the_recording_gives_the_live_results_again(demo):
+    _, story, out = demo
+    report = json.loads((out / "report" / "report.json").read_text())
+    (bag,) = report["bags"]
+    assert bag["simulated"]
+    kinds = {session["kind"]: session for session in bag["sessions"]}
+    assert set(kinds) == {"thermal", "tool"}
+    for session in kinds.values():
+        assert session["as_recorded"]
+        assert session["differs"] == []
+    cycles = kinds["thermal"]["cycles"]
+    assert [cycle["verdict"]["code"] for cycle in cycles] == [
+        gap["thermal_code"] for gap in story["gaps"]
+    ]
+    page = (out / "report" / "report.html").read_text()
+    assert "bit for bit" in page
     assert "simulated" in page
-    assert page.count("<svg") == 3
-    rows = list(csv.DictReader((out / "errors.csv").open()))
-    assert len(rows) == 15 * 34
-    shown = np.array([[float(row[f"after_{axis}_mm"]) for axis in "xyz"] for row in rows])
-    assert np.linalg.norm(shown, axis=1).mean() == pytest.approx(after["mean_mm"], abs=1e-3)
-
-    nominal = load_robot("kr150_r3100")
-    with CalibrationHistory.open(
-        "SIM-KR150-1", model_hash=nominal.model_hash, state_dir=out / "state"
-    ) as history:
-        entries = history.list(100)
-        assert history.head().revision == report["cycles"][-1]["revision"]
-    thermal = [entry for entry in entries if entry.kind == "thermal"]
-    assert len(thermal) == 15
-    by_cycle = {entry.cycle_id: entry for entry in thermal}
-    for cycle in report["cycles"]:
-        entry = by_cycle[cycle["cycle"]]
-        assert entry.code.name == cycle["verdict"]["code"]
-        assert (entry.revision > 0) == (entry.code is Code.ACCEPT)
+    rows = list(csv.DictReader((out / "report" / "decisions.csv").open()))
+    assert sum(row["command"] == "run_maintenance" for row in rows) == 2

@@ -1,0 +1,116 @@
+"""The demo's cell before its shift: commissioned while it was cold, in one process. Simulated.
+
+What a person does once in a real cell is done by the sessions of the nodes on the simulated robot
+(`bench.closed_loop`): the sphere sensor is placed, the cold reference captured, the beams placed,
+the healthy tool measured. It is left in a state folder, as the nodes would leave it.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from demo_graph import ROOT
+
+sys.path.insert(0, str(ROOT))  # for the bench
+
+from bench.closed_loop import setting
+from bench.closed_loop.plant import Plant
+from bench.closed_loop.suite import Suite
+from robocal_ros.sim.cell import SimulatedCell
+from robocal_ros.sim.cell_samples import CellSamples
+from robocal_ros.sim.kr150_cell import kr150_cell
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.laser_files import LaserFile, write_laser
+from robocal_ros.storage.robots import load_robot, save_robot
+
+ROBOT, SERIAL = "kr150_r3100", setting.SERIAL
+PARAMETERS = ROOT / "config" / "cells" / "kr150_shift.yaml"
+SEED = 1
+WARM_H = 3.0  # so long ago the cell was commissioned and began to work
+PROGRAM, CONTROLLER = "/program/joint_trajectory", "/robot/joint_trajectory"
+TRUTH = "/cell_sim_node/truth/state"
+TOLERANCE_MM = 1.0
+LATE_S = 1.0  # joint states may come so late: this machine may have other work too
+
+
+@dataclass(frozen=True)
+class Commissioned:
+    """Files that the commissioning left: histories in ``state``, beams, calibrated cold robot."""
+
+    state: Path
+    laser: Path
+    reference: Path
+
+
+def commission(folder: Path) -> Commissioned:
+    """Commission the cold cell, `WARM_H` hours ago.
+
+    Raises
+    ------
+    RobocalError
+        When a step is refused.
+    """
+    made = Commissioned(folder / "state", folder / "laser.yaml", folder / "reference.yaml")
+    nominal = load_robot(ROBOT)
+    cell = SimulatedCell(kr150_cell(nominal, SEED))
+    laser = setting.laser_of(cell.plan)
+    placed = LaserFile(laser, setting.STATION, nominal.name, nominal.model_hash, SERIAL)
+    write_laser(made.laser, placed)
+    with CalibrationHistory.open(
+        SERIAL, model_hash=nominal.model_hash, state_dir=made.state
+    ) as history:
+        plant = Plant(cell, None)
+        plant.samples = CellSamples(
+            nominal.joint_names,
+            setting.THERMAL.sphere,
+            start_ns=time.time_ns() - round(WARM_H * 3600e9),
+            station=setting.STATION,
+            frame=setting.FRAME,
+        )
+        plant.suite = suite = Suite(nominal, history, laser, plant.send)
+        plant.commission()
+        if suite.thermal.reference is not None:
+            save_robot(suite.thermal.reference.cell.arm, made.reference)
+    return made
+
+
+def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
+    """Write the parameters of each node beside `PARAMETERS`."""
+    from robocal_ros.nodes.recorder_node import TOPICS
+
+    motion: dict[str, object] = {"motion_silence_s": 0.5, "motion_late_s": LATE_S}
+    motion |= {"deviation_mm": 50.0, "deviation_deg": 5.0}  # what comes late looks astray
+    motion |= {"laser": str(made.laser), "joint_velocity_deg_s": [115.0]}
+    nodes: dict[str, dict[str, object]] = {
+        "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": "", "rate_hz": 62.5},
+        "recorder_node": {"folder": str(recordings), "topics": [*TOPICS, TRUTH]},
+        "thermal_node": {"tolerance_mm": TOLERANCE_MM},
+        "tcf_node": motion
+        | {"joint_silence_s": LATE_S, "circle_speed_mm_s": 80.0, "plunge_speed_mm_s": 20.0},
+        "joint_correction_node": {"reference": str(made.reference), "joint_state_age_s": LATE_S},
+        "maintenance_node": motion
+        | {"auto_accept": True, "tolerance_mm": TOLERANCE_MM, "travel_speed_mm_s": 1500.0},
+    }
+    document = {f"/**/{name}": {"ros__parameters": given} for name, given in nodes.items()}
+    path.write_text(json.dumps(document, indent=1), encoding="utf-8")  # which is YAML too
+
+
+def wiring() -> Mapping[str, Mapping[str, str]]:
+    """The nodes, and where their topics lead."""
+    out = {"~/joint_trajectory": CONTROLLER}
+    corrects = {
+        "joint_trajectory": PROGRAM,
+        "kinematic_model": "/thermal_node/model",
+        "tool_frame": "/tcf_node/tool",
+    }
+    return {
+        "cell_sim_node": {"joint_trajectory": CONTROLLER, "~/truth/commanded": CONTROLLER},
+        "recorder_node": {},
+        "thermal_node": {},
+        "tcf_node": out,
+        "joint_correction_node": out | corrects,
+        "maintenance_node": out,
+    }
