@@ -1,4 +1,4 @@
-"""Make the demo's bag: ``python bags/make_demo_shift.py`` writes ``demo_shift.mcap``. Simulated.
+"""A simulated shift of three hours: ``python bags/make_demo_shift.py`` writes ``demo_shift.mcap``.
 
 A KR 150 works for three hours with a break. Cold, it shows its sphere to the sensor in twelve
 poses; then, every twelve minutes, in eight of them. The bag holds what a cell would record:

@@ -1,12 +1,14 @@
 """A cell that keeps itself accurate for a shift: simulated cell and sessions in one process.
 
-setting   settings of the sessions, as a configured cell has them
-suite     the sessions, joined as the nodes join them
-words     what they tell each other
-plant     robot, PLC and suite on one clock: commissioning, gaps, production
-shift     the golden shift and shorter ones, and what came of them
-judging   how accurate that was, against the same shift without the suite
-faults    what each fault costs, and from which size on it is reported
-checks    the tool's check alone, with faults of many sizes
-tables    all of it as the tables of the bench
+setting      settings of the sessions, as a configured cell has them
+suite        the sessions, joined as the nodes join them
+words        what they tell each other
+plant        robot, PLC and suite on one clock: commissioning, gaps, production
+shift        the golden shift and shorter ones, and what came of them
+judging      how accurate that was, against the same shift without the suite
+earlier      shifts at the pace of the cycles, and what they teach
+drift_bound  what the stated bound of the drift is made of
+faults       what each fault costs, and from which size on it is reported
+checks       the tool's check alone, with faults of many sizes
+tables       all of it as the tables of the bench
 """

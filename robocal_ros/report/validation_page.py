@@ -268,7 +268,8 @@ def _decisions(decisions: Sequence[Document]) -> str:
 def _origin(report: Document) -> str:
     facts = [("software", report["software"]), ("date", report["created"])]
     facts += [(name, version) for name, version in report["versions"].items()]
-    facts += [("tables", "bags.csv, cycles.csv, decisions.csv, report.json beside this page")]
+    tables = "bags.csv, cycles.csv, decisions.csv, hours.csv, report.json"
+    facts.append(("tables", f"{tables} beside this page"))
     return listed(facts)
 
 

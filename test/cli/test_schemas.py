@@ -113,6 +113,12 @@ CASES = {
         ["history", "show", "99", "--state", "state"],
         (2, "BAD_INPUT"),
     ),
+    "history corrections": (
+        "history.corrections.json",
+        ["history", "corrections", "--state", "state"],
+        ["history", "corrections", "--state", "nowhere"],
+        (2, "BAD_INPUT"),
+    ),
     "history accept": (
         "history.decision.json",
         ["history", "rollback", "--to", "nominal", "--state", "state"],

@@ -1,7 +1,5 @@
 """Harness of the node tests: a graph of its own for each test, spun in the test's own thread."""
 
-import contextlib
-import fcntl
 import os
 import signal
 import subprocess
@@ -30,10 +28,9 @@ sys.path[:0] = [
     str(ROOT / "test" / "sessions"),
     str(ROOT / "test" / "cli"),
 ]
+from domains import free_domain  # noqa: E402
 
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
-# Domains whose ports lie below those that Linux hands out to any program.
-DOMAINS = range(1, 102)
 DEADLINE_S = 10.0
 DISCOVERY_S = 0.25
 
@@ -216,18 +213,6 @@ class Graph:
         self.executor.shutdown()
         self.probe.destroy_node()
         self.context.try_shutdown()
-
-
-@contextlib.contextmanager
-def free_domain() -> Iterator[int]:
-    """Reserve a ROS domain that no other test on this machine uses."""
-    for domain in DOMAINS:
-        path = Path(tempfile.gettempdir(), f"robocal_test_domain_{domain}.lock")
-        with contextlib.suppress(BlockingIOError), path.open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield domain
-            return
-    pytest.fail("all ROS domains are in use by other tests")
 
 
 @pytest.fixture

@@ -171,18 +171,23 @@ class LiveCell:
 
     def capture_reference(self) -> None:
         """A person drives the cold robot through the poses, and back home."""
+        ends = np.radians([*POSES_DEG, HOME_DEG])
+        for start, end in zip(np.roll(ends, 1, axis=0), ends, strict=True):
+            self.drive_between(start, end)
+            self.graph.spin_for(RESTS_S + 0.8)
+        # The visit home is none of the poses.
+        answer = self.graph.call(CaptureReference, "/thermal_node/capture_reference")
+        assert answer.success, answer.message
+
+    def drive_between(self, start: np.ndarray, end: np.ndarray) -> None:
+        """A person drives the robot on a straight joint line (n,) to (n,), rad, to its end."""
         body = ToolBody(np.eye(4), 0.1, 0.01, 0.06)
         housing = Housing(0.06, 0.03, -0.12, 0.05)
         limits = MotionLimits(tcp_speed_m_s=1.0)
         cell = MotionCell(self.arm, body, np.eye(4), housing, limits)
-        ends = np.radians([*POSES_DEG, HOME_DEG])
-        for start, end in zip(np.roll(ends, 1, axis=0), ends, strict=True):
-            plan: JointPlan = joint_way(cell, start, end)
-            self.drive.publish(trajectory_message(plan, self.arm.joint_names))
-            self.graph.spin_for(plan.duration_s + RESTS_S + 0.8)
-        # The visit home is none of the poses.
-        answer = self.graph.call(CaptureReference, "/thermal_node/capture_reference")
-        assert answer.success, answer.message
+        plan: JointPlan = joint_way(cell, start, end)
+        self.drive.publish(trajectory_message(plan, self.arm.joint_names))
+        self.graph.spin_for(plan.duration_s)
 
     # ---- calls ----------------------------------------------------------------------------------
 

@@ -40,7 +40,11 @@ def test_each_node_takes_its_values(path):
 
 
 def test_accuracy_is_judged_where_the_robot_works():
-    given = yaml.safe_load(CELLS[0].read_text())["/**/thermal_node"]["ros__parameters"]
+    sections = yaml.safe_load(CELLS[0].read_text())
+    given = {
+        **sections[SHARED]["ros__parameters"],
+        **sections["/**/thermal_node"]["ros__parameters"],
+    }
     settings = {s.name: s.default for s in ThermalNode.SETTINGS} | given
     work = session_config(settings | {"drift_parameters": []}, load_robot(given["robot"])).work
     assert work.q == pytest.approx(poses("work"))

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from domains import free_domain
 
 from robocal_ros.core.codes import Code
 
@@ -21,8 +22,6 @@ NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what i
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory) -> tuple[str, dict, Path]:
     """What the demo printed, what it told of its story, and its folder."""
-    from conftest import free_domain
-
     out = tmp_path_factory.mktemp("demo")
     with free_domain() as domain:
         done = subprocess.run(
@@ -68,8 +67,7 @@ def test_the_line_reads_what_is_known(demo):
     _, story, _ = demo
     states = [moment["state"] for moment in story["moments"]]
     assert states[0] == "EXPIRED"
-    assert states[1] == states[2] != "EXPIRED"
-    assert states[3] in ("OK", "DUE", "DEGRADED")
+    assert states[1:] == ["OK", "OK", "OK"]
 
 
 def test_the_recording_gives_the_live_results_again(demo):

@@ -16,13 +16,11 @@ from rcl_interfaces.srv import SetParameters
 from robocal_msgs.msg import MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.codes import Code
 
 GAP_S = 60.0
 WITHIN_S = 45.0
-HOME_S = 3
 SHORT = {
     "clock_jump": Code.CLOCK_WRONG,
     "wrong_tool": Code.WRONG_TOOL,
@@ -112,10 +110,7 @@ class FaultCell:
 
     def drive_home(self) -> None:
         """A person does."""
-        point = JointTrajectoryPoint(positions=np.radians(HOME_DEG).tolist())
-        point.time_from_start.sec = HOME_S
-        names = list(self.cell.arm.joint_names)
-        self.cell.drive.publish(JointTrajectory(joint_names=names, points=[point]))
+        self.cell.drive_between(self.cell.q, np.radians(HOME_DEG))
         self.until(self.cell.at_home, "at home")
         self.graph.spin_for(0.5)
 

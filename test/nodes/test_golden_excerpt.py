@@ -210,7 +210,8 @@ def test_the_thermal_node_says_what_a_replay_says(
     assert begun == recorded
     again = replayed(recording, recording.configured, recording.commands, tmp_path / "again")
     with kept(graph.state, "K7") as found, kept(tmp_path / "again", "again") as wanted:
-        assert cycles(found) == cycles(wanted)
+        assert len(cycles(wanted)) == 2
+    assert cycles(found) == cycles(wanted)
     assert len(commands_of(live)) == len(again.outcomes) == 4
     heard = [replay.One(THERMAL_EVENTS, event) for event in live]
     own = replayed(recording, *replay.read_events(heard, recording.start_ns), tmp_path / "own")

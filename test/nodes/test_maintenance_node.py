@@ -54,7 +54,7 @@ def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
     assert 0.0 < said.predicted_error_mm < said.bound_mm <= said.tolerance_mm
     recorded = [e.command for e in cell.events]
     assert [n for n in recorded if n != "maintenance_ended"] == [
-        "run_maintenance", "accept", "accept", "run_maintenance",
+        "run_maintenance", "withhold", "accept", "accept", "run_maintenance",
     ]  # fmt: skip
 
 

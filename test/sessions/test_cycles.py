@@ -351,12 +351,13 @@ def test_a_step_does_not_become_plausible_by_waiting(cell):
 
 @pytest.mark.parametrize("hours", [0.0, -1.0, -1e5])
 def test_accuracy_is_told_at_any_stamp(cell, hours):
-    """At the cold visit itself, before it, and at a clock that has not begun."""
+    """At the cold visit itself a visit's scatter alone; more before it, or at clocks not begun."""
     cold_ns = cell.session.reference.data.middle_ns
     found = cell.session.accuracy(max(cold_ns + round(hours * 3600 * NS), 0))
     assert found.error is not None
     assert np.isfinite([found.error.rms_m, found.error.bound_m, found.due_in_s]).all()
-    assert (found.error.rms_m == 0.0) == (hours == 0.0)
+    scatter_m = np.sqrt(3.0) * cell.session.config.sigma_m
+    assert (found.error.rms_m == pytest.approx(scatter_m)) == (hours == 0.0)
 
 
 def test_an_open_cycle_times_out_after_a_jump_back_too(cell):
