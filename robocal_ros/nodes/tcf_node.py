@@ -190,6 +190,8 @@ class TcfNode(HouseNode):
         if outcome.repeated or self._session is None:
             return
         try:
+            if name == MEASURE_TOOL:  # a run goes by the thermal model of its begin
+                self._show_in_force()
             self._outputs.event(outcome.command, outcome)
             if name == MEASURE_TOOL and outcome.done:
                 self._run_end, self._last = Future(), None
