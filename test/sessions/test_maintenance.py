@@ -599,6 +599,13 @@ def test_the_line_reads_one_state(cell):
     assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.EXPIRED
 
 
+def test_an_error_that_is_no_number_is_not_within_tolerance(cell):
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert accuracy(cell).level is AccuracyLevel.OK
+    assert accuracy(cell, error=ToolError(1e-4, np.nan)).level is AccuracyLevel.DEGRADED
+
+
 def test_a_bent_tool_degrades(cell):
     cell.check = bent()
     cell.run("c1", 33.0)

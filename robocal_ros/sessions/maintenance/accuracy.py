@@ -56,7 +56,7 @@ def accuracy_of(
     if error is not None:
         bound = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
         bound += f", of {config.tolerance_m * 1e3:.2f} mm allowed"
-        if error.bound_m > config.tolerance_m and worst < AccuracyLevel.DEGRADED:
+        if not error.bound_m <= config.tolerance_m and worst < AccuracyLevel.DEGRADED:
             return Accuracy(AccuracyLevel.DEGRADED, f"drift and tool: {bound}", error, due_in_s)
         words = f"{bound}; {words}"
     return Accuracy(worst, words, error, due_in_s)
