@@ -27,7 +27,7 @@ from tool_driver import TAUGHT
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
 from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, ROLLBACK, WITHHOLD
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
@@ -121,6 +121,20 @@ def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
     cell.run("c2", LONG_S)
     assert cell.finish().tool_answer == "pass"
     assert level(cell) is AccuracyLevel.OK
+
+
+def test_a_drift_beyond_tolerance_degrades_whatever_is_known_of_the_tool(cell):
+    cell.check = bent()
+    number = measured_in_full(cell)
+    cell.finish()
+    decide(cell, ACCEPT, number)
+    assert level(cell) is AccuracyLevel.DUE
+    beyond_m = 1.1 * cell.config.tolerance_m
+    drift = replace(KNOWN, error=ToolError(0.5 * beyond_m, beyond_m))
+    cell.session.drift(drift, cell.now_s)
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert (said.level, said.error) == (AccuracyLevel.DEGRADED, None)
+    assert "what is known of drift and tool" in said.reason
 
 
 def test_another_tool_than_the_measured_one_stays_degraded(cell):

@@ -45,7 +45,9 @@ def accuracy_of(
         parts.append(_thermal(drift))
     if config.T_base_laser is not None:
         parts.append(_tool(config, memory.tool, tool, wall_ns))
-    error = _error([part.error for part in parts])
+    errors = [part.error for part in parts if part.error is not None]
+    known = both_errors(*errors) if len(errors) == 2 else errors[0] if errors else None
+    error = known if len(errors) == len(parts) else None
     if memory.fault:
         return Accuracy(AccuracyLevel.FAULT, f"maintenance: {memory.fault}", error)
     if not parts:
@@ -53,20 +55,14 @@ def accuracy_of(
     due_in_s = min(part.due_in_s for part in parts)
     worst = max(part.level for part in parts)
     words = "; ".join(part.words for part in parts if part.level >= worst)
-    if error is not None:
-        bound = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
+    if known is not None:
+        bound = f"95 % of tool errors below {known.bound_m * 1e3:.2f} mm"
         bound += f", of {config.tolerance_m * 1e3:.2f} mm allowed"
-        if not error.bound_m <= config.tolerance_m and worst < AccuracyLevel.DEGRADED:
-            return Accuracy(AccuracyLevel.DEGRADED, f"drift and tool: {bound}", error, due_in_s)
-        words = f"{bound}; {words}"
+        if not known.bound_m <= config.tolerance_m and worst < AccuracyLevel.DEGRADED:
+            whose = "drift and tool" if error is not None else "what is known of drift and tool"
+            return Accuracy(AccuracyLevel.DEGRADED, f"{whose}: {bound}", error, due_in_s)
+        words = f"{bound}; {words}" if error is not None else words
     return Accuracy(worst, words, error, due_in_s)
-
-
-def _error(errors: list[ToolError | None]) -> ToolError | None:
-    known = [error for error in errors if error is not None]
-    if not known or len(known) < len(errors):
-        return None
-    return known[0] if len(known) == 1 else both_errors(*known)
 
 
 def _thermal(drift: Drift | None) -> _Finding:
