@@ -367,3 +367,15 @@ def test_a_tool_that_cannot_be_taken_back_is_a_fault(history, monkeypatch, where
     assert cell.state is State.FAULT
     assert not cell.tool.armed
     assert cell.at_home()
+
+
+def test_a_calibration_that_is_in_force_again_is_taken_back_again(cell):
+    first = proposed(cell.history)
+    decide(cell, ACCEPT, first)
+    session, head = cell.session, cell.history.head
+    assert session.decide_only(ROLLBACK, "a person", cell.wall_ns).done
+    assert "already" in session.decide_only(ROLLBACK, "a person", cell.wall_ns).message
+    decide(cell, ROLLBACK, first)
+    assert head(TOOL).calibration_id == first
+    session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    assert head(TOOL).calibration_id is None

@@ -135,7 +135,8 @@ class Decider:
             raise InputError("nothing was accepted: there is nothing to roll back")
         last = accepted[-1]
         since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
-        if not any(d.action is Action.ROLLBACK for d in since):
+        again = self.in_force(last.kind, last.calibration_id)  # by a rollback to its id
+        if again or not any(d.action is Action.ROLLBACK for d in since):
             return self.roll_back(last.kind, by, "", wall_ns)
         command = Command(ROLLBACK, {"previous": True, "by": by})
         return _nothing_to_do(command, f"calibration {last.calibration_id} is taken back already")
