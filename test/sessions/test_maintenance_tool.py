@@ -28,7 +28,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.sessions.events import ACCEPT, ROLLBACK, WITHHOLD
+from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.deciding import Decider
@@ -379,3 +379,23 @@ def test_a_calibration_that_is_in_force_again_is_taken_back_again(cell):
     assert head(TOOL).calibration_id == first
     session.decide_only(ROLLBACK, "a person", cell.wall_ns)
     assert head(TOOL).calibration_id is None
+
+
+def test_a_rejection_is_told_where_the_next_one_fails(cell, monkeypatch):
+    numbers = {proposed(cell.history), thermal_proposed(cell.history, 10.0)}
+    reject = CalibrationHistory.reject
+
+    def once(*args, **kwargs):
+        monkeypatch.setattr(CalibrationHistory, "get", held)
+        return reject(*args, **kwargs)
+
+    def held(*args, **kwargs):
+        raise StorageError("the history is held")
+
+    monkeypatch.setattr(CalibrationHistory, "reject", once)
+    answer = cell.session.decide_only(REJECT, "a person", cell.wall_ns)
+    (recorded,) = (outcome for name, outcome in cell.events if name == REJECT)
+    assert recorded.calibration_id in numbers
+    assert answer.status is Code.STORAGE_FAILED
+    assert recorded.message in answer.message
+    assert "the history is held" in answer.message

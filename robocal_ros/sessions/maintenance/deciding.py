@@ -1,6 +1,6 @@
 """Decisions about thermal models and tools, and what may be accepted without a person."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -108,8 +108,8 @@ class Decider:
             raise ConflictError(f"one candidate must wait, found {words}: decide by id")
         return newest[0]
 
-    def decide_only(self, name: str, by: str, wall_ns: int) -> list[Outcome]:
-        """A decision without an id; what was done, in its order.
+    def decide_only(self, name: str, by: str, wall_ns: int) -> Iterator[Outcome]:
+        """A decision without an id; each outcome as soon as it is made.
 
         Accept: the one candidate that waits. Reject: all that wait. Rollback: take the last
         acceptance back. The last two may come twice: nothing more is done.
@@ -120,13 +120,16 @@ class Decider:
             As `decide`, `only_pending`; BAD_INPUT where nothing was ever accepted.
         """
         if name == ROLLBACK:
-            return [self._take_back(by, wall_ns)]
+            yield self._take_back(by, wall_ns)
+            return
         if name == ACCEPT:
-            return [self.decide(name, self.only_pending().id, by, "", wall_ns)]
+            yield self.decide(name, self.only_pending().id, by, "", wall_ns)
+            return
         waiting = [entry.id for kind in KINDS for entry in self.pending(kind)]
         if not waiting:
-            return [_nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")]
-        return [self.decide(name, number, by, "", wall_ns) for number in waiting]
+            yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
+        for number in waiting:
+            yield self.decide(name, number, by, "", wall_ns)
 
     def _take_back(self, by: str, wall_ns: int) -> Outcome:
         made = [d for d in self._history.decisions() if d.kind in KINDS]

@@ -168,11 +168,17 @@ class MaintenanceSession:
         Raises
         ------
         RobocalError
-            When there is nothing to decide about; as `decide`.
+            When there is nothing to decide about; as `decide`, before anything was decided.
         """
-        outcomes = self._decider.decide_only(name, by, wall_ns)
-        for outcome in outcomes:
-            self._decided(outcome)
+        outcomes: list[Outcome] = []
+        try:
+            for outcome in self._decider.decide_only(name, by, wall_ns):
+                self._decided(outcome)
+                outcomes.append(outcome)
+        except RobocalError as error:  # what was decided before it stays, and is told
+            if not outcomes:
+                raise
+            outcomes.append(Outcome(Command(name, {"by": by}), error.code, str(error)))
         answer = next((outcome for outcome in outcomes if not outcome.done), outcomes[-1])
         return replace(answer, message="; ".join(outcome.message for outcome in outcomes))
 
