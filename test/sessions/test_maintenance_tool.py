@@ -21,6 +21,7 @@ from maintenance_cell import (
     passed,
     proposed,
     thermal_proposed,
+    wrong_tool,
 )
 from tool_driver import TAUGHT
 
@@ -67,6 +68,39 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
     cell.finish()
     assert modes(cell) == ["quick"]
     assert level(cell) is AccuracyLevel.OK
+
+
+@pytest.mark.parametrize("mode", ["quick", "full"])
+def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(cell, monkeypatch, mode):
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert level(cell) is AccuracyLevel.OK
+    cell.check, cell.full = (wrong_tool() if mode == "quick" else bent()), lambda _: wrong_tool()
+    later_ns = round(cell.config.check_every_s * 1e9)
+    monkeypatch.setattr(maintenance_cell, "WALL_NS", maintenance_cell.WALL_NS + later_ns)
+    cell.run("c2", LONG_S)
+    result = cell.finish()
+    assert (result.tool_code, result.complete) == (Code.WRONG_TOOL, False)
+    assert result.left == (f"tool measurement ({mode})",)
+    assert level(cell) is AccuracyLevel.DEGRADED
+    assert wrong_tool().message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
+    cell.restart()
+    assert level(cell) is AccuracyLevel.DEGRADED
+    cell.pass_time(0.3)
+    cell.log.clear()
+    cell.check = passed()
+    cell.run("c3", LONG_S)
+    assert cell.finish().complete
+    assert modes(cell) == ["quick"]
+    assert level(cell) is AccuracyLevel.OK
+
+
+def test_a_first_check_that_fails_leaves_the_tool_unknown(cell):
+    cell.check = wrong_tool()
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert level(cell) is AccuracyLevel.EXPIRED
+    assert wrong_tool().message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
 
 
 def decide(cell: Cell, name: str, calibration_id: int) -> None:
@@ -146,7 +180,7 @@ def test_another_tool_than_the_measured_one_stays_degraded(cell):
     assert level(cell) is AccuracyLevel.DEGRADED
     decide(cell, ROLLBACK, number)
     assert level(cell) is AccuracyLevel.DUE
-    cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    cell.history.rollback(0, kind=TOOL, by="a person", reason="", wall_ns=cell.wall_ns)
     assert level(cell) is AccuracyLevel.DEGRADED
 
 

@@ -74,7 +74,7 @@ def _thermal(drift: Drift | None) -> _Finding:
 def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: int) -> _Finding:
     age_s = (wall_ns - record.wall_ns) / NS
     due_in_s = config.tool_due_s - age_s
-    if not record.answer:
+    if not record.wall_ns:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
     if age_s < 0.0:  # the clock was set back: nobody knows how old it is
         return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
@@ -83,6 +83,8 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: in
     error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM) if same else None
     if age_s > config.tool_expires_s:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
+    if record.answer == "failed":
+        return _Finding(AccuracyLevel.DEGRADED, f"tool: {record.words}", None, 0.0)
     if record.candidate and record.candidate == tool.calibration_id:
         words = f"tool: {when}, measured and accepted; a check has not passed yet"
         return _Finding(AccuracyLevel.DUE, words, None, min(due_in_s, 0.0))

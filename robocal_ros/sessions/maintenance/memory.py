@@ -67,10 +67,11 @@ class ToolRecord:
 
     Attributes
     ----------
-    answer : "pass", "recalibrate" or "cannot tell"; empty: never measured.
-    revision : of the tool that was in force then.
+    answer : "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong
+        and has no result; empty: never measured.
+    revision : of the tool that was in force in the last run.
     candidate : calibration that a full measurement proposes in its place; 0: none.
-    wall_ns, full_ns : when, and when it was last measured in full.
+    wall_ns, full_ns : of its last result, and of the last full one; 0: none.
     """
 
     answer: str = ""

@@ -17,6 +17,7 @@ from robocal_ros.sessions.tool_driving import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 NS = 1_000_000_000
+FAILED = (Code.WRONG_TOOL, Code.CLOCK_WRONG, Code.BEAM_EDGES_WRONG, Code.RESIDUAL_TOO_LARGE)
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 
 
@@ -84,6 +85,7 @@ class ToolPart:
         known = known and record.revision == self._decider.revision(TOOL)
         if known and record.answer in ("recalibrate", "cannot tell"):
             return FULL
+        known = known and record.answer != "failed"
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
         return QUICK if due else ""
 
@@ -116,7 +118,7 @@ class ToolPart:
     def _check(self, cycle_id: str, name: str, outcome: ToolOutcome) -> Script[bool]:
         """A quick check; whether it gave an answer."""
         answer = yield from self._measured(QUICK, f"{cycle_id}/{name}", outcome)
-        if answer is None or not answer.has_result:
+        if answer is None:
             return False
         outcome.checked = answer.answer
         self._note(answer, answer.answer)
@@ -124,7 +126,7 @@ class ToolPart:
 
     def _full(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         answer = yield from self._measured(FULL, f"{cycle_id}/full", outcome)
-        if answer is None or not answer.has_result:
+        if answer is None:
             return
         self._memory.note_tool(full_ns=self.wall_ns)
         outcome.candidate_id = answer.candidate_id
@@ -162,7 +164,7 @@ class ToolPart:
         if not self._decider.in_force(TOOL, outcome.candidate_id):
             outcome.accepted = False  # somebody chose another one
         elif not verified:
-            outcome.left = outcome.left or "verification of the accepted tool"
+            outcome.left = "verification of the accepted tool"
         elif outcome.checked == "recalibrate":
             self._take_back(outcome)
 
@@ -182,7 +184,7 @@ class ToolPart:
         self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
 
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
-        """From home and back home; None where it did not fit, or tells of another tool."""
+        """From home and back home; None where it did not fit, or gave no result for this tool."""
         hands = self._hands
         if hands.tool.absent:
             outcome.left = f"tool measurement ({mode})"
@@ -205,13 +207,18 @@ class ToolPart:
         yield from hands.disarmed()
         yield from hands.stand(STANDS_S)
         yield from hands.go_home()
-        if not answer.has_result:
-            outcome.told = f"tool measurement ({mode}): {answer.message}"
-        elif self._checked != self._decider.revision(TOOL):
-            outcome.left = f"tool measurement ({mode})"
+        if answer.has_result and self._checked == self._decider.revision(TOOL):
+            return answer
+        outcome.left = f"tool measurement ({mode})"
+        if answer.has_result:
             outcome.told = f"{outcome.left} is discarded: another tool came into force"
             return None
-        return answer
+        outcome.told = f"{outcome.left}: {answer.message}"
+        if answer.code in FAILED:  # what an older check found of the tool holds no more
+            self._memory.note_tool(
+                answer="failed", words=answer.message, revision=self._checked, candidate=0
+            )
+        return None
 
     def _note(self, answer: Answer, verdict: str, candidate: int = 0) -> None:
         self._memory.note_tool(
