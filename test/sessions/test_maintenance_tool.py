@@ -369,6 +369,22 @@ def test_an_accepted_tool_that_fails_its_check_is_taken_back(history):
     assert history.head(TOOL).calibration_id is None
 
 
+@pytest.mark.parametrize("how", ["closed", "cancelled"])
+def test_a_tool_accepted_in_a_run_that_is_broken_off_is_told(history, how):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    until_verified(cell)
+    if how == "closed":
+        cell.is_open = False
+    else:
+        cell.session.cancel("by the PLC")
+    result = cell.finish()
+    assert history.head(TOOL).calibration_id == number
+    assert result.code is Code.CONFLICT
+    assert (result.accepted, result.tool_id) == ((number,), number)
+    assert (result.tool_answer, result.tool_code) == ("recalibrate", Code.ACCEPT)
+
+
 def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
     cell = automatic(history)
     first = proposed(cell.history)

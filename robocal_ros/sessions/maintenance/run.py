@@ -56,6 +56,7 @@ class Run:
 
     def ended(self, code: Code, message: str) -> CycleResult:
         """The result, at its end."""
+        self._fold()
         self.result = replace(self.result, code=code, message=message)
         return self.result
 
@@ -102,12 +103,19 @@ class Run:
             self._accepted(answer.candidate_id)
 
     def _measure_tool(self) -> Script[None]:
-        found = yield from self._tool.script(self.result.cycle_id)
+        yield from self._tool.script(self.result.cycle_id)
+        found = self._tool.outcome
         if found.left:
             self._left(found.left)
         for words in (found.last.message if found.last else "", found.told):
             if words:
                 self._tell(f"tool: {words}")
+        if found.fault:
+            raise FaultError(Code.CONFLICT, found.fault)
+
+    def _fold(self) -> None:
+        """The tool part into the result, also where it was broken off."""
+        found = self._tool.outcome
         self.result = replace(
             self.result,
             tool_code=found.last.code if found.last else Code.NONE,
@@ -116,8 +124,6 @@ class Run:
         )
         if found.accepted:
             self._accepted(found.candidate_id)
-        if found.fault:
-            raise FaultError(Code.CONFLICT, found.fault)
 
     def _unsure(self) -> str:
         """Why a tool that was measured now waits for a person; empty: it need not.

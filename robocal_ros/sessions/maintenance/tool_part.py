@@ -59,6 +59,10 @@ class ToolPart:
     ----------
     decided : told of each decision that was made without a person.
     unsure : why a tool that was measured now waits for a person; empty: it need not.
+
+    Attributes
+    ----------
+    outcome : as far as it has come.
     """
 
     def __init__(
@@ -75,6 +79,7 @@ class ToolPart:
         self._times = hands.config.times
         self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
+        self.outcome = ToolOutcome()
 
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
@@ -89,27 +94,27 @@ class ToolPart:
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
         return QUICK if due else ""
 
-    def script(self, cycle_id: str) -> Script[ToolOutcome]:
+    def script(self, cycle_id: str) -> Script[None]:
         """Everything that is due and fits."""
-        outcome = ToolOutcome()
+        outcome = self.outcome
         wanted = self.wants()
         if not wanted:
             if waiting := self._decider.pending(TOOL):
                 outcome.told = f"tool candidate {waiting[0].id} waits for a decision"
-            return outcome
+            return
         if wanted == QUICK:
             if not (yield from self._check(cycle_id, "check", outcome)):
-                return outcome
+                return
             passed = self._memory.tool.answer == "pass"
             if passed and not self._full_is_due():
-                return outcome
+                return
             optional = passed
         else:
             optional = False
         if optional and not self._hands.fits(worst_s(self._times, FULL)):
-            return outcome  # only when time allows
+            return  # only when time allows
         yield from self._full(cycle_id, outcome)
-        return outcome
+        return
 
     def _full_is_due(self) -> bool:
         every_s = self._hands.config.full_every_s
