@@ -218,7 +218,7 @@ class MaintenanceSession:
     def give_up(self, reason: str, now_s: float) -> list[Request]:
         """The driver goes: stop and disarm, to be carried out at once; a fault unless at home."""
         self._hands.now_s = now_s
-        self._conductor.give_up(reason)
+        self._conductor.give_up(reason, at_once=True)
         return self._hands.handed_out()
 
     # ---- what is said ---------------------------------------------------------------------------
