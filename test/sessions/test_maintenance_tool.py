@@ -444,8 +444,8 @@ def test_a_rejection_is_told_where_the_next_one_fails(cell, monkeypatch):
 
     monkeypatch.setattr(CalibrationHistory, "reject", once)
     answer = cell.session.decide_only(REJECT, "a person", cell.wall_ns)
-    (recorded,) = (outcome for name, outcome in cell.events if name == REJECT)
-    assert recorded.calibration_id in numbers
+    recorded, failed = (outcome for name, outcome in cell.events if name == REJECT)
+    assert {recorded.calibration_id, failed.command.arguments["id"]} == numbers
     assert answer.status is Code.STORAGE_FAILED
     assert recorded.message in answer.message
     assert "the history is held" in answer.message

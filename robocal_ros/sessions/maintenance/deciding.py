@@ -7,7 +7,7 @@ import numpy as np
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of, reference_of
-from robocal_ros.core.errors import ConflictError, InputError, StaleError
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, Head, State
 from robocal_ros.core.tool.judging import KnownTool, change_between
@@ -129,7 +129,11 @@ class Decider:
         if not waiting:
             yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
         for number in waiting:
-            yield self.decide(name, number, by, "", wall_ns)
+            try:
+                yield self.decide(name, number, by, "", wall_ns)
+            except RobocalError as error:  # those before it stay rejected, and are told
+                command = Command(name, {"id": number, "by": by, "reason": ""})
+                yield Outcome(command, error.code, str(error))
 
     def _take_back(self, by: str, wall_ns: int) -> Outcome:
         made = [d for d in self._history.decisions() if d.kind in KINDS]

@@ -168,17 +168,12 @@ class MaintenanceSession:
         Raises
         ------
         RobocalError
-            When there is nothing to decide about; as `decide`, before anything was decided.
+            When there is nothing to decide about; as `decide`.
         """
-        outcomes: list[Outcome] = []
-        try:
-            for outcome in self._decider.decide_only(name, by, wall_ns):
-                self._decided(outcome)
-                outcomes.append(outcome)
-        except RobocalError as error:  # what was decided before it stays, and is told
-            if not outcomes:
-                raise
-            outcomes.append(Outcome(Command(name, {"by": by}), error.code, str(error)))
+        outcomes = []
+        for outcome in self._decider.decide_only(name, by, wall_ns):
+            self._decided(outcome)
+            outcomes.append(outcome)
         answer = next((outcome for outcome in outcomes if not outcome.done), outcomes[-1])
         return replace(answer, message="; ".join(outcome.message for outcome in outcomes))
 
