@@ -385,6 +385,24 @@ def test_a_tool_accepted_in_a_run_that_is_broken_off_is_told(history, how):
     assert (result.tool_answer, result.tool_code) == ("recalibrate", Code.ACCEPT)
 
 
+def test_the_drift_that_went_into_a_tool_counts_as_long_as_that_tool(history):
+    """The model is known better by now, but the tool was measured through the one before."""
+    cell = automatic(history)
+    cell.drift = replace(KNOWN, error=ToolError(1e-4, 1.5e-4))
+    measured_in_full(cell)
+    until_verified(cell)
+    cell.check = replace(passed(), deviation_mm=0.0, sigma_mm=0.0)
+    assert cell.finish().complete
+    cell.restart()
+    cell.pass_time(0.3)
+    cell.drift = None
+    later = replace(KNOWN, error=ToolError(1e-5, 1.5e-5))
+    cell.session.drift(later, cell.now_s)
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert said.error.rms_m == pytest.approx(np.hypot(1e-4, 1e-5), rel=1e-9)
+    assert said.error.bound_m > 1.5e-4
+
+
 def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
     cell = automatic(history)
     first = proposed(cell.history)

@@ -80,7 +80,7 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: in
         return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
     same = record.revision == tool.revision
-    error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM) if same else None
+    error = _tool_error(record, tool) if same else None
     if age_s > config.tool_expires_s:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
     if record.answer == "failed":
@@ -99,3 +99,11 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: in
         words = f"tool: {when}, {record.words}"
         return _Finding(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))
     return _Finding(AccuracyLevel.OK, f"tool: {when}, {record.words}", error, due_in_s)
+
+
+def _tool_error(record: ToolRecord, tool: Head) -> ToolError:
+    """What a check found, and what none sees: the drift that went into a measured tool."""
+    found = offset_error(record.deviation_mm * MM, record.sigma_mm * MM)
+    if tool.calibration_id is None:
+        return found
+    return both_errors(ToolError(record.drift_rms_m, record.drift_bound_m), found)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, LEAVE, Command, Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
@@ -46,7 +46,9 @@ class Run:
         self._hands, self._decider, self._decided = hands, decider, decided
         self._drift = drift
         self._thermal = ThermalPart(hands, book)
-        self._tool = ToolPart(hands, book, decider, memory, decided, self._unsure)
+        self._tool = ToolPart(
+            hands, book, decider, memory, decided, self._unsure, self._drift_error
+        )
         self.wall_ns = 0
         self._words: list[str] = []
 
@@ -139,6 +141,11 @@ class Run:
         if drift is None:  # a cell without measuring poses need not have a thermal node
             return "the thermal node is silent" if self._hands.ways.count else ""
         return f"the drift is {drift.level.name}: {drift.reason}" if drift.level >= worst else ""
+
+    def _drift_error(self) -> ToolError | None:
+        """Of the thermal model in force; without poses nobody asks."""
+        drift = self._drift() if self._hands.ways.count else None
+        return None if drift is None else drift.error
 
     def _drift_is_known(self) -> bool:
         """Whether the model in force is what this cycle found; without poses nobody asks."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.thermal.accuracy import ToolError
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.config import Times
 from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
@@ -59,6 +60,7 @@ class ToolPart:
     ----------
     decided : told of each decision that was made without a person.
     unsure : why a tool that was measured now waits for a person; empty: it need not.
+    drift : error of the thermal model in force now; None: not known.
 
     Attributes
     ----------
@@ -73,9 +75,10 @@ class ToolPart:
         memory: Memory,
         decided: Callable[[Outcome], None],
         unsure: Callable[[], str],
+        drift: Callable[[], ToolError | None],
     ) -> None:
         self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
-        self._decided, self._unsure = decided, unsure
+        self._decided, self._unsure, self._drift = decided, unsure, drift
         self._times = hands.config.times
         self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
@@ -139,6 +142,8 @@ class ToolPart:
             self._note(answer, "pass")
             return
         self._note(answer, "recalibrate", answer.candidate_id if answer.done else 0)
+        if answer.done and (drift := self._drift()) is not None:
+            self._memory.note_tool(drift_rms_m=drift.rms_m, drift_bound_m=drift.bound_m)
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
