@@ -142,7 +142,7 @@ class Decider:
             raise InputError("nothing was accepted: there is nothing to roll back")
         last = accepted[-1]
         since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
-        again = self.in_force(last.kind, last.calibration_id)  # by a rollback to its id
+        again = self.head(last.kind).calibration_id == last.calibration_id  # by a rollback to it
         if again or not any(d.action is Action.ROLLBACK for d in since):
             return self.roll_back(last.kind, by, "", wall_ns)
         command = Command(ROLLBACK, {"previous": True, "by": by})
