@@ -35,8 +35,10 @@ def _square(error: ToolError) -> tuple[float, float]:
 
     One degree of freedom at least: the squared length of a Gaussian error has no fewer.
     """
-    if error.rms_m == 0.0:
+    if error.bound_m == 0.0:
         return 0.0, 0.0
+    if error.rms_m == 0.0:
+        return error.bound_m**2, 0.0
     wanted = (error.bound_m / error.rms_m) ** 2
     few, many = 0.0, float(np.log(MOST_FREEDOM))
     if wanted <= _over_mean(np.exp(many)):

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from rclpy.action import ActionClient
 from rclpy.task import Future
 from robocal_msgs.action import MeasureTool
@@ -100,13 +101,14 @@ class MaintenanceDriver:
         self._goals.pop(number, None)
         self._cancelled.discard(number)
         result: Any = ended.result().result
+        found_mm = [result.deviation_mm, result.sigma_mm]
         self._answered(
             number,
             Answer(
                 _code(result.status),
                 result.message,
                 result.candidate_id,
-                has_result=result.success,
+                has_result=result.success and bool(np.isfinite(found_mm).all()),
                 answer=WORDS_OF.get(result.answer, ""),
                 deviation_mm=result.deviation_mm,
                 sigma_mm=result.sigma_mm,

@@ -67,3 +67,8 @@ def test_one_error_alone_is_itself():
     for both in (both_errors(drift, ToolError(0.0, 0.0)), both_errors(ToolError(0.0, 0.0), drift)):
         assert both.rms_m == drift.rms_m
         assert both.bound_m == pytest.approx(drift.bound_m, rel=1e-9)
+
+
+def test_a_bound_counts_where_no_rms_is_told():
+    both = both_errors(ToolError(0.0, 1e-3), ToolError(1e-4, 2e-4))
+    assert both.bound_m >= 1e-3

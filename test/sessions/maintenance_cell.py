@@ -389,3 +389,7 @@ def bent() -> Answer:
 
 def same_tool() -> Answer:
     return Answer(Code.NO_SIGNIFICANT_GAIN, "same tool", 1, (), True, "", 0.02, 0.03)
+
+
+def wrong_tool() -> Answer:
+    return Answer(Code.WRONG_TOOL, "5 mm too thick: another tool is mounted")

@@ -31,6 +31,7 @@ from robocal_ros.sessions.events import LEAVE
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.sessions.maintenance.hands import DEAF_S
 from robocal_ros.sim.joint_motion import JointMotion
 
 SMALL = ToolError(1e-4, 1.5e-4)
@@ -306,11 +307,35 @@ def test_a_deaf_tool_node_is_stopped_by_what_armed_it(cell, how):
     else:
         cell.session.cancel("by the PLC")
     cell.pass_time(3.0)
-    assert cell.moved_s <= since_s + 0.2 + SHORTEST_STOP_S + 0.1
+    assert cell.moved_s <= since_s + 0.2 + DEAF_S + SHORTEST_STOP_S + 0.1
     assert cell.state is State.FAULT
     assert "Stop" in kinds(cell)
     with pytest.raises(ConflictError, match="not confirmed"):
         cell.session.acknowledge("me")
+
+
+@pytest.mark.parametrize("how", ["closed", "cancelled"])
+def test_a_tool_node_that_hears_is_left_to_stop_by_itself(cell, how):
+    """Two stops at once would pull the robot to and fro; nor is one left for the next run."""
+    until_moving(cell, "tool")
+    if how == "closed":
+        cell.is_open = False
+        cell.pass_time(3.0)
+        cell.motion = JointMotion(HOME)  # brought home by hand
+        cell.open_gap()
+        cell.session.acknowledge("me")
+    else:
+        cell.session.cancel("by the PLC")
+        cell.finish()
+    cell.run("c2", LONG_S)
+    assert cell.finish().complete
+    assert "Stop" not in kinds(cell)
+
+
+def test_a_node_that_ends_stops_what_the_tool_node_moves_at_once(cell):
+    until_moving(cell, "tool")
+    asked = cell.session.give_up("the node ends", cell.now_s)
+    assert [type(request).__name__ for request in asked] == ["Stop", "CancelMeasure", "Disarm"]
 
 
 @pytest.mark.parametrize("service", ["thermal", "arm", "measure", "sensor"])
@@ -597,6 +622,13 @@ def test_the_line_reads_one_state(cell):
     assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.DUE
     later_ns += 6 * 3600 * 10**9
     assert cell.session.accuracy(cell.now_s, later_ns).level is AccuracyLevel.EXPIRED
+
+
+def test_an_error_that_is_no_number_is_not_within_tolerance(cell):
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert accuracy(cell).level is AccuracyLevel.OK
+    assert accuracy(cell, error=ToolError(1e-4, np.nan)).level is AccuracyLevel.DEGRADED
 
 
 def test_a_bent_tool_degrades(cell):

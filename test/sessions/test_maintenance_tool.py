@@ -21,14 +21,15 @@ from maintenance_cell import (
     passed,
     proposed,
     thermal_proposed,
+    wrong_tool,
 )
 from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
 from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions.events import ACCEPT, ROLLBACK, WITHHOLD
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.deciding import Decider
@@ -67,6 +68,39 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
     cell.finish()
     assert modes(cell) == ["quick"]
     assert level(cell) is AccuracyLevel.OK
+
+
+@pytest.mark.parametrize("mode", ["quick", "full"])
+def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(cell, monkeypatch, mode):
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert level(cell) is AccuracyLevel.OK
+    cell.check, cell.full = (wrong_tool() if mode == "quick" else bent()), lambda _: wrong_tool()
+    later_ns = round(cell.config.check_every_s * 1e9)
+    monkeypatch.setattr(maintenance_cell, "WALL_NS", maintenance_cell.WALL_NS + later_ns)
+    cell.run("c2", LONG_S)
+    result = cell.finish()
+    assert (result.tool_code, result.complete) == (Code.WRONG_TOOL, False)
+    assert result.left == (f"tool measurement ({mode})",)
+    assert level(cell) is AccuracyLevel.DEGRADED
+    assert wrong_tool().message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
+    cell.restart()
+    assert level(cell) is AccuracyLevel.DEGRADED
+    cell.pass_time(0.3)
+    cell.log.clear()
+    cell.check = passed()
+    cell.run("c3", LONG_S)
+    assert cell.finish().complete
+    assert modes(cell) == ["quick"]
+    assert level(cell) is AccuracyLevel.OK
+
+
+def test_a_first_check_that_fails_leaves_the_tool_unknown(cell):
+    cell.check = wrong_tool()
+    cell.run("c1", LONG_S)
+    cell.finish()
+    assert level(cell) is AccuracyLevel.EXPIRED
+    assert wrong_tool().message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
 
 
 def decide(cell: Cell, name: str, calibration_id: int) -> None:
@@ -123,6 +157,20 @@ def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
     assert level(cell) is AccuracyLevel.OK
 
 
+def test_a_drift_beyond_tolerance_degrades_whatever_is_known_of_the_tool(cell):
+    cell.check = bent()
+    number = measured_in_full(cell)
+    cell.finish()
+    decide(cell, ACCEPT, number)
+    assert level(cell) is AccuracyLevel.DUE
+    beyond_m = 1.1 * cell.config.tolerance_m
+    drift = replace(KNOWN, error=ToolError(0.5 * beyond_m, beyond_m))
+    cell.session.drift(drift, cell.now_s)
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert (said.level, said.error) == (AccuracyLevel.DEGRADED, None)
+    assert "what is known of drift and tool" in said.reason
+
+
 def test_another_tool_than_the_measured_one_stays_degraded(cell):
     cell.check = bent()
     number = measured_in_full(cell)
@@ -132,7 +180,7 @@ def test_another_tool_than_the_measured_one_stays_degraded(cell):
     assert level(cell) is AccuracyLevel.DEGRADED
     decide(cell, ROLLBACK, number)
     assert level(cell) is AccuracyLevel.DUE
-    cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    cell.history.rollback(0, kind=TOOL, by="a person", reason="", wall_ns=cell.wall_ns)
     assert level(cell) is AccuracyLevel.DEGRADED
 
 
@@ -321,6 +369,40 @@ def test_an_accepted_tool_that_fails_its_check_is_taken_back(history):
     assert history.head(TOOL).calibration_id is None
 
 
+@pytest.mark.parametrize("how", ["closed", "cancelled"])
+def test_a_tool_accepted_in_a_run_that_is_broken_off_is_told(history, how):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    until_verified(cell)
+    if how == "closed":
+        cell.is_open = False
+    else:
+        cell.session.cancel("by the PLC")
+    result = cell.finish()
+    assert history.head(TOOL).calibration_id == number
+    assert result.code is Code.CONFLICT
+    assert (result.accepted, result.tool_id) == ((number,), number)
+    assert (result.tool_answer, result.tool_code) == ("recalibrate", Code.ACCEPT)
+
+
+def test_the_drift_that_went_into_a_tool_counts_as_long_as_that_tool(history):
+    """The model is known better by now, but the tool was measured through the one before."""
+    cell = automatic(history)
+    cell.drift = replace(KNOWN, error=ToolError(1e-4, 1.5e-4))
+    measured_in_full(cell)
+    until_verified(cell)
+    cell.check = replace(passed(), deviation_mm=0.0, sigma_mm=0.0)
+    assert cell.finish().complete
+    cell.restart()
+    cell.pass_time(0.3)
+    cell.drift = None
+    later = replace(KNOWN, error=ToolError(1e-5, 1.5e-5))
+    cell.session.drift(later, cell.now_s)
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert said.error.rms_m == pytest.approx(np.hypot(1e-4, 1e-5), rel=1e-9)
+    assert said.error.bound_m > 1.5e-4
+
+
 def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
     cell = automatic(history)
     first = proposed(cell.history)
@@ -353,3 +435,35 @@ def test_a_tool_that_cannot_be_taken_back_is_a_fault(history, monkeypatch, where
     assert cell.state is State.FAULT
     assert not cell.tool.armed
     assert cell.at_home()
+
+
+def test_a_calibration_that_is_in_force_again_is_taken_back_again(cell):
+    first = proposed(cell.history)
+    decide(cell, ACCEPT, first)
+    session, head = cell.session, cell.history.head
+    assert session.decide_only(ROLLBACK, "a person", cell.wall_ns).done
+    assert "already" in session.decide_only(ROLLBACK, "a person", cell.wall_ns).message
+    decide(cell, ROLLBACK, first)
+    assert head(TOOL).calibration_id == first
+    session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    assert head(TOOL).calibration_id is None
+
+
+def test_a_rejection_is_told_where_the_next_one_fails(cell, monkeypatch):
+    numbers = {proposed(cell.history), thermal_proposed(cell.history, 10.0)}
+    reject = CalibrationHistory.reject
+
+    def once(*args, **kwargs):
+        monkeypatch.setattr(CalibrationHistory, "get", held)
+        return reject(*args, **kwargs)
+
+    def held(*args, **kwargs):
+        raise StorageError("the history is held")
+
+    monkeypatch.setattr(CalibrationHistory, "reject", once)
+    answer = cell.session.decide_only(REJECT, "a person", cell.wall_ns)
+    recorded, failed = (outcome for name, outcome in cell.events if name == REJECT)
+    assert {recorded.calibration_id, failed.command.arguments["id"]} == numbers
+    assert answer.status is Code.STORAGE_FAILED
+    assert recorded.message in answer.message
+    assert "the history is held" in answer.message

@@ -45,7 +45,9 @@ def accuracy_of(
         parts.append(_thermal(drift))
     if config.T_base_laser is not None:
         parts.append(_tool(config, memory.tool, tool, wall_ns))
-    error = _error([part.error for part in parts])
+    errors = [part.error for part in parts if part.error is not None]
+    known = both_errors(*errors) if len(errors) == 2 else errors[0] if errors else None
+    error = known if len(errors) == len(parts) else None
     if memory.fault:
         return Accuracy(AccuracyLevel.FAULT, f"maintenance: {memory.fault}", error)
     if not parts:
@@ -53,20 +55,14 @@ def accuracy_of(
     due_in_s = min(part.due_in_s for part in parts)
     worst = max(part.level for part in parts)
     words = "; ".join(part.words for part in parts if part.level >= worst)
-    if error is not None:
-        bound = f"95 % of tool errors below {error.bound_m * 1e3:.2f} mm"
+    if known is not None:
+        bound = f"95 % of tool errors below {known.bound_m * 1e3:.2f} mm"
         bound += f", of {config.tolerance_m * 1e3:.2f} mm allowed"
-        if error.bound_m > config.tolerance_m and worst < AccuracyLevel.DEGRADED:
-            return Accuracy(AccuracyLevel.DEGRADED, f"drift and tool: {bound}", error, due_in_s)
-        words = f"{bound}; {words}"
+        if not known.bound_m <= config.tolerance_m and worst < AccuracyLevel.DEGRADED:
+            whose = "drift and tool" if error is not None else "what is known of drift and tool"
+            return Accuracy(AccuracyLevel.DEGRADED, f"{whose}: {bound}", error, due_in_s)
+        words = f"{bound}; {words}" if error is not None else words
     return Accuracy(worst, words, error, due_in_s)
-
-
-def _error(errors: list[ToolError | None]) -> ToolError | None:
-    known = [error for error in errors if error is not None]
-    if not known or len(known) < len(errors):
-        return None
-    return known[0] if len(known) == 1 else both_errors(*known)
 
 
 def _thermal(drift: Drift | None) -> _Finding:
@@ -78,15 +74,17 @@ def _thermal(drift: Drift | None) -> _Finding:
 def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: int) -> _Finding:
     age_s = (wall_ns - record.wall_ns) / NS
     due_in_s = config.tool_due_s - age_s
-    if not record.answer:
+    if not record.wall_ns:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {record.words}", None, 0.0)
     if age_s < 0.0:  # the clock was set back: nobody knows how old it is
         return _Finding(AccuracyLevel.EXPIRED, "tool: checked in the future: check it", None, 0.0)
     when = f"checked {age_s / 60.0:.0f} min ago"
     same = record.revision == tool.revision
-    error = offset_error(record.deviation_mm * MM, record.sigma_mm * MM) if same else None
+    error = _tool_error(record, tool) if same else None
     if age_s > config.tool_expires_s:
         return _Finding(AccuracyLevel.EXPIRED, f"tool: {when}", error, due_in_s)
+    if record.answer == "failed":
+        return _Finding(AccuracyLevel.DEGRADED, f"tool: {record.words}", None, 0.0)
     if record.candidate and record.candidate == tool.calibration_id:
         words = f"tool: {when}, measured and accepted; a check has not passed yet"
         return _Finding(AccuracyLevel.DUE, words, None, min(due_in_s, 0.0))
@@ -101,3 +99,11 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: in
         words = f"tool: {when}, {record.words}"
         return _Finding(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))
     return _Finding(AccuracyLevel.OK, f"tool: {when}, {record.words}", error, due_in_s)
+
+
+def _tool_error(record: ToolRecord, tool: Head) -> ToolError:
+    """What a check found, and what none sees: the drift that went into a measured tool."""
+    found = offset_error(record.deviation_mm * MM, record.sigma_mm * MM)
+    if tool.calibration_id is None:
+        return found
+    return both_errors(ToolError(record.drift_rms_m, record.drift_bound_m), found)

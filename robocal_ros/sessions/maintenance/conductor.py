@@ -66,24 +66,28 @@ class Conductor:
         self._hands.doing = "is broken off"
         self._script = self._hands.after_break()
 
-    def fault(self, code: Code, reason: str) -> None:
-        """Stop the robot where it moves, disarm, end the run; nothing more until acknowledged."""
+    def fault(self, code: Code, reason: str, at_once: bool = False) -> None:
+        """Stop the robot where it moves, disarm, end the run; nothing more until acknowledged.
+
+        ``at_once``: no tick follows, see `Hands.halt`.
+        """
         self._close_script()
         hands, run = self._hands, self.run
-        hands.halt()
+        hands.halt(at_once)
         if hands.tool.engaged:
             hands.disengage()
         self.run, hands.doing = None, "fault"
         self._tell(FAULT, {}, code, reason)
         self._keep(run, code, reason, fault=reason)
 
-    def give_up(self, why: str) -> None:
-        """End the run now: at home and disarmed it just ends, anywhere else it is a fault."""
+    def give_up(self, why: str, at_once: bool = False) -> None:
+        """End the run now: at home and disarmed it just ends, anywhere else it is a `fault`."""
         hands = self._hands
         if self.run is None:
             return
         if hands.tool.engaged or hands.robot.moving or hands.robot.beside_home():
-            self.fault(Code.CONFLICT, f"{why}, and the robot is not handed over at home")
+            words = f"{why}, and the robot is not handed over at home"
+            self.fault(Code.CONFLICT, words, at_once)
         else:
             self._end(Code.CONFLICT, why)
 

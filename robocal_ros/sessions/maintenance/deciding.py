@@ -1,13 +1,13 @@
 """Decisions about thermal models and tools, and what may be accepted without a person."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of, reference_of
-from robocal_ros.core.errors import ConflictError, InputError, StaleError
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, Head, State
 from robocal_ros.core.tool.judging import KnownTool, change_between
@@ -108,8 +108,8 @@ class Decider:
             raise ConflictError(f"one candidate must wait, found {words}: decide by id")
         return newest[0]
 
-    def decide_only(self, name: str, by: str, wall_ns: int) -> list[Outcome]:
-        """A decision without an id; what was done, in its order.
+    def decide_only(self, name: str, by: str, wall_ns: int) -> Iterator[Outcome]:
+        """A decision without an id; each outcome as soon as it is made.
 
         Accept: the one candidate that waits. Reject: all that wait. Rollback: take the last
         acceptance back. The last two may come twice: nothing more is done.
@@ -120,13 +120,20 @@ class Decider:
             As `decide`, `only_pending`; BAD_INPUT where nothing was ever accepted.
         """
         if name == ROLLBACK:
-            return [self._take_back(by, wall_ns)]
+            yield self._take_back(by, wall_ns)
+            return
         if name == ACCEPT:
-            return [self.decide(name, self.only_pending().id, by, "", wall_ns)]
+            yield self.decide(name, self.only_pending().id, by, "", wall_ns)
+            return
         waiting = [entry.id for kind in KINDS for entry in self.pending(kind)]
         if not waiting:
-            return [_nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")]
-        return [self.decide(name, number, by, "", wall_ns) for number in waiting]
+            yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
+        for number in waiting:
+            try:
+                yield self.decide(name, number, by, "", wall_ns)
+            except RobocalError as error:  # those before it stay rejected, and are told
+                command = Command(name, {"id": number, "by": by, "reason": ""})
+                yield Outcome(command, error.code, str(error))
 
     def _take_back(self, by: str, wall_ns: int) -> Outcome:
         made = [d for d in self._history.decisions() if d.kind in KINDS]
@@ -135,7 +142,8 @@ class Decider:
             raise InputError("nothing was accepted: there is nothing to roll back")
         last = accepted[-1]
         since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
-        if not any(d.action is Action.ROLLBACK for d in since):
+        again = self.head(last.kind).calibration_id == last.calibration_id  # by a rollback to it
+        if again or not any(d.action is Action.ROLLBACK for d in since):
             return self.roll_back(last.kind, by, "", wall_ns)
         command = Command(ROLLBACK, {"previous": True, "by": by})
         return _nothing_to_do(command, f"calibration {last.calibration_id} is taken back already")

@@ -28,6 +28,8 @@ from robocal_ros.sessions.maintenance.requests import (
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
 from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
 
+DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot
+
 Array = NDArray[np.float64]
 R = TypeVar("R")
 Script = Generator[None, None, R]
@@ -58,6 +60,7 @@ class Hands:
         self.tool = Disarming()
         self.measured: list[float] = []
         self.doing = ""
+        self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
         self._numbers = 0
         self._waiting: dict[int, Answer | None] = {}
 
@@ -127,7 +130,7 @@ class Hands:
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
         self.doubt()
-        self.tool.armed = True
+        self.tool.armed, self._deaf_s = True, np.inf
         self.robot.place = STATION
         answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm)
         self.tool.armed = not answer.absent
@@ -165,7 +168,9 @@ class Hands:
         self.tool.asked(self.request(Disarm), self.now_s)
 
     def _let_go(self) -> None:
-        """Do not wait for a driver that is gone, see `disarming`."""
+        """Stop what a deaf driver moves; do not wait for one that is gone, see `disarming`."""
+        if self.tool.armed and self.now_s >= self._deaf_s:
+            self._stop_measured()
         if self.tool.gone(self.now_s) and not self.robot.beside_home():
             self.tool.engaged &= self.robot.resting(STANDS_S) is None
 
@@ -221,12 +226,22 @@ class Hands:
         while not self.robot.arrived(self.now_s):
             yield
 
-    def halt(self) -> None:
-        """Stop what this node moves, or has moved by the tool's driver: that may be deaf."""
-        plan = self.robot.stop(self.now_s)
-        if plan is None and self.tool.armed:
-            plan = self.robot.stop_measured(self.now_s)
-        if plan is not None:
+    def halt(self, at_once: bool = False) -> None:
+        """Stop what this node moves; what the tool's driver moves only where that is deaf.
+
+        A driver that hears stops by itself, from its own plan. The readings lag behind that, so
+        that a stop from them steps back. ``at_once``: nobody will be there to see it deaf.
+        """
+        if (plan := self.robot.stop(self.now_s)) is not None:
+            self.request(Stop, plan)
+        elif self.tool.armed and at_once:
+            self._stop_measured()
+        elif self.tool.armed:
+            self._deaf_s = self.now_s + DEAF_S
+
+    def _stop_measured(self) -> None:
+        self._deaf_s = np.inf
+        if (plan := self.robot.stop_measured(self.now_s)) is not None:
             self.request(Stop, plan)
 
     def go_home(self) -> Script[None]:

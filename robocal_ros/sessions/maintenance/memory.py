@@ -67,10 +67,12 @@ class ToolRecord:
 
     Attributes
     ----------
-    answer : "pass", "recalibrate" or "cannot tell"; empty: never measured.
-    revision : of the tool that was in force then.
+    answer : "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong
+        and has no result; empty: never measured.
+    revision : of the tool that was in force in the last run.
     candidate : calibration that a full measurement proposes in its place; 0: none.
-    wall_ns, full_ns : when, and when it was last measured in full.
+    wall_ns, full_ns : of its last result, and of the last full one; 0: none.
+    drift_rms_m, drift_bound_m : error of the thermal model through which a tool was last measured.
     """
 
     answer: str = ""
@@ -81,6 +83,8 @@ class ToolRecord:
     candidate: int = 0
     wall_ns: int = 0
     full_ns: int = 0
+    drift_rms_m: float = 0.0
+    drift_bound_m: float = 0.0
 
 
 @dataclass

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, LEAVE, Command, Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
@@ -46,7 +46,9 @@ class Run:
         self._hands, self._decider, self._decided = hands, decider, decided
         self._drift = drift
         self._thermal = ThermalPart(hands, book)
-        self._tool = ToolPart(hands, book, decider, memory, decided, self._unsure)
+        self._tool = ToolPart(
+            hands, book, decider, memory, decided, self._unsure, self._drift_error
+        )
         self.wall_ns = 0
         self._words: list[str] = []
 
@@ -56,6 +58,7 @@ class Run:
 
     def ended(self, code: Code, message: str) -> CycleResult:
         """The result, at its end."""
+        self._fold()
         self.result = replace(self.result, code=code, message=message)
         return self.result
 
@@ -102,12 +105,19 @@ class Run:
             self._accepted(answer.candidate_id)
 
     def _measure_tool(self) -> Script[None]:
-        found = yield from self._tool.script(self.result.cycle_id)
+        yield from self._tool.script(self.result.cycle_id)
+        found = self._tool.outcome
         if found.left:
             self._left(found.left)
         for words in (found.last.message if found.last else "", found.told):
             if words:
                 self._tell(f"tool: {words}")
+        if found.fault:
+            raise FaultError(Code.CONFLICT, found.fault)
+
+    def _fold(self) -> None:
+        """The tool part into the result, also where it was broken off."""
+        found = self._tool.outcome
         self.result = replace(
             self.result,
             tool_code=found.last.code if found.last else Code.NONE,
@@ -116,8 +126,6 @@ class Run:
         )
         if found.accepted:
             self._accepted(found.candidate_id)
-        if found.fault:
-            raise FaultError(Code.CONFLICT, found.fault)
 
     def _unsure(self) -> str:
         """Why a tool that was measured now waits for a person; empty: it need not.
@@ -133,6 +141,11 @@ class Run:
         if drift is None:  # a cell without measuring poses need not have a thermal node
             return "the thermal node is silent" if self._hands.ways.count else ""
         return f"the drift is {drift.level.name}: {drift.reason}" if drift.level >= worst else ""
+
+    def _drift_error(self) -> ToolError | None:
+        """Of the thermal model in force; without poses nobody asks."""
+        drift = self._drift() if self._hands.ways.count else None
+        return None if drift is None else drift.error
 
     def _drift_is_known(self) -> bool:
         """Whether the model in force is what this cycle found; without poses nobody asks."""

@@ -170,9 +170,10 @@ class MaintenanceSession:
         RobocalError
             When there is nothing to decide about; as `decide`.
         """
-        outcomes = self._decider.decide_only(name, by, wall_ns)
-        for outcome in outcomes:
+        outcomes = []
+        for outcome in self._decider.decide_only(name, by, wall_ns):
             self._decided(outcome)
+            outcomes.append(outcome)
         answer = next((outcome for outcome in outcomes if not outcome.done), outcomes[-1])
         return replace(answer, message="; ".join(outcome.message for outcome in outcomes))
 
@@ -212,7 +213,7 @@ class MaintenanceSession:
     def give_up(self, reason: str, now_s: float) -> list[Request]:
         """The driver goes: stop and disarm, to be carried out at once; a fault unless at home."""
         self._hands.now_s = now_s
-        self._conductor.give_up(reason)
+        self._conductor.give_up(reason, at_once=True)
         return self._hands.handed_out()
 
     # ---- what is said ---------------------------------------------------------------------------

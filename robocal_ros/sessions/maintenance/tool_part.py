@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.thermal.accuracy import ToolError
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.config import Times
 from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
@@ -17,6 +18,7 @@ from robocal_ros.sessions.tool_driving import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 NS = 1_000_000_000
+FAILED = (Code.WRONG_TOOL, Code.CLOCK_WRONG, Code.BEAM_EDGES_WRONG, Code.RESIDUAL_TOO_LARGE)
 MOVED = "the sensor or the robot has moved, and a robot that has looks like a bent tool"
 
 
@@ -58,6 +60,11 @@ class ToolPart:
     ----------
     decided : told of each decision that was made without a person.
     unsure : why a tool that was measured now waits for a person; empty: it need not.
+    drift : error of the thermal model in force now; None: not known.
+
+    Attributes
+    ----------
+    outcome : as far as it has come.
     """
 
     def __init__(
@@ -68,12 +75,14 @@ class ToolPart:
         memory: Memory,
         decided: Callable[[Outcome], None],
         unsure: Callable[[], str],
+        drift: Callable[[], ToolError | None],
     ) -> None:
         self._hands, self._book, self._decider, self._memory = hands, book, decider, memory
-        self._decided, self._unsure = decided, unsure
+        self._decided, self._unsure, self._drift = decided, unsure, drift
         self._times = hands.config.times
         self._checked = 0  # revision of the tool that the last measurement was about
         self.wall_ns = 0
+        self.outcome = ToolOutcome()
 
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
@@ -84,30 +93,31 @@ class ToolPart:
         known = known and record.revision == self._decider.revision(TOOL)
         if known and record.answer in ("recalibrate", "cannot tell"):
             return FULL
+        known = known and record.answer != "failed"
         due = not known or self._age_s(record.wall_ns) >= config.check_every_s
         return QUICK if due else ""
 
-    def script(self, cycle_id: str) -> Script[ToolOutcome]:
+    def script(self, cycle_id: str) -> Script[None]:
         """Everything that is due and fits."""
-        outcome = ToolOutcome()
+        outcome = self.outcome
         wanted = self.wants()
         if not wanted:
             if waiting := self._decider.pending(TOOL):
                 outcome.told = f"tool candidate {waiting[0].id} waits for a decision"
-            return outcome
+            return
         if wanted == QUICK:
             if not (yield from self._check(cycle_id, "check", outcome)):
-                return outcome
+                return
             passed = self._memory.tool.answer == "pass"
             if passed and not self._full_is_due():
-                return outcome
+                return
             optional = passed
         else:
             optional = False
         if optional and not self._hands.fits(worst_s(self._times, FULL)):
-            return outcome  # only when time allows
+            return  # only when time allows
         yield from self._full(cycle_id, outcome)
-        return outcome
+        return
 
     def _full_is_due(self) -> bool:
         every_s = self._hands.config.full_every_s
@@ -116,7 +126,7 @@ class ToolPart:
     def _check(self, cycle_id: str, name: str, outcome: ToolOutcome) -> Script[bool]:
         """A quick check; whether it gave an answer."""
         answer = yield from self._measured(QUICK, f"{cycle_id}/{name}", outcome)
-        if answer is None or not answer.has_result:
+        if answer is None:
             return False
         outcome.checked = answer.answer
         self._note(answer, answer.answer)
@@ -124,7 +134,7 @@ class ToolPart:
 
     def _full(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         answer = yield from self._measured(FULL, f"{cycle_id}/full", outcome)
-        if answer is None or not answer.has_result:
+        if answer is None:
             return
         self._memory.note_tool(full_ns=self.wall_ns)
         outcome.candidate_id = answer.candidate_id
@@ -132,6 +142,8 @@ class ToolPart:
             self._note(answer, "pass")
             return
         self._note(answer, "recalibrate", answer.candidate_id if answer.done else 0)
+        if answer.done and (drift := self._drift()) is not None:
+            self._memory.note_tool(drift_rms_m=drift.rms_m, drift_bound_m=drift.bound_m)
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
@@ -162,7 +174,7 @@ class ToolPart:
         if not self._decider.in_force(TOOL, outcome.candidate_id):
             outcome.accepted = False  # somebody chose another one
         elif not verified:
-            outcome.left = outcome.left or "verification of the accepted tool"
+            outcome.left = "verification of the accepted tool"
         elif outcome.checked == "recalibrate":
             self._take_back(outcome)
 
@@ -182,7 +194,7 @@ class ToolPart:
         self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
 
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
-        """From home and back home; None where it did not fit, or tells of another tool."""
+        """From home and back home; None where it did not fit, or gave no result for this tool."""
         hands = self._hands
         if hands.tool.absent:
             outcome.left = f"tool measurement ({mode})"
@@ -205,13 +217,18 @@ class ToolPart:
         yield from hands.disarmed()
         yield from hands.stand(STANDS_S)
         yield from hands.go_home()
-        if not answer.has_result:
-            outcome.told = f"tool measurement ({mode}): {answer.message}"
-        elif self._checked != self._decider.revision(TOOL):
-            outcome.left = f"tool measurement ({mode})"
+        if answer.has_result and self._checked == self._decider.revision(TOOL):
+            return answer
+        outcome.left = f"tool measurement ({mode})"
+        if answer.has_result:
             outcome.told = f"{outcome.left} is discarded: another tool came into force"
             return None
-        return answer
+        outcome.told = f"{outcome.left}: {answer.message}"
+        if answer.code in FAILED:  # what an older check found of the tool holds no more
+            self._memory.note_tool(
+                answer="failed", words=answer.message, revision=self._checked, candidate=0
+            )
+        return None
 
     def _note(self, answer: Answer, verdict: str, candidate: int = 0) -> None:
         self._memory.note_tool(
