@@ -71,7 +71,7 @@ class TcfMotion:
         if self._gap is not None:
             heartbeat = node.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
             self._sources = GapSources(node, heartbeat)
-        node.add_service(SetBool, "~/arm", self._arm)
+        node.add_service(SetBool, "~/arm", self._arm, inactive=True)
         node.add_timer(TICK_S, self._tick, steady=True)
 
     def activate(self, session: ToolSession) -> None:
@@ -147,7 +147,11 @@ class TcfMotion:
 
     def _arm(self, request: Any, response: Any) -> Any:
         if self.driver is None:
-            raise NotActiveError("no session: activate the node")
+            if request.data:
+                raise NotActiveError(f"the node is {self._node.state}: activate it to arm")
+            # deactivation disarmed; who must know that nothing moves gets a plain answer
+            response.success, response.message = True, "disarmed: the node is not active"
+            return response
         now_s = time.monotonic()
         if request.data and (why := self._closed(now_s)):
             raise ConflictError(f"{why}: nothing may move")
