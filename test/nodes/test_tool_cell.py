@@ -78,6 +78,7 @@ class Cell:
         for _ in range(20):
             answer = self.graph.call(SetBool, "/tcf_node/arm", data=True)
             if answer.success:
+                assert answer.message.endswith("gap_open is not listened to: gap_stale_s is 0")
                 return
             self.graph.spin_for(0.2)
         raise AssertionError(answer.message)
