@@ -166,7 +166,7 @@ class Plc:
 
 
 class Judge:
-    """The simulator's truth: rms errors of the tool at the working poses, mm."""
+    """The simulator's truth: rms errors of the tool at the visited working poses, mm."""
 
     def __init__(self, controller: CellController) -> None:
         self._controller = controller
@@ -174,9 +174,12 @@ class Judge:
         controller.listen(String, TRUTH, self._told, qos.LATCHED)
 
     def now(self) -> tuple[float, float]:
-        """As taught, without correction, and as it was commanded last."""
+        """As taught, without correction, and as commanded last, at the same poses.
+
+        Before anything was commanded: as taught at all working poses, and not a number.
+        """
         self._told.clear()
         self._controller.wait(lambda: self._told, "the truth")
         truth = json.loads(self._told[-1].data)
-        taught = truth["tcp_error_rms_m"]
+        taught = truth.get("visited_tcp_error_rms_m", truth["tcp_error_rms_m"])
         return 1e3 * taught, 1e3 * truth.get("commanded_tcp_error_rms_m", np.nan)
