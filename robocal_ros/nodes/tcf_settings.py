@@ -98,9 +98,7 @@ SETTINGS = (
     length("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
     length("change_limit_mm", 15.0, "Largest change of the tip from the taught one", 0.1, 100.0),
     Setting("tilt_limit_deg", 10.0, "Largest change of the axis", unit="deg", low=0.1, high=45.0),
-    length(
-        "trait_radius_mm", 0.05, "Change of its radius that is no fault yet; 0: any", 0.0, 5.0
-    ),
+    length("trait_radius_mm", 0.05, "Change of its radius that is no fault yet; 0: any", 0.0, 5.0),
     Setting(
         "trait_latency_ms",
         5.0,
