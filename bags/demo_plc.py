@@ -1,7 +1,8 @@
-"""The demo's PLC bridge: a heartbeat, service calls, and the production programme. Nothing else.
+"""The demo's PLC bridge: heartbeat, programme, maintenance's services, and the correction's node
+(/joint_correction_node/status and enable). Nothing else.
 
-What it knows of the cell it has from the maintenance's answers and from ``accuracy_state``, as a
-PLC does. `Judge` listens to the simulator's truth, for judging alone.
+What it knows of the cell it has from these and from ``accuracy_state``, as a PLC does. `Judge`
+listens to the simulator's truth, for judging alone.
 """
 
 import json
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from demo_cell import PROGRAM, ROBOT, TRUTH
 from demo_graph import CellController, DemoError
+from rclpy.exceptions import InvalidHandle
 from robocal_msgs.msg import AccuracyState, CorrectionStatus, MaintenanceStatus
 from robocal_msgs.srv import GetMaintenance, RunMaintenanceCycle
 from std_msgs.msg import Bool, String
@@ -70,7 +72,7 @@ class Plc:
     def _beat(self) -> None:
         """As a PLC does it: whatever else goes on here."""
         while self._beats:
-            with suppress(Exception):  # the graph ends
+            with suppress(InvalidHandle):  # the graph ends
                 self._gap.publish(Bool(data=self._is_open))
             time.sleep(BEAT_S)
 
@@ -166,7 +168,7 @@ class Plc:
 
 
 class Judge:
-    """The simulator's truth: rms errors of the tool at the working poses, mm."""
+    """The simulator's truth: rms errors of the tool at the visited working poses, mm."""
 
     def __init__(self, controller: CellController) -> None:
         self._controller = controller
@@ -174,9 +176,12 @@ class Judge:
         controller.listen(String, TRUTH, self._told, qos.LATCHED)
 
     def now(self) -> tuple[float, float]:
-        """As taught, without correction, and as it was commanded last."""
+        """As taught, without correction, and as commanded last, at the same poses.
+
+        Before anything was commanded: as taught at all working poses, and not a number.
+        """
         self._told.clear()
         self._controller.wait(lambda: self._told, "the truth")
         truth = json.loads(self._told[-1].data)
-        taught = truth["tcp_error_rms_m"]
+        taught = truth.get("visited_tcp_error_rms_m", truth["tcp_error_rms_m"])
         return 1e3 * taught, 1e3 * truth.get("commanded_tcp_error_rms_m", np.nan)

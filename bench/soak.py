@@ -81,7 +81,7 @@ def endurance(amount: Amount) -> Table:
     add("whole gaps of a live cell at the limits as they are set, and its calls' times", 1,
         lambda: not _pytest("test/nodes/soak_maintenance.py"))  # fmt: skip
     matrix = "test/nodes/test_fault_matrix.py"
-    add("all faults of a cell over DDS, each with its code", 1,
+    add("the sixteen faults of a cell's tool side over DDS, each with its code", 1,
         lambda: not _pytest(matrix, ROBOCAL_FAULTS="all"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.closed_loop import setting
-from bench.closed_loop.faults import POWER, RIGHT, SWEEP, Trial, named_size
+from bench.closed_loop.faults import POWER, RIGHT, SWEEP, Trial, named_size, smallest_with_power
 from bench.closed_loop.plant import Plant
 from bench.closed_loop.shift import ROBOT
 from bench.closed_loop.suite import Suite
@@ -77,17 +77,6 @@ def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterat
                 plant.home_from_station(suite)
 
 
-def smallest_checked(found: Sequence[Checked]) -> float | None:
-    """The smallest size of one fault from which on the right code comes with the wanted power."""
-    smallest = None
-    for size in sorted({one.trial.size for one in found}, reverse=True):
-        own = [one.right for one in found if one.trial.size == size]
-        if sum(own) < POWER * len(own):
-            break
-        smallest = size
-    return smallest
-
-
 def power_table(found: Sequence[Checked]) -> Table:
     """How often the right code came, by size."""
     seeds = len({one.trial.seed for one in found})
@@ -108,7 +97,7 @@ def power_table(found: Sequence[Checked]) -> Table:
             f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}"
             for cells in by_size.values()
         )
-        smallest = smallest_checked(own)
+        smallest = smallest_with_power((one.trial.size, one.right) for one in own)
         usual = [c.right for c in by_size.get(SIZES[fault][0], own)]
         share = 100.0 * sum(usual) / len(usual)
         table.add(

@@ -13,7 +13,7 @@ from bench.closed_loop.faults import (
     Trial,
     named_size,
     report_of,
-    smallest_detected,
+    smallest_with_power,
     sweep,
     usual,
 )
@@ -178,7 +178,7 @@ def detection_table(reports: Sequence[Report]) -> Table:
     )
     for fault in dict.fromkeys(one.trial.fault for one in reports):
         own = [one for one in reports if one.trial.fault == fault]
-        size = smallest_detected(own)
+        size = smallest_with_power((one.trial.size, one.in_time) for one in own)
         at_it = [one for one in own if one.trial.size == size]
         codes = ", ".join(sorted({one.code.name for one in at_it}))
         tried = ", ".join(dict.fromkeys(named_size(one.trial) for one in own))

@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 HOUR_S = 3600.0
 ACCURACY = "accuracy_state"
-KEYS = {  # of a state, by what it is called here; lengths come in m
-    "without_mm": "tcp_error_rms_m",
-    "with_mm": "commanded_tcp_error_rms_m",
-    "p95_mm": "commanded_tcp_error_p95_m",
-    "lambda_without": "within_share",
-    "lambda_with": "commanded_within_share",
+KEYS = {  # of a state, by what it is called here, the first that is told; lengths come in m
+    "without_mm": ("visited_tcp_error_rms_m", "tcp_error_rms_m"),
+    "with_mm": ("commanded_tcp_error_rms_m",),
+    "p95_mm": ("commanded_tcp_error_p95_m",),
+    "lambda_without": ("visited_within_share", "within_share"),
+    "lambda_with": ("commanded_within_share",),
 }
 
 
@@ -50,7 +50,7 @@ def cell_course(reader: BagReader) -> CellCourse | None:
     time_s = np.array([1e-9 * (stamp - start_ns) for stamp, _ in states])
     line = _line(reader, start_ns)
     truths = [truth for _, truth in states]
-    series = {name: _series(truths, key, name) for name, key in KEYS.items()}
+    series = {name: _series(truths, keys, name) for name, keys in KEYS.items()}
     return CellCourse(
         hours=time_s / HOUR_S,
         bound_mm=_held(line, time_s),
@@ -60,9 +60,10 @@ def cell_course(reader: BagReader) -> CellCourse | None:
     )
 
 
-def _series(truths: Sequence[Mapping[str, Any]], key: str, name: str) -> Array:
+def _series(truths: Sequence[Mapping[str, Any]], keys: Sequence[str], name: str) -> Array:
     scale = 1e3 if name.endswith("_mm") else 1.0
-    return scale * np.array([truth.get(key, np.nan) for truth in truths], dtype=np.float64)
+    told = [next((truth[key] for key in keys if key in truth), np.nan) for truth in truths]
+    return scale * np.array(told, dtype=np.float64)
 
 
 def _faults(hours: Array, truths: Sequence[Mapping[str, Any]]) -> list[Document]:

@@ -135,6 +135,7 @@ def truth_of(cell: SimulatedCell, commanded: Commanded | None) -> dict[str, Any]
     if commanded is not None:
         which, q = commanded
         told |= _error("commanded_", cell.tcp_error(q, which))
+        told |= _error("visited_", cell.tcp_error(working[which], which))  # the same, as taught
     return told
 
 

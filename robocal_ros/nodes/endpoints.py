@@ -150,19 +150,29 @@ class EndpointNode(LifecycleNode):
         self._release.append(lambda: self.destroy_lifecycle_publisher(publisher))
         return publisher
 
-    def add_service(self, kind: type, name: str, callback: Callable[[Any, Any], Any]) -> None:
+    def add_service(
+        self,
+        kind: type,
+        name: str,
+        callback: Callable[[Any, Any], Any],
+        *,
+        inactive: bool = False,
+    ) -> None:
         """Serve until cleanup; ``callback(request, response)`` may be ``async``.
 
         While inactive, and when the callback raises a `RobocalError`, the answer is
         ``success = False`` with the reason in ``message`` and its code in ``status``. A defect in
         the callback is logged and answered too: it does not end the node. An async callback may
         await other services; the node must then run in the plain executor.
+
+        ``inactive``: the callback answers while inactive too.
         """
+        ready = (lambda: None) if inactive else (lambda: self._require_active(name))
         if inspect.iscoroutinefunction(callback):
 
             async def serve(request: Any, response: Any) -> Any:
                 try:
-                    self._require_active(name)
+                    ready()
                     return await callback(request, response)
                 except Exception as error:
                     return self._refuse(name, response, error)
@@ -172,7 +182,7 @@ class EndpointNode(LifecycleNode):
 
             def answer(request: Any, response: Any) -> Any:
                 try:
-                    self._require_active(name)
+                    ready()
                     return callback(request, response)
                 except Exception as error:
                     return self._refuse(name, response, error)

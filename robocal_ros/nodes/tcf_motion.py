@@ -44,6 +44,7 @@ SETTINGS = (
     ),
 )
 GAP_OPEN = "gap_open"
+UNHEARD = "gap_open is not listened to: gap_stale_s is 0"
 
 
 class TcfMotion:
@@ -71,7 +72,9 @@ class TcfMotion:
         if self._gap is not None:
             heartbeat = node.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
             self._sources = GapSources(node, heartbeat)
-        node.add_service(SetBool, "~/arm", self._arm)
+        else:
+            node.get_logger().warning(f"{UNHEARD}; set it in a cell with maintenance_node")
+        node.add_service(SetBool, "~/arm", self._arm, inactive=True)
         node.add_timer(TICK_S, self._tick, steady=True)
 
     def activate(self, session: ToolSession) -> None:
@@ -147,7 +150,11 @@ class TcfMotion:
 
     def _arm(self, request: Any, response: Any) -> Any:
         if self.driver is None:
-            raise NotActiveError("no session: activate the node")
+            if request.data:
+                raise NotActiveError(f"the node is {self._node.state}: activate it to arm")
+            # deactivation disarmed; who must know that nothing moves gets a plain answer
+            response.success, response.message = True, "disarmed: the node is not active"
+            return response
         now_s = time.monotonic()
         if request.data and (why := self._closed(now_s)):
             raise ConflictError(f"{why}: nothing may move")
@@ -156,12 +163,13 @@ class TcfMotion:
         else:
             self.driver.disarm("disarmed by a call", now_s)
         response.success = True
-        seconds = f"{self._config.armed_s:g} s"
-        response.message = (
-            f"armed: begin the measurement within {seconds}" if request.data else "disarmed"
-        )
+        response.message = self._armed() if request.data else "disarmed"
         self._node.get_logger().warning(f"arm {request.data}: {response.message}")
         return response
 
     def _send(self, plan: JointPlan) -> None:
         self._output.publish(trajectory_message(plan, self._names))
+
+    def _armed(self) -> str:
+        words = f"armed: begin the measurement within {self._config.armed_s:g} s"
+        return words if self._gap is not None else f"{words}; {UNHEARD}"

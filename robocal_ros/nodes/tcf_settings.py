@@ -13,6 +13,7 @@ from robocal_ros.core.tool.judging import ToolLimits
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
+from robocal_ros.core.tool.run_traits import TraitLimits
 from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import given_pose, pose_settings
@@ -97,6 +98,22 @@ SETTINGS = (
     length("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
     length("change_limit_mm", 15.0, "Largest change of the tip from the taught one", 0.1, 100.0),
     Setting("tilt_limit_deg", 10.0, "Largest change of the axis", unit="deg", low=0.1, high=45.0),
+    length("trait_radius_mm", 0.05, "Change of its radius that is no fault yet; 0: any", 0.0, 5.0),
+    Setting(
+        "trait_latency_ms",
+        5.0,
+        "Change of the edges' delay that is no fault yet; 0: any",
+        unit="ms",
+        low=0.0,
+        high=1000.0,
+    ),
+    Setting(
+        "trait_lost",
+        0.05,
+        "Share of the joint readings that may be lost; 0: any",
+        low=0.0,
+        high=1.0,
+    ),
     Setting(
         "step_timeout_s",
         30.0,
@@ -168,5 +185,10 @@ def session_config(
             settings["sigma_limit_mm"] * 1e-3,
             settings["change_limit_mm"] * 1e-3,
             float(np.radians(settings["tilt_limit_deg"])),
+        ),
+        traits=TraitLimits(
+            settings["trait_radius_mm"] * 1e-3,
+            settings["trait_latency_ms"] * 1e-3,
+            settings["trait_lost"],
         ),
     )

@@ -29,7 +29,8 @@ class CellCourse:
     Attributes
     ----------
     hours : (t,) since the recording began.
-    without_mm, with_mm : (t,) rms without correction, and of what was commanded.
+    without_mm, with_mm : (t,) rms without correction, and of what was commanded; at the same poses,
+        where some were visited.
     p95_mm : (t,) 95 % of the poses are better, of what was commanded.
     lambda_without, lambda_with : (t,) share of directions within `TOLERANCE_MM`.
     bound_mm : (t,) what the line was told: 95 % of the errors are below.

@@ -111,6 +111,7 @@ class ToolResults:
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         """Keep how the healthy tool measures; in force at once: by itself it moves nothing."""
+        run.require_even_readings()
         estimate = run.estimate(Held())
         found = KnownTool(estimate.T_flange_tool, estimate.covariance)
         taught = self._config.T_flange_taught

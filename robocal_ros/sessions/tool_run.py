@@ -14,7 +14,7 @@ from robocal_ros.core.tool.crossed_run import ToolEstimate, estimate_tool, run_p
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
-from robocal_ros.core.tool.run_traits import RunTraits
+from robocal_ros.core.tool.run_traits import RunTraits, require_even
 from robocal_ros.core.tool.step_watch import StepWatch
 from robocal_ros.sessions.tool_config import ToolConfig
 
@@ -109,10 +109,10 @@ class ToolRun:
             first, last = edges[0].stamp_ns - BEFORE_NS, edges[-1].stamp_ns + AFTER_NS
             near = (stamps >= first) & (stamps <= last)
             stamps, q = stamps[near], q[near]
-        self._require_readings(stamps)
-        self.steps.append(BeamStep(step.name, step.kind, debounced(found, rule.debounce_s)))
         self._time.append(1e-9 * (stamps - self.begun_ns).astype(np.float64))
         self._q.append(q)
+        self._require_readings()  # first: with readings edges are lost
+        self.steps.append(BeamStep(step.name, step.kind, debounced(found, rule.debounce_s)))
         if self.complete:
             return
         if self.plan.needs_tool(len(self.steps) + 1):
@@ -141,8 +141,7 @@ class ToolRun:
 
     def traits(self, estimate: ToolEstimate) -> RunTraits:
         """What the run shows beside the tool that it found."""
-        count = sum(len(time) - 1 for time in self._time)
-        span_s = sum(float(time[-1] - time[0]) for time in self._time)
+        count, span_s = np.sum(self._readings, axis=0).tolist()
         return RunTraits.of(estimate, self.circles, count / span_s)
 
     def require_like_healthy(self, estimate: ToolEstimate) -> None:
@@ -150,10 +149,20 @@ class ToolRun:
         if self.healthy is not None:
             self.traits(estimate).require_like(self.healthy, self.config.traits)
 
-    def _require_readings(self, stamps: NDArray[np.int64]) -> None:
-        if self.healthy is not None and len(stamps) > 1:
-            span_s = 1e-9 * float(stamps[-1] - stamps[0])
-            self.healthy.require_readings(len(stamps) - 1, span_s, self.config.traits)
+    def require_even_readings(self) -> None:
+        """Refuse unlike rates of the joint readings, see `require_even`."""
+        require_even([count / span_s for count, span_s in self._readings], self.config.traits)
+
+    @property
+    def _readings(self) -> list[tuple[int, float]]:
+        """Of each step so far: joint readings after its first, and over what time, s."""
+        return [(len(t) - 1, float(t[-1] - t[0])) for t in self._time if len(t) > 1]
+
+    def _require_readings(self) -> None:
+        """Judge the run so far: a short burst in one step is no lossy line."""
+        if self.healthy is not None and (readings := self._readings):
+            count, span_s = np.sum(readings, axis=0).tolist()
+            self.healthy.require_readings(int(count), span_s, self.config.traits)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All that was measured, for keeping."""

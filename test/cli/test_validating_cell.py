@@ -23,7 +23,14 @@ def bag(tmp_path: Path) -> Path:
         {"faults": {}, "tcp_error_rms_m": 3e-4, "T_flange_tool": np.eye(4).tolist()},
         {"faults": {}, "tcp_error_rms_m": 4e-4, "commanded_tcp_error_rms_m": 4e-5},
         {"faults": {"collision": 2e-3}, "tcp_error_rms_m": 2e-3, "commanded_within_share": 0.5},
-        {"faults": {}, "tcp_error_rms_m": 4e-4, "commanded_tcp_error_p95_m": 1e-4},
+        {
+            "faults": {},
+            "tcp_error_rms_m": 4e-4,
+            "visited_tcp_error_rms_m": 5e-4,
+            "within_share": 0.3,
+            "visited_within_share": 0.2,
+            "commanded_tcp_error_p95_m": 1e-4,
+        },
     ]
     with BagWriter(path) as writer:
         for i, state in enumerate(states):
@@ -41,9 +48,10 @@ def test_the_course_is_what_was_told(bag: Path) -> None:
         course = cell_course(reader)
     assert course is not None
     np.testing.assert_allclose(course.hours, [0.0, 0.5, 1.0, 1.5])
-    np.testing.assert_allclose(course.without_mm, [0.3, 0.4, 2.0, 0.4])
+    np.testing.assert_allclose(course.without_mm, [0.3, 0.4, 2.0, 0.5])
     np.testing.assert_allclose(course.with_mm, [np.nan, 0.04, np.nan, np.nan])
     np.testing.assert_allclose(course.p95_mm, [np.nan, np.nan, np.nan, 0.1])
+    np.testing.assert_allclose(course.lambda_without, [np.nan, np.nan, np.nan, 0.2])
     np.testing.assert_allclose(course.lambda_with, [np.nan, np.nan, 0.5, np.nan])
     np.testing.assert_allclose(course.bound_mm, [np.nan, 0.2, 0.2, 0.2])
     assert course.tolerance_mm == pytest.approx(0.3)

@@ -9,7 +9,13 @@ import pytest
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError, TooFewSamplesError
 from robocal_ros.core.tool.beam_edges import BeamError
-from robocal_ros.core.tool.run_traits import ClockError, RunTraits, TraitLimits, WrongToolError
+from robocal_ros.core.tool.run_traits import (
+    ClockError,
+    RunTraits,
+    TraitLimits,
+    WrongToolError,
+    require_even,
+)
 
 LIMITS = TraitLimits()
 SIGMA_M, SIGMA_S = 1e-5, 1e-3
@@ -116,3 +122,29 @@ def test_readings_that_are_lost_are_counted(lost, found):
 def test_a_faster_driver_loses_nothing():
     HEALTHY.require_readings(1500, 3.0, LIMITS)
     HEALTHY.require_readings(0, 0.0, LIMITS)
+
+
+def test_a_limit_of_zero_is_not_looked_at():
+    off = TraitLimits(0.0, 0.0, 0.0)
+    quick(2e-4, 2e-4, later_s=1.0).require_like(HEALTHY, off)
+    HEALTHY.require_readings(1, 3.0, off)
+    require_even([60.0, 125.0], off)
+
+
+@pytest.mark.parametrize(
+    ("run", "kind"),
+    [
+        (quick(x_m=np.nan), BeamError),
+        (replace(quick(), radius_sigma_m=np.nan), BeamError),
+        (quick(later_s=np.nan), ClockError),
+    ],
+)
+def test_not_a_number_is_let_through_nowhere(run, kind):
+    with pytest.raises(kind):
+        run.require_like(HEALTHY, LIMITS)
+
+
+def test_a_healthy_run_under_loss_is_none():
+    require_even([125.0, 121.0, 124.0], LIMITS)
+    with pytest.raises(TooFewSamplesError, match="113 to 125 in a second"):
+        require_even([125.0, 113.0, 124.0], LIMITS)

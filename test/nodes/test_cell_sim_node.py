@@ -384,6 +384,9 @@ def test_the_truth_says_what_is_wrong_and_by_how_much(graph):
     error = cell.node._cell.tcp_error(wanted, np.array([7, 3]))
     two = pytest.approx(np.sqrt(np.mean(np.sum(error**2, axis=1))), rel=0.01)
     cell.graph.spin_until(lambda: cell.truth()[key] == two, "those of the working poses alone")
+    taught = cell.node._cell.tcp_error(work[[7, 3]], np.array([7, 3]))
+    rms = pytest.approx(np.sqrt(np.mean(np.sum(taught**2, axis=1))), rel=0.01)
+    assert cell.truth()["visited_tcp_error_rms_m"] == rms
     cell.to_judge.publish(cell.trajectory(poses("cycle")))  # none of them is judged
     states = len(cell.told["/cell_sim_node/truth/state"])
     cell.wait_for("/cell_sim_node/truth/state", states + 2)

@@ -78,6 +78,7 @@ class Cell:
         for _ in range(20):
             answer = self.graph.call(SetBool, "/tcf_node/arm", data=True)
             if answer.success:
+                assert answer.message.endswith("gap_open is not listened to: gap_stale_s is 0")
                 return
             self.graph.spin_for(0.2)
         raise AssertionError(answer.message)
@@ -151,6 +152,12 @@ def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: st
         assert cell.tcf.stop(signal.SIGTERM) == 0
     elif how == "deactivate":
         graph.call(ChangeState, "/tcf_node/change_state", transition=Transition(id=4))
+        disarmed = graph.call(SetBool, "/tcf_node/arm", data=False)
+        assert disarmed.success, disarmed.message
+        assert disarmed.message == "disarmed: the node is not active"
+        armed = graph.call(SetBool, "/tcf_node/arm", data=True)
+        assert not armed.success
+        assert armed.message == "the node is inactive: activate it to arm"
     graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=3.0)
     stop = cell.sent[-1]
     duration = stop.points[-1].time_from_start

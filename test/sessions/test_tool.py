@@ -310,3 +310,26 @@ def test_flange_poses_come_from_the_thermal_model_in_force(history):
     found = KnownTool.of_document(model)
     away = found.T_flange_tool[:3, 3] - TRUTH[:3, 3]
     assert away @ np.linalg.solve(found.covariance[:3, :3], away) < 16.3
+
+
+@pytest.mark.parametrize(("mode", "refused"), [("full", False), ("reference", True)])
+def test_a_burst_of_lost_readings_is_judged_over_the_whole_run(history, mode, refused):
+    """A fifth of one step is a twentieth of all; a healthy tool measured so would hide loss."""
+    driver = driver_of(history, TAUGHT, noisy_cell())
+    assert driver.measure("reference").done
+    play, driven = driver.play, 0
+
+    def bursty(samples):
+        nonlocal driven
+        edges = [s.stamp_ns for s in samples if not isinstance(s, JointSample)]
+        driven += bool(edges)
+        if driven == 5 and edges:  # before the last plunge meets a beam
+            begin, end = edges[0] - 700_000_000, edges[0] - 200_000_000
+            samples = [s for s in samples if not begin < s.stamp_ns < end]
+        play(samples)
+
+    driver.play = bursty
+    outcome = driver.measure(mode)
+    assert driven == 5
+    assert outcome.done is not refused, outcome.message
+    assert not refused or outcome.status is Code.TOO_FEW_SAMPLES

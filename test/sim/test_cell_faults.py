@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from kr150_shift import ABOVE, CYCLE, HOME, WORK, cell_of, first_circle, went
 
+from bench.closed_loop.faults import smallest_with_power
 from robocal_ros.sim.cell_faults import FAULTS, NEXT_MOTION, SIZES
 from robocal_ros.sim.kr150_cell import TAUGHT
 from robocal_ros.sim.robot import Effects
@@ -239,3 +240,10 @@ def test_no_size_brings_the_cell_down(fault, size):
     told = tour(fault, size)
     for name in ("stamps", "joints", "ball", "error"):
         assert np.all(np.isfinite(told[name]))
+
+
+def test_the_smallest_size_is_found_from_the_largest_downwards():
+    often = [(2.0, True)] * 10 + [(1.0, True)] * 9 + [(1.0, False)]
+    assert smallest_with_power(often) == 1.0
+    assert smallest_with_power([*often, (0.5, False), (0.2, True)]) == 1.0  # by chance
+    assert smallest_with_power([(2.0, False)]) is None

@@ -35,7 +35,7 @@ class ClockError(RobocalError):
 
 @dataclass(frozen=True)
 class TraitLimits:
-    """Changes against the healthy tool's run that are no fault yet.
+    """Changes against the healthy tool's run that are no fault yet; 0: any.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class RunTraits:
         expected = self.rate_hz * span_s
         lost = 1.0 - count / expected if expected > 0.0 else 0.0
         sigma = np.sqrt(max(lost * (1.0 - lost), 0.0) / max(expected, 1.0))
-        if lost - ONE_SIDED * sigma > limits.lost:
+        if _beyond(max(lost, 0.0), float(sigma), limits.lost):
             raise TooFewSamplesError(
                 f"{lost:.0%} of the joint readings are missing: {count} in {span_s:.1f} s, the "
                 f"healthy tool was measured with {self.rate_hz:.0f} in a second; edges are lost "
@@ -163,6 +163,26 @@ class RunTraits:
         return np.asarray(np.mean([np.subtract(now, then) for now, then in pairs], axis=0))
 
 
+def require_even(rates_hz: Sequence[float], limits: TraitLimits) -> None:
+    """Refuse a healthy tool's run whose steps (k,) had joint readings at unlike rates.
+
+    Measured under loss it would hide what is lost later. A loss that is alike in all steps does
+    not show.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When the slowest and the fastest step differ by more than the limit.
+    """
+    slowest, fastest = min(rates_hz), max(rates_hz)
+    if _beyond(1.0 - slowest / fastest, 0.0, limits.lost):
+        raise TooFewSamplesError(
+            f"joint readings came at {slowest:.0f} to {fastest:.0f} in a second: some were lost, "
+            "and a healthy tool measured so would hide later loss; look at network and load, then "
+            "measure it again"
+        )
+
+
 def _beyond(change: float, sigma: float, limit: float) -> bool:
-    """Whether a change is larger than the limit in all but 5 % of cases."""
-    return abs(change) - ONE_SIDED * sigma > limit
+    """Whether a change is larger than the limit in all but 5 % of cases; not a number is."""
+    return limit > 0.0 and not abs(change) - ONE_SIDED * sigma <= limit

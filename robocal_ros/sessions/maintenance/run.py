@@ -16,6 +16,7 @@ from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
 
+NONE_BETTER = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
 
 
@@ -148,9 +149,9 @@ class Run:
         return None if drift is None else drift.error
 
     def _drift_is_known(self) -> bool:
-        """Whether the model in force is what this cycle found; without poses nobody asks."""
+        """Whether this cycle found the model in force, or none better; else it may be wrong."""
         code, found = self.result.thermal_code, self.result.thermal_id
-        if not self._hands.ways.count or code is Code.NO_SIGNIFICANT_GAIN:
+        if not self._hands.ways.count or code in NONE_BETTER:
             return True
         return code is Code.ACCEPT and found > 0 and self._decider.in_force(THERMAL, found)
 
