@@ -54,6 +54,7 @@ from robocal_ros.storage.bag_writer import BagWriter, ros_time  # noqa: E402
 FULL = ROOT / "out" / "golden_shift.mcap"
 EXCERPT = Path(__file__).with_name("golden_excerpt.mcap")
 SEED = 1
+CHUNK_BYTES = 4 << 20  # large, as the excerpt is kept in the repository: nobody kills its writer
 WINDOW_S = (at(10, 38), at(10, 48))  # of the excerpt
 AHEAD_S = 2.0 * PASS_S  # the sessions hear every reading from so long before it on
 NODES = {"thermal": "thermal_node", "tool": "tcf_node", "maintenance": "maintenance_node"}
@@ -238,7 +239,7 @@ class Recorder:
 def recorder(path: Path, window_s: tuple[float, float]) -> Iterator[Recorder]:
     """Writes a bag of a window of a shift, s from its begin."""
     latched = [f"/{name}/session_events" for name in NODES.values()]
-    with BagWriter(path, latched=latched) as bag:
+    with BagWriter(path, latched=latched, chunk_bytes=CHUNK_BYTES) as bag:
         yield Recorder(bag, window_s)
 
 

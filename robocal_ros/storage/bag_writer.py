@@ -51,7 +51,7 @@ class BagWriter:
         An existing file is replaced.
     latched : topics that are published latched (transient-local); looked up with a topic's first
         message.
-    compression : of the chunks.
+    compression, chunk_bytes : of the chunks; larger ones are smaller on the disk.
 
     Raises
     ------
@@ -65,6 +65,7 @@ class BagWriter:
         *,
         latched: Collection[str] = (),
         compression: Literal["zstd", "lz4"] = "zstd",
+        chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
         self.path = Path(path)
         try:
@@ -72,7 +73,7 @@ class BagWriter:
         except OSError as error:
             raise InputError(f"cannot be written: {error.strerror}", file=str(path)) from error
         self._writer = Writer(
-            self._stream, chunk_size=CHUNK_BYTES, compression=_COMPRESSIONS[compression]
+            self._stream, chunk_size=chunk_bytes, compression=_COMPRESSIONS[compression]
         )
         self._writer.start(profile="ros2", library=f"robocal_ros {__version__}")
         self._latched = latched

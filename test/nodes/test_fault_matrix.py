@@ -22,6 +22,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import Fault
 
 GAP_S = 60.0
+AHEAD_S = 2.0  # until stamps have passed those of a clock that was ahead
 WITHIN_S = 45.0
 SHORT: tuple[Fault, ...] = ("clock_jump", "wrong_tool", "beam_dirty")
 BY_MAINTENANCE: frozenset[Fault] = frozenset({"joints_silent", "frozen_clock", "frozen_encoder"})
@@ -85,6 +86,7 @@ class FaultCell:
         faulty = state.state == MaintenanceStatus.FAULT
         end = "fault" if faulty and state.disarmed else "at home" * self.cell.at_home()
         self.set_fault("none")
+        self.graph.spin_for(AHEAD_S)
         if faulty:
             self.drive_home()
             self.until(self.acknowledged, f"{fault} is acknowledged")
@@ -96,6 +98,7 @@ class FaultCell:
 
     def drive_home(self) -> None:
         """A person does."""
+        self.until(lambda: self.cell.stands(0.5), "the robot rests")
         self.cell.drive_between(self.cell.q, np.radians(HOME_DEG))
         self.until(self.cell.at_home, "at home")
         self.graph.spin_for(0.5)
