@@ -57,7 +57,8 @@ BEAT_S, PLC_BEAT_S = 0.1, 0.2
 SENSE_S = 0.1
 RESTS_S = 0.35
 SERIAL = "K7"
-BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6}  # a machine that has other work too
+# A machine that has other work too.
+BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6, "gap_stale_s": 1.5}
 BUSY_TIMES = {"answer_s": 3.0, "rest_s": 2.0, "check_s": 30.0, "full_s": 60.0}
 
 
@@ -100,11 +101,10 @@ class LiveCell:
             "laser": str(laser),
             "taught_xyz_mm": "[0.0, 0.0, 150.0]",
             "serial": SERIAL,
+            "gap_stale_s": 0.5,
         } | (BUSY if busy else {})
         out = {"~/joint_trajectory": ROBOT}
-        self.tcf = graph.start(
-            "tcf_node", self.tool | {"motion": "trajectory", "gap_stale_s": 0.5}, out
-        )
+        self.tcf = graph.start("tcf_node", self.tool | {"motion": "trajectory"}, out)
         self.thermal = graph.start(
             "thermal_node", {"robot": "ur10", "serial": SERIAL, "sphere_radius_mm": 19.05}
         )
