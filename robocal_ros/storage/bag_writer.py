@@ -65,7 +65,7 @@ class BagWriter:
         *,
         latched: Collection[str] = (),
         compression: Literal["zstd", "lz4"] = "zstd",
-        chunk_bytes: int = CHUNK_BYTES,
+        chunk_bytes: int | None = None,
     ) -> None:
         self.path = Path(path)
         try:
@@ -73,7 +73,9 @@ class BagWriter:
         except OSError as error:
             raise InputError(f"cannot be written: {error.strerror}", file=str(path)) from error
         self._writer = Writer(
-            self._stream, chunk_size=chunk_bytes, compression=_COMPRESSIONS[compression]
+            self._stream,
+            chunk_size=chunk_bytes or CHUNK_BYTES,
+            compression=_COMPRESSIONS[compression],
         )
         self._writer.start(profile="ros2", library=f"robocal_ros {__version__}")
         self._latched = latched

@@ -267,7 +267,8 @@ class TestSignals:
             assert (done.returncode, done.stderr) == (0, b"")
 
 
-def test_piped_tables_stay_whole():
+def test_piped_tables_stay_whole(monkeypatch):
+    monkeypatch.delenv("COLUMNS", raising=False)
     stream = io.StringIO()
     from robocal_ros.cli.output import show
 

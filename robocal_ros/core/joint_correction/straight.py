@@ -36,8 +36,8 @@ AT_GOAL = 1e-12
 # Longest second step as a share of the first: see `solution`.
 AHEAD, BESIDE = 0.2, 0.5
 # The last step and the one before show what one more would be: below this it is not made.
-LEFT = 2e-14
-QUIET, SHORT = 5e-14, 1e-9  # a last step that is as short needs no other; one that is longer does
+LEFT = 2e-15
+QUIET, SHORT = 5e-15, 1e-9  # a last step that is as short needs no other; one that is longer does
 SINGULAR = 1e-13  # square of a column's part that no column before has, beside the first's
 FAR = 2.0  # a solution so many times beyond the bound is another posture
 
