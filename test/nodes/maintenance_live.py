@@ -58,7 +58,7 @@ SENSE_S = 0.1
 RESTS_S = 0.35
 SERIAL = "K7"
 # A machine that has other work too.
-BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6, "gap_stale_s": 1.5}
+BUSY = {"motion_silence_s": 0.5, "motion_late_s": 0.6}
 BUSY_TIMES = {"answer_s": 3.0, "rest_s": 2.0, "check_s": 30.0, "full_s": 60.0}
 
 

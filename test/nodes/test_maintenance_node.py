@@ -60,9 +60,15 @@ def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
 
 def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Path) -> None:
     cell = LiveCell(graph, tmp_path)
-    handle = cell.begin("c1", GAP_S)  # without a cold reference the tool alone is measured
-    ended = handle.get_result_async()
-    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
+    for name in ("c0", "c1"):  # one that a busy machine broke off at home may be asked for again
+        handle = cell.begin(name, GAP_S)  # without a cold reference the tool alone is measured
+        ended = handle.get_result_async()
+        graph.spin_until(
+            lambda e=ended: len(cell.sent) == 2 or e.done(), "the first circle", within_s=30.0
+        )
+        if not ended.done():
+            break
+    assert len(cell.sent) == 2
     graph.spin_for(0.5)
     cell.is_open = False
     graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=1.0)
