@@ -11,6 +11,7 @@ Document = dict[str, Any]
 
 ERRORS = {"without": "nominal", "in_force": "in_force", "after": "candidate"}
 ERROR_KEYS = ("mean_mm", "rms_mm", "p95_mm", "max_mm", "share_within_tolerance")
+NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")  # the last: the model stays
 CYCLE = ("bag", "cycle", "stamp", "hours", "samples", "code", "revision")
 DECISION = ("bag", "node", "stamp", "command", "code", "message")
 HOUR = (
@@ -30,7 +31,7 @@ def summary_rows(bags: Sequence[Document]) -> list[Document]:
 
 
 def _row(bag: Document, session: Document) -> Document:
-    refused = [d for d in session["decisions"] if d["code"] != "ACCEPT"]
+    refused = [d for d in session["decisions"] if d["code"] not in NO_FAULT]
     own = {"thermal": _thermal, "tool": _tool, "hand_eye": _hand_eye}[session["kind"]](session)
     return {
         "bag": bag["bag"],

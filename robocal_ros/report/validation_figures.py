@@ -24,12 +24,12 @@ from robocal_ros.report.figures import (
     svg,
     titled,
 )
+from robocal_ros.report.validation import NO_FAULT
 from robocal_ros.report.validation_cell import CellCourse, cell_figure
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
-_NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")
 MOST_NAMED = 8  # runs that have their name below the axis
 DRIFT_CAPTION = (
     "The parameters that moved most in units of their own standard deviation; the band is two "
@@ -120,7 +120,7 @@ def accuracy_by_cycle(cycles: Sequence[Document], mark: str = "") -> Figure:
                 [cycle["hours"] for cycle in known], bound, color=INK, lw=1.0, ls=(0, (2, 2)),
                 label="95 % bound",
             )  # fmt: skip
-        faults = [cycle for cycle in cycles if cycle["verdict"]["code"] not in _NO_FAULT]
+        faults = [cycle for cycle in cycles if cycle["verdict"]["code"] not in NO_FAULT]
         if faults:
             axes.plot(
                 [cycle["hours"] for cycle in faults],
