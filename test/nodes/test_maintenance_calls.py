@@ -1,5 +1,6 @@
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
+import os
 import signal
 import sqlite3
 import time
@@ -103,6 +104,21 @@ def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
     assert plc.call(GetMaintenance, "status", cycle_id="4712").status == Code.BAD_INPUT
     names = [event.command for event in plc.events]
     assert names == ["run_maintenance", "maintenance_ended"]
+
+
+def test_a_disk_that_takes_its_time_breaks_no_cycle_off(plc, graph, monkeypatch):
+    fsync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        time.sleep(0.35)  # file and folder: the heartbeat is older than gap_stale_s afterwards
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    assert plc.run("4711").success
+    monkeypatch.undo()
+    graph.spin_until(lambda: plc.run("4711").result.code != Code.NONE, "it ends")
+    ended = plc.run("4711").result
+    assert (ended.code, ended.complete) == (Code.ACCEPT, True), ended.message
 
 
 def test_the_action_does_the_same(plc, graph):

@@ -196,6 +196,7 @@ class ToolPart:
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
         """From home and back home; None where it did not fit, or gave no result for this tool."""
         hands = self._hands
+        yield  # what was kept just before may have taken its time: the gap is looked at again
         if hands.tool.absent:
             outcome.left = f"tool measurement ({mode})"
             outcome.last = Answer(Code.CONFLICT, hands.tool.words(), absent=True)
