@@ -1,5 +1,8 @@
 """What is known of the tool: when it was checked, which one, and what may be concluded."""
 
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +19,7 @@ from maintenance_cell import (
     Cell,
     bent,
     config_of,
+    kinds,
     new_tool,
     opened,
     passed,
@@ -34,6 +38,7 @@ from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.settling import HELD_S
 from robocal_ros.sessions.tool_config import rows_of
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -354,6 +359,63 @@ def test_a_tool_of_another_thermal_revision_is_not_accepted_without_a_person(his
     result = cell.finish()
     assert f"tool candidate {number} waits for a decision: tool {number} was" in result.message
     assert result.accepted == ()
+
+
+@contextmanager
+def held_by_another(history: CalibrationHistory) -> Iterator[None]:
+    """Another process is in the middle of a change of the history."""
+    history.wait_at_most(0.0)
+    with closing(sqlite3.connect(history.path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield
+        other.execute("ROLLBACK")
+
+
+def accepts(cell: Cell) -> list[Code]:
+    return [outcome.status for name, outcome in cell.events if name == ACCEPT]
+
+
+def until_back_home(cell: Cell) -> None:
+    """Until a measurement has ended, and the robot is at home again."""
+    while cell.tool.measuring or cell.tool.armed or not cell.at_home():
+        cell.step()
+        assert cell.now_s < cell.ends_s
+
+
+@pytest.mark.parametrize("kind", ["thermal", "tool"])
+def test_an_acceptance_that_meets_a_held_history_comes_later(history, kind):
+    cell = automatic(history, poses=POSES[: len(POSES) * (kind == "thermal")])
+    if kind == "thermal":
+        cell.check = passed()
+        number = thermal_candidate(cell)
+        cell.run("c1", LONG_S)
+        while kinds(cell)[-1:] != ["EndCycle"]:
+            cell.step()
+            assert cell.now_s < cell.ends_s
+    else:
+        number = measured_in_full(cell)
+        until_back_home(cell)
+    with held_by_another(history):
+        cell.pass_time(HELD_S / 2.0)
+        assert cell.state is State.RUNNING
+        assert history.head(kind).calibration_id is None
+    cell.check = passed()
+    assert cell.finish().accepted == (number,)
+    assert accepts(cell) == [Code.ACCEPT]  # told once
+
+
+def test_an_acceptance_waits_no_longer_than_it_may(history):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    with held_by_another(history):
+        until_back_home(cell)
+        home_s = cell.now_s
+        result = cell.finish()
+    assert HELD_S <= cell.now_s - home_s < HELD_S + 1.0
+    assert result.accepted == ()
+    assert "another process holds it" in result.message
+    assert cell.session.status(cell.now_s).tool_pending == number
+    assert accepts(cell) == [Code.STORAGE_FAILED]
 
 
 def until_verified(cell: Cell) -> None:
