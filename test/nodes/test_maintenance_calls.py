@@ -294,7 +294,7 @@ def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
 
     graph.spin_until(ended, "a has ended")
     (goal,) = calls._goals  # its caller is not told yet
-    session.run("b", 30.0, time.monotonic(), time.time_ns())
+    session.run("b", 30.0, *plc.node._clocks())
     assert calls._cancel(goal) is CancelResponse.REJECT
     graph.spin_until(lambda: session.running is None, "b has ended")
     assert session.result("b").code is Code.ACCEPT
@@ -349,6 +349,21 @@ def test_heartbeats_that_waited_for_the_node_do_not_count(graph):
         assert refused.message.startswith("gap_open is silent for more than 0.5 s")
     plc.beating = True
     graph.spin_until(lambda: plc.run("e").success, "heartbeats count again")
+
+
+def test_a_heartbeat_from_before_the_host_was_suspended_is_old(plc, graph, monkeypatch):
+    clock = time.clock_gettime
+
+    def woken(which: int) -> float:
+        return clock(which) + 3600.0 * (which == time.CLOCK_BOOTTIME)
+
+    plc.beating = False
+    monkeypatch.setattr(time, "clock_gettime", woken)
+    refused = plc.run("4711")
+    assert refused.status == Code.CONFLICT, refused.message
+    assert refused.message.startswith("gap_open is silent for more than 0.5 s")
+    plc.beating = True
+    graph.spin_until(lambda: plc.run("4711").success, "heartbeats count again")
 
 
 def test_a_state_that_is_lost_is_a_fault(plc, graph):
