@@ -31,7 +31,7 @@ from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
-from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
 from robocal_ros.sessions.maintenance import AcceptBounds, State
@@ -227,6 +227,79 @@ def test_a_full_measurement_of_another_tool_is_not_credited(cell):
     cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
     assert "another tool came into force" in cell.finish().message
     assert level(cell) is AccuracyLevel.DEGRADED
+
+
+@pytest.fixture
+def checked(history) -> Cell:
+    """A tool that passed its check with the second of two thermal models; the next is far off."""
+    cell = opened(history, config=config_of(check_every_s=1e6))
+    for kelvin in (10.0, 20.0):
+        decide(cell, ACCEPT, thermal_proposed(history, kelvin))
+    decide(cell, ACCEPT, proposed(history))
+    cell.run("c1", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    assert level(cell) is AccuracyLevel.OK
+    cell.log.clear()
+    return cell
+
+
+OTHER_MODEL = "another thermal model is in force than it was checked with: check it"
+
+
+def is_due_until_checked(cell: Cell, *, error_known: bool) -> None:
+    assert level(cell) is AccuracyLevel.DUE
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert OTHER_MODEL in said.reason
+    assert (said.error is not None) == error_known
+    cell.restart()
+    assert level(cell) is AccuracyLevel.DUE
+    cell.pass_time(0.3)
+    cell.run("c2", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    assert modes(cell) == ["quick"]
+    assert level(cell) is AccuracyLevel.OK
+
+
+@pytest.mark.parametrize("by", ["the PLC", "another process"])
+def test_a_thermal_model_that_is_rolled_back_leaves_the_tool_due(checked, by):
+    """What was wrong with it may be in the tool."""
+    history = checked.history
+    first = next(d.calibration_id for d in history.decisions() if d.kind == THERMAL)
+    if by == "the PLC":
+        decide(checked, ROLLBACK, first)
+    else:
+        history.rollback(first, kind=THERMAL, by=by, reason="", wall_ns=0)
+    is_due_until_checked(checked, error_known=False)
+
+
+def test_a_thermal_model_that_is_accepted_leaves_the_tool_due(checked):
+    decide(checked, ACCEPT, thermal_proposed(checked.history, 30.0))
+    is_due_until_checked(checked, error_known=True)
+
+
+def test_the_model_that_a_tool_was_checked_with_may_come_back(checked):
+    history = checked.history
+    back = history.head(THERMAL).calibration_id
+    history.rollback(0, kind=THERMAL, by="a person", reason="", wall_ns=0)
+    assert level(checked) is AccuracyLevel.DUE
+    decide(checked, ROLLBACK, back)
+    assert level(checked) is AccuracyLevel.OK
+
+
+def test_a_tool_of_another_thermal_model_that_comes_back_is_due(checked):
+    history, tool = checked.history, checked.history.head(TOOL).calibration_id
+    decide(checked, ACCEPT, thermal_proposed(history, 30.0))
+    decide(checked, ACCEPT, proposed(history))
+    checked.run("c2", LONG_S)
+    assert checked.finish().tool_answer == "pass"
+    assert level(checked) is AccuracyLevel.OK
+    decide(checked, ROLLBACK, tool)
+    assert level(checked) is AccuracyLevel.DUE
+    checked.log.clear()
+    checked.run("c3", LONG_S)
+    checked.finish()
+    assert modes(checked) == ["quick"]
+    assert level(checked) is AccuracyLevel.OK
 
 
 def automatic(history, **changes) -> Cell:

@@ -82,6 +82,7 @@ class ToolPart:
         self._decided, self._unsure, self._drift = decided, unsure, drift
         self._times = hands.config.times
         self._checked = 0  # revision of the tool that the last measurement was about
+        self._through = 0  # thermal model that gave its flange poses
         self.wall_ns = 0
         self.outcome = ToolOutcome()
 
@@ -92,6 +93,7 @@ class ToolPart:
             return ""
         known = 0 < record.wall_ns <= self.wall_ns
         known = known and record.revision == self._decider.revision(TOOL)
+        known = known and record.thermal_id == self._decider.thermal_id()
         if known and record.answer in ("recalibrate", "cannot tell"):
             return FULL
         known = known and record.answer != "failed"
@@ -203,7 +205,7 @@ class ToolPart:
             return None
         hands.doing = f"tool measurement ({mode})"
         yield from hands.stand(STANDS_S)
-        self._checked = self._decider.revision(TOOL)
+        self._checked, self._through = self._decider.revision(TOOL), self._decider.thermal_id()
         try:
             answer = yield from hands.arm()
             if answer.done:
@@ -224,7 +226,11 @@ class ToolPart:
         outcome.told = f"{outcome.left}: {answer.message}"
         if answer.code in FAILED:  # what an older check found of the tool holds no more
             self._memory.note_tool(
-                answer="failed", words=answer.message, revision=self._checked, candidate=0
+                answer="failed",
+                words=answer.message,
+                revision=self._checked,
+                thermal_id=self._through,
+                candidate=0,
             )
         return None
 
@@ -235,6 +241,7 @@ class ToolPart:
             deviation_mm=answer.deviation_mm,
             sigma_mm=answer.sigma_mm,
             revision=self._checked,
+            thermal_id=self._through,
             candidate=candidate,
             wall_ns=self.wall_ns,
         )
