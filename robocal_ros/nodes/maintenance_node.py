@@ -25,6 +25,7 @@ from robocal_ros.nodes.maintenance_services import MaintenanceServices, Now
 from robocal_ros.nodes.maintenance_settings import SETTINGS, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.steady_clock import steady_s
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
@@ -106,7 +107,7 @@ class MaintenanceNode(HouseNode):
     def deactivate(self) -> None:
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
-            self._carry_out(self._session.give_up(ENDS, time.monotonic()))
+            self._carry_out(self._session.give_up(ENDS, steady_s()))
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
             self._outputs.accuracy(gone, self._config.tolerance_m, self.now_ns())
@@ -137,12 +138,12 @@ class MaintenanceNode(HouseNode):
             raise InputError(fault)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
-        session.reading(sample.stamp_ns / NS, q, time.monotonic())
+        session.reading(sample.stamp_ns / NS, q, steady_s())
 
     def _take_gap(self, message: Any) -> None:
         if self._session is not None:
             self._session.doubt_gap(self._sources.doubt())
-            self._session.gap(message.data, time.monotonic())
+            self._session.gap(message.data, steady_s())
             self._tick()  # a gap that closes stops the robot now
 
     def _take_measurement(self, message: Any) -> None:
@@ -161,7 +162,7 @@ class MaintenanceNode(HouseNode):
         drift = Drift(
             level, message.reason, ToolError(rms_m, bound_m) if known else None, message.due_in_s
         )
-        self._session.drift(drift, time.monotonic())
+        self._session.drift(drift, steady_s())
 
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:
@@ -170,7 +171,7 @@ class MaintenanceNode(HouseNode):
     # ---- time -----------------------------------------------------------------------------------
 
     def _clocks(self) -> Now:
-        return Now(time.monotonic(), time.time_ns())
+        return Now(steady_s(), time.time_ns())
 
     def _tick(self) -> None:
         if self._session is not None:
@@ -199,7 +200,7 @@ class MaintenanceNode(HouseNode):
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
-        status = session.status(time.monotonic())
+        status = session.status(steady_s())
         shown = replace(status, left_s=round(status.left_s))
         if shown != self._shown:
             self._shown = shown
@@ -220,7 +221,7 @@ class MaintenanceNode(HouseNode):
         session, health = self._session, Health()
         if session is None:
             return health
-        status = session.status(time.monotonic())
+        status = session.status(steady_s())
         values: dict[str, object] = {
             "state": status.state.name,
             "doing": status.doing or "nothing",
