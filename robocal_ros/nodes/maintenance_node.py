@@ -43,6 +43,7 @@ HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks aft
 NS = 1_000_000_000
 MM = 1e-3
 ENDS = "the node was deactivated"
+LARGEST = 1e9  # mm, s: a figure beyond is a defect, and its square might be infinite
 GAP_OPEN, ACCURACY = "gap_open", "thermal_node/accuracy"
 MEASUREMENTS = {
     POINT: PointStamped,
@@ -157,12 +158,12 @@ class MaintenanceNode(HouseNode):
             level = AccuracyLevel(message.state)
         except ValueError as error:
             raise InputError(f"accuracy state {message.state} is unknown") from error
-        known = message.predicted_error_mm >= 0.0 and message.bound_mm >= 0.0
-        rms_m, bound_m = message.predicted_error_mm * MM, message.bound_mm * MM
-        drift = Drift(
-            level, message.reason, ToolError(rms_m, bound_m) if known else None, message.due_in_s
-        )
-        self._session.drift(drift, steady_s())
+        rms_mm, bound_mm, due_in_s = message.predicted_error_mm, message.bound_mm, message.due_in_s
+        if not all(abs(figure) <= LARGEST for figure in (rms_mm, bound_mm, due_in_s)):
+            raise InputError(f"rms {rms_mm:g} mm, bound {bound_mm:g} mm, due in {due_in_s:g} s")
+        known = rms_mm >= 0.0 and bound_mm >= 0.0
+        found = ToolError(rms_mm * MM, bound_mm * MM) if known else None
+        self._session.drift(Drift(level, message.reason, found, due_in_s), steady_s())
 
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:

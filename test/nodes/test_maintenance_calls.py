@@ -23,7 +23,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.maintenance_node import ACCURACY, MaintenanceNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -329,6 +329,24 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     assert plc.statuses[-1].last.code == Code.CONFLICT
     graph.spin_until(lambda: plc.states[-1].state == AccuracyState.FAULT, "the line is told")
     assert "deactivated" in plc.states[-1].reason
+
+
+@pytest.mark.parametrize("name", ["predicted_error_mm", "bound_mm", "due_in_s"])
+def test_a_figure_that_cannot_be_is_no_drift(graph, name):
+    poses = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
+    node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})
+    states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
+    drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
+    known = {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
+    for count, value in enumerate((np.nan, np.inf, -np.inf, 1e300), 1):
+        drift.publish(AccuracyState(state=AccuracyState.OK, **(known | {name: value})))
+        graph.spin_until(lambda n=count: node.inputs[ACCURACY].invalid == n, f"{value} is refused")
+        states.clear()
+        graph.spin_until(lambda: states, "the line is told")
+        assert states[-1].reason == "drift: the thermal node is silent"
+    drift.publish(AccuracyState(state=AccuracyState.OK, **known))
+    graph.spin_until(lambda: states[-1].state == AccuracyState.OK, "the next one counts")
+    assert (states[-1].predicted_error_mm, states[-1].bound_mm) == pytest.approx((0.1, 0.2))
 
 
 def test_a_second_publisher_of_the_heartbeat_closes_the_gap(plc, graph):

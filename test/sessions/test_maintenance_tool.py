@@ -1,6 +1,7 @@
 """What is known of the tool: when it was checked, which one, and what may be concluded."""
 
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -34,6 +35,7 @@ from robocal_ros.core.errors import StaleError, StorageError
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
+from robocal_ros.sessions.gap import STALL_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.deciding import Decider
@@ -424,6 +426,44 @@ def test_a_tool_of_another_thermal_revision_is_stale(cell):
     cell.run("c2", LONG_S)  # it waits for nobody
     cell.finish()
     assert modes(cell) == ["full"]
+
+
+def copied(history: CalibrationHistory, calibration_id: int, count: int) -> None:
+    """So many more of a calibration, as other nodes would propose them."""
+    columns = (
+        "kind, model_hash, based_on, cycle_id, stamp_ns, created_ns, software, method, code, reason"
+    )
+    with closing(sqlite3.connect(history.path)) as raw, raw:
+        raw.execute(
+            "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < ?) "
+            f"INSERT INTO calibrations ({columns}) "
+            f"SELECT {columns} FROM calibrations, n WHERE id = ?",
+            (count, calibration_id),
+        )
+        raw.execute(
+            "INSERT INTO payloads SELECT c.id, p.name, p.data, p.sha256 FROM calibrations c, "
+            "payloads p WHERE p.calibration_id = ? AND c.id NOT IN "
+            "(SELECT calibration_id FROM payloads)",
+            (calibration_id,),
+        )
+
+
+def test_a_status_is_no_pause_however_many_candidates_wait(cell):
+    """It is asked for five times a second by the process that looks after the robot."""
+    history = cell.history
+    copied(history, proposed(history), 9_998)
+    outdated = proposed(history, thermal_revision=3)
+    copied(history, outdated, 10_000)
+    copied(history, thermal_proposed(history, 1.0), 9_999)
+    took_s = []
+    for _ in range(5):
+        begin_s = time.perf_counter()
+        status = cell.session.status(cell.now_s)
+        took_s.append(time.perf_counter() - begin_s)
+    assert (status.thermal_pending, status.tool_pending) == (30_000, 0)
+    assert min(took_s) < 0.1 * STALL_S
+    number = proposed(history)
+    assert cell.session.status(cell.now_s).tool_pending == number
 
 
 def test_a_tool_of_another_thermal_revision_is_not_accepted_without_a_person(history):

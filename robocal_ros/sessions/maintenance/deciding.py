@@ -39,6 +39,14 @@ class Decider:
         found = self._history.pending(kind)
         return [entry for entry in found if not self._outdated(entry)]
 
+    def newest(self, kind: str) -> Entry | None:
+        """The first of them, however many there are; None where nothing waits.
+
+        Where the newest tool is outdated, those measured before it are too: revisions only grow.
+        """
+        found = self._history.pending(kind, 1)
+        return found[0] if found and not self._outdated(found[0]) else None
+
     def _outdated(self, entry: Entry) -> str:
         """Why it is STALE although its own kind's revision is in force; else empty."""
         try:
@@ -106,7 +114,7 @@ class Decider:
         ConflictError
             When nothing waits, or candidates of both kinds.
         """
-        newest = [found[0] for kind in KINDS if (found := self.pending(kind))]
+        newest = [found for kind in KINDS if (found := self.newest(kind))]
         if len(newest) != 1:
             words = ", ".join(f"{entry.id} ({entry.kind})" for entry in newest) or "none"
             raise ConflictError(f"one candidate must wait, found {words}: decide by id")

@@ -253,8 +253,8 @@ class MaintenanceSession:
         named = last.cycle_id if last is not None else ""
         thermal, tool, trouble = 0, 0, ""
         try:
-            pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
-            thermal, tool = (found[0].id if found else 0 for found in pending)
+            newest = [self._decider.newest(kind) for kind in (THERMAL, TOOL)]
+            thermal, tool = (found.id if found else 0 for found in newest)
         except RobocalError as error:
             trouble = str(error)
         return Status(

@@ -89,7 +89,7 @@ class ToolPart:
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
         record, config = self._memory.tool, self._hands.config
-        if config.T_base_laser is None or self._decider.pending(TOOL):
+        if config.T_base_laser is None or self._decider.newest(TOOL):
             return ""
         known = 0 < record.wall_ns <= self.wall_ns
         known = known and record.revision == self._decider.revision(TOOL)
@@ -105,8 +105,8 @@ class ToolPart:
         outcome = self.outcome
         wanted = self.wants()
         if not wanted:
-            if waiting := self._decider.pending(TOOL):
-                outcome.told = f"tool candidate {waiting[0].id} waits for a decision"
+            if waiting := self._decider.newest(TOOL):
+                outcome.told = f"tool candidate {waiting.id} waits for a decision"
             return
         if wanted == QUICK:
             if not (yield from self._check(cycle_id, "check", outcome)):
