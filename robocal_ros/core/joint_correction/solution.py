@@ -24,6 +24,8 @@ REPEATS = 3
 CALM = 2e-3
 # A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
 SMALL_RESIDUAL = 1e-12
+# A step (rad, m) that shrinks below the rounding floor by the next one with the same matrix.
+FLOOR = 1e-13
 # A step below which the next one is under the rounding floor (convergence is quadratic).
 SMALL_STEP = 1e-9
 # Longest second step with the first one's matrix, as a share of the first: in its direction (at
@@ -115,6 +117,15 @@ def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bo
 
 
 @lean
+def _finish(q: Array, free: bool, room: Room, out: Array) -> None:
+    """Steps with the last matrix down to the rounding floor."""
+    repeats, size = 0, _add_step(free, False, room)
+    while size > FLOOR and repeats < REPEATS:
+        _moved(q, free, room, out)
+        repeats, size = repeats + 1, _add_step(free, False, room)
+
+
+@lean
 def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
     """Newton's steps from ``q``, whose pose is ``here`` and whose residual is ``e``."""
     n, size = q.shape[0], 0.0
@@ -147,10 +158,7 @@ def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> Non
             calm = size <= CALM * before
             converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
         if converged or (iterations > 1 and size <= SMALL_STEP):
-            _add_step(free, False, room)
-            if repeats > 0 and not calm:
-                _moved(q, free, room, out)
-                _add_step(free, False, room)
+            _finish(q, free, room, out)
             converged = True
         calm = False
     out[n + CONVERGED] = _take(q, room.x, largest, converged, out)

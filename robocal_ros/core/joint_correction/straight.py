@@ -1,7 +1,7 @@
 """Compiled correction of six turning joints without a branch, for many points at once.
 
-Newton's method as in `solution`, two factored matrices with two and three steps, written with
-single numbers: the compiler works on several points at a time in vector registers. Each gets the
+Newton's method as in `solution`, three factored matrices with two steps each, written with single
+numbers: the compiler works on several points at a time in vector registers. Each gets the
 bits that it gets alone. Where that does not do (a bound or a singularity near, a shift so large
 that it needs more steps) a point is left to `solution`.
 """
@@ -13,6 +13,7 @@ from robocal_ros.core.compiled import kernel, lean
 from robocal_ros.core.joint_correction.straight_kinematics import (
     ACTUAL,
     LARGEST,
+    Frame,
     Frames,
     N,
     Six,
@@ -29,15 +30,15 @@ LANES = 16
 # what is written for each point
 ROWS = 11
 POSITION_LEFT, ROTATION_LEFT, FINE, TCP_SHIFT, TCP_ROTATION = range(N, ROWS)
-ITERATIONS = 2.0
+ITERATIONS = 3.0
 
 # A residual (m, rad) that is left alone.
 AT_GOAL = 1e-12
 # Longest second step as a share of the first: see `solution`.
 AHEAD, BESIDE = 0.2, 0.5
-# The last step and the one before show what one more would be: below this it is not made.
-LEFT = 2e-15
-QUIET, SHORT = 5e-15, 1e-9  # a last step that is as short needs no other; one that is longer does
+# The last matrix was made so near to the solution that its second step, this short, is the last:
+# what is left is their product, times a curvature that even beside a singularity is below 1e4.
+NEAR, SHORT = 1e-6, 1e-11
 SINGULAR = 1e-13  # square of a column's part that no column before has, beside the first's
 FAR = 2.0  # a solution so many times beyond the bound is another posture
 
@@ -148,6 +149,19 @@ def _turns_little(c: Array, at: int, q: Six) -> bool:
 
 
 @lean
+def _two_steps(c: Array, q: Six, aim: Frame, x: Six) -> tuple[Six, Six, float, float, bool]:
+    """Shift after two steps with one matrix, the residual before the last, the steps' squares."""
+    frames = walk(c, ACTUAL, _more(q, 1.0, x))
+    e, near = residual(aim, frames[6])
+    factor, regular = _factor(c, frames)
+    step = _step(factor, e)
+    x, before = _more(x, 1.0, step), _dot(step, step)
+    last, still_near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
+    step = _step(factor, last)
+    return _more(x, 1.0, step), last, before, _dot(step, step), near & regular & still_near
+
+
+@lean
 def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool]:
     """Shift of the joints, first and last residual, and whether the shift is the solution."""
     aim = goal(c, q)
@@ -163,23 +177,10 @@ def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool]:
     step = _step(factor, e)
     length, along = _dot(x, x), _dot(x, step)
     fine &= near & (along <= AHEAD * length) & (_dot(step, step) <= BESIDE * BESIDE * length)
-    x = _more(x, 1.0, step)
-    frames = walk(c, ACTUAL, _more(q, 1.0, x))
-    e, near = residual(aim, frames[6])
-    factor, regular = _factor(c, frames)
-    step = _step(factor, e)
-    fine &= near & regular
-    x = _more(x, 1.0, step)
-    e, near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
-    step = _step(factor, e)
-    x, before = _more(x, 1.0, step), _dot(step, step)
-    fine &= near
-    last, near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
-    step = _step(factor, last)
-    x, size = _more(x, 1.0, step), _dot(step, step)
-    # steps with one matrix shrink alike: one more would be s^2 / s0
-    small = (size * size <= LEFT * LEFT * before) | (size <= QUIET * QUIET)
-    fine &= near & small & (size <= SHORT * SHORT) & _within(c, x, FAR)
+    x, _, _, _, good = _two_steps(c, q, aim, _more(x, 1.0, step))
+    fine &= good
+    x, last, before, size, good = _two_steps(c, q, aim, x)
+    fine &= good & (before <= NEAR * NEAR) & (size <= SHORT * SHORT) & _within(c, x, FAR)
     return x, first, last, fine
 
 
