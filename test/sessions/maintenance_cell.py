@@ -201,6 +201,7 @@ class Cell:
         end_s = self.now_s + seconds
         while self.now_s < end_s:
             self.now_s += TICK_S
+            self._controller_goes_on()
             if self._beat_is_due():
                 self.beat_s = self.now_s
                 self.waiting = end_s + LATE_S, self.is_open
@@ -212,13 +213,7 @@ class Cell:
     def step(self) -> None:
         self.now_s += TICK_S
         self._beat()
-        while self.coming and self.coming[0][0] <= self.now_s:
-            at_s, plan = self.coming.pop(0)
-            self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
-        q = self.motion.joints(np.array([self.now_s]))[0]
-        if np.max(np.abs(q - self.q)) > 1e-7:
-            self.moved_s = self.now_s
-        self.q = q
+        self._controller_goes_on()
         self._tool_goes_on()
         if not self.silent:
             self.session.reading(self.now_s, self.q + self.offset, self.now_s)
@@ -229,6 +224,15 @@ class Cell:
             self.session.answered(item[1], item[2])
         for request in self.session.tick(self.now_s, self.wall_ns):
             self._carry_out(request)
+
+    def _controller_goes_on(self) -> None:
+        while self.coming and self.coming[0][0] <= self.now_s:
+            at_s, plan = self.coming.pop(0)
+            self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
+        q = self.motion.joints(np.array([self.now_s]))[0]
+        if np.max(np.abs(q - self.q)) > 1e-7:
+            self.moved_s = self.now_s
+        self.q = q
 
     def _beat_is_due(self) -> bool:
         return self.beating and self.now_s >= self.beat_s + self.beats_every_s

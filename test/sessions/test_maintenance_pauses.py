@@ -2,7 +2,9 @@
 
 import pytest
 from maintenance_cell import (
+    BEAT_S,
     KNOWN,
+    LAG_S,
     LATE_S,
     LONG_S,
     STALE_S,
@@ -18,6 +20,7 @@ from maintenance_cell import (
 )
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.gap import DRAIN_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 
@@ -105,3 +108,30 @@ def test_a_pause_in_a_motion_stops_the_robot(cell):
     assert result.code is Code.CONFLICT
     assert cell.state is State.FAULT
     assert "Stop" in kinds(cell)
+
+
+def test_a_stop_does_not_wait_for_the_disk(cell):
+    cell.run("c1", LONG_S)
+    while "Move" not in kinds(cell):
+        cell.step()
+    cell.pass_time(0.5)
+    cell.shelf.takes = lambda: cell.pause(0.6)
+    cell.is_open, closed_s = False, cell.now_s
+    while cell.state is State.RUNNING:
+        cell.step()
+    cell.pass_time(1.0)
+    assert cell.moved_s <= closed_s + BEAT_S + SHORTEST_STOP_S + LAG_S + 2.0 * TICK_S
+    cell.restart()
+    assert "gap_open is false" in cell.session.status(cell.now_s).fault
+
+
+def test_a_fault_that_is_not_on_the_disk_yet_outlives_a_kill(cell):
+    cell.run("c1", LONG_S)
+    while "Move" not in kinds(cell):
+        cell.step()
+    cell.is_open = False
+    while cell.state is State.RUNNING:
+        cell.step()
+    cell.restart()
+    status = cell.session.status(cell.now_s)
+    assert (status.state, status.last.code) == (State.FAULT, Code.CONFLICT)

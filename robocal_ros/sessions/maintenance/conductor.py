@@ -31,6 +31,7 @@ class Conductor:
         self.run: Run | None = None
         self.broken: tuple[Code, str] | None = None
         self._script: Script[None] | None = None
+        self._unsaved = False
 
     def begin(self, run: Run) -> None:
         """A run begins at the next tick; nothing moves before the tool's driver is disarmed."""
@@ -40,6 +41,8 @@ class Conductor:
 
     def tick(self, wall_ns: int) -> None:
         """Look after gap and robot, then go on."""
+        if self._unsaved:
+            self._save()
         run, hands = self.run, self._hands
         if run is None:
             hands.keep_disarming()
@@ -80,7 +83,11 @@ class Conductor:
             hands.disengage()
         self.run, hands.doing = None, "fault"
         self._tell(FAULT, {}, code, reason)
-        self._keep(run, code, reason, fault=reason)
+        self._note(run, code, reason, fault=reason)
+        # A stop does not wait for the disk: without this write too the next start finds a fault.
+        self._unsaved = bool(hands.out) and not at_once
+        if not self._unsaved:
+            self._save()
 
     def give_up(self, why: str, at_once: bool = False) -> None:
         """End the run now: at home and disarmed it just ends, anywhere else it is a `fault`."""
@@ -119,19 +126,24 @@ class Conductor:
         self._close_script()
         run, self.run = self.run, None
         self._hands.doing = ""
-        self._keep(run, code, message)
+        self._note(run, code, message)
+        self._save()
 
-    def _keep(self, run: Run | None, code: Code, message: str, fault: str = "") -> None:
+    def _note(self, run: Run | None, code: Code, message: str, fault: str = "") -> None:
+        if run is None:
+            self._memory.set_fault(code, fault)
+            return
+        result = run.ended(code, message)
+        self._tell(ENDED, result.document(), code, message)
+        self._memory.end(result, code if fault else Code.NONE, fault)
+
+    def _save(self) -> None:
+        self._unsaved, memory = False, self._memory
         try:
-            if run is not None:
-                result = run.ended(code, message)
-                self._tell(ENDED, result.document(), code, message)
-                self._memory.end(result, code if fault else Code.NONE, fault)
-            else:
-                self._memory.set_fault(code, fault)
+            memory.save()
         except RobocalError as error:  # what is in memory holds; it is a fault all the same
-            self._memory.fault_code = error.code
-            self._memory.fault = f"{fault}; {error}" if fault else str(error)
+            memory.fault_code = error.code
+            memory.fault = f"{memory.fault}; {error}" if memory.fault else str(error)
 
     def _close_script(self) -> None:
         if self._script is not None:

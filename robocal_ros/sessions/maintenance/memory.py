@@ -121,6 +121,7 @@ class Memory:
             memory = cls(keeper)
             known = "ended cycles, whose ids would run again, the last check, an open fault"
             memory.set_fault(error.code, f"{error} ({known}): see where the robot is")
+            memory.save()
             return memory
         if document is None:
             return cls(keeper)
@@ -137,6 +138,7 @@ class Memory:
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
             result = CycleResult(memory.running, Code.CONFLICT, words)
             memory.end(result, Code.CONFLICT, words)
+            memory.save()
         return memory
 
     def begin(self, cycle_id: str) -> None:
@@ -149,14 +151,13 @@ class Memory:
             raise
 
     def end(self, result: CycleResult, fault_code: Code = Code.NONE, fault: str = "") -> None:
-        """It has ended, for good."""
+        """It has ended, for good; `save` keeps that."""
         self.running = ""
         self.cycles[result.cycle_id] = result
         while len(self.cycles) > REMEMBERED:
             del self.cycles[next(iter(self.cycles))]
         if fault:
             self.fault_code, self.fault = fault_code, fault
-        self.save()
 
     def note_tool(self, **known: Any) -> None:
         """The tool was measured."""
@@ -164,9 +165,8 @@ class Memory:
         self.save()
 
     def set_fault(self, code: Code, words: str) -> None:
-        """A fault."""
+        """A fault; `save` keeps it."""
         self.fault_code, self.fault = code, words
-        self.save()
 
     def clear_fault(self) -> None:
         """Its end; it stays where that cannot be kept."""
