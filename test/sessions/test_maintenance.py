@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from maintenance_cell import (
     ARM,
+    BEAT_S,
     CELL,
+    DRIVING,
     HOME,
     LONG_S,
     POSES,
@@ -14,6 +16,7 @@ from maintenance_cell import (
     SILENT,
     SLOW,
     STALE_S,
+    TICK_S,
     TIMES,
     Cell,
     ToolNode,
@@ -32,6 +35,8 @@ from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.hands import DEAF_S
+from robocal_ros.sessions.robot_watch import VELOCITY_S
+from robocal_ros.sessions.tool_driving import SETTLED_S
 from robocal_ros.sim.joint_motion import JointMotion
 
 SMALL = ToolError(1e-4, 1.5e-4)
@@ -254,7 +259,7 @@ def test_a_tool_node_that_died_at_home_is_a_fault_that_can_be_acknowledged(cell)
 
 
 def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
-    """Nobody but itself can tell that nothing is under way."""
+    """One that is there must confirm, the same or a new one, and the robot must rest."""
     until_moving(cell, "tool")
     cell.tool_dies()
     cell.is_open = False
@@ -312,6 +317,62 @@ def test_a_deaf_tool_node_is_stopped_by_what_armed_it(cell, how):
     assert "Stop" in kinds(cell)
     with pytest.raises(ConflictError, match="not confirmed"):
         cell.session.acknowledge("me")
+
+
+@pytest.mark.parametrize(
+    ("how", "hears_s"), [("closed", BEAT_S), ("silent", STALE_S), ("cancelled", 0.0)]
+)
+def test_what_a_dead_tool_node_left_is_stopped_whoever_confirms(cell, how, hears_s):
+    """Started anew it confirms at once, but knows nothing of the plan that the controller has."""
+    until_moving(cell, "tool")
+    cell.tool_dies()
+    cell.tool = ToolNode()
+    if how == "cancelled":
+        cell.session.cancel("by the PLC")
+    else:
+        cell.is_open, cell.beating = how == "silent", how != "silent"
+    believed_s = DRIVING.late_s + SHORTEST_STOP_S + SETTLED_S
+    cell.pass_time(hears_s + believed_s + SHORTEST_STOP_S + 0.1)
+    assert cell.moved_s < cell.now_s - TICK_S
+    cell.finish()
+    over(cell, fault=how != "cancelled")
+    assert kinds(cell).count("Stop") == 1
+
+
+def test_a_confirmation_near_home_does_not_hand_over_what_a_dead_tool_node_left(cell):
+    cell.run("c1", LONG_S)
+    while not cell.tool.measuring:
+        cell.step()
+    cell.pass_time(0.06)
+    cell.tool_dies()
+    cell.tool = ToolNode()
+    cell.session.cancel("by the PLC")
+    while not cell.session.status(cell.now_s).disarmed:
+        cell.step()
+    assert cell.session.status(cell.now_s).at_home
+    cell.session.doubt_gap("two publish gap_open")
+    over(cell, fault=True)
+    assert kinds(cell)[-1] == "Stop"
+
+
+@pytest.mark.parametrize("silent_s", [0.6, 3.0])
+def test_a_deaf_tool_node_is_stopped_once_joint_states_are_back(cell, silent_s):
+    """Not before: nobody knows where to stop from. One that stands by then is not pushed."""
+    until_moving(cell, "tool")
+    cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    cell.silent = True
+    cell.is_open = False
+    cell.pass_time(silent_s)
+    assert "Stop" not in kinds(cell)
+    moving = cell.moved_s == cell.now_s
+    assert moving == (silent_s < 1.0)
+    cell.silent, heard_s, q = False, cell.now_s, cell.q
+    cell.pass_time(1.5)
+    assert kinds(cell).count("Stop") == 1
+    if moving:
+        assert cell.moved_s <= heard_s + VELOCITY_S + SHORTEST_STOP_S + 0.1
+    else:
+        np.testing.assert_allclose(cell.q, q, atol=1e-6)
 
 
 @pytest.mark.parametrize("how", ["closed", "cancelled"])

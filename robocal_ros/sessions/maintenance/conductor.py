@@ -41,6 +41,7 @@ class Conductor:
     def tick(self, wall_ns: int) -> None:
         """Look after gap and robot, then go on."""
         run, hands = self.run, self._hands
+        hands.look_after_tool()
         if run is None:
             hands.keep_disarming()
             return
@@ -85,7 +86,8 @@ class Conductor:
         hands = self._hands
         if self.run is None:
             return
-        if hands.tool.engaged or hands.robot.moving or hands.robot.beside_home():
+        doubt = hands.tool.engaged or hands.tool.armed
+        if doubt or hands.robot.moving or hands.robot.beside_home():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
