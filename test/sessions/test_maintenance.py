@@ -35,6 +35,7 @@ from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.hands import DEAF_S
+from robocal_ros.sessions.maintenance.mover import Mover
 from robocal_ros.sessions.robot_watch import VELOCITY_S
 from robocal_ros.sessions.tool_driving import SETTLED_S
 from robocal_ros.sim.joint_motion import JointMotion
@@ -406,6 +407,19 @@ def test_nodes_that_fail_leave_the_robot_at_home(cell, service, how):
     cell.run("c1", LONG_S)
     assert cell.finish().code is Code.ACCEPT
     over(cell)
+
+
+def test_a_defect_is_a_fault_and_no_cycle_is_left_without_a_code(cell, monkeypatch):
+    until_moving(cell, "thermal")
+    with monkeypatch.context() as patch:
+        patch.setattr(Mover, "arrived", lambda mover, now_s: 1 / 0)
+        cell.step()
+    result = cell.session.result("c1")
+    assert result.code is Code.CONFLICT
+    assert "ZeroDivisionError: division by zero" in result.message
+    assert "defect in test_maintenance.py:" in result.message
+    assert kinds(cell)[-1] == "Stop"
+    over(cell, fault=True)
 
 
 def test_silent_joint_states_stop_the_robot(cell):

@@ -1,6 +1,8 @@
 """Plays the script of a run from tick to tick, and stops everything where something is odd."""
 
 from collections.abc import Callable
+from pathlib import Path
+from traceback import extract_tb
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -59,6 +61,8 @@ class Conductor:
             self.fault(error.code, str(error))
         except RobocalError as error:
             self._failed(error)
+        except Exception as error:  # a defect: the script is over, and the robot may move
+            self.fault(Code.CONFLICT, _defect(error))
 
     def break_off(self, code: Code, reason: str) -> None:
         """Stop the robot, and bring it home; the run ends with this code."""
@@ -138,3 +142,9 @@ class Conductor:
             self._script.close()
         self._script = None
         self._hands.forget_answers()
+
+
+def _defect(error: Exception) -> str:
+    """Where it is, for whoever mends it."""
+    place = extract_tb(error.__traceback__)[-1]
+    return f"defect in {Path(place.filename).name}:{place.lineno}: {type(error).__name__}: {error}"
