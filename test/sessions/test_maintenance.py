@@ -28,6 +28,7 @@ from maintenance_cell import (
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, LimitError, StorageError
+from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import LEAVE
@@ -671,6 +672,36 @@ def test_worst_cases_hold(cell):
         begun |= {type(r).__name__: cell.now_s for r in cell.log[count:]}
     took = cell.now_s - begun["Arm"]
     assert cell.config.times.check_s < took < worst["tool measurement (quick)"]
+
+
+def unsettled_rad(now_s: float, sent_s: float, plan: JointPlan) -> float:
+    """By how much the last joint is off, so that each rest takes nearly `rest_s`."""
+    late_s = TIMES.rest_s - 3 * TICK_S
+    arrives_s = sent_s + plan.duration_s + late_s
+    rests_s = arrives_s + late_s
+    if now_s < arrives_s:
+        return 1e-3
+    calm = rests_s <= now_s < rests_s + 0.1
+    trembles = now_s < rests_s + TIMES.measure_s + late_s and not calm
+    return 2e-4 * (round(now_s / TICK_S) % 2) * trembles
+
+
+def test_a_pose_takes_its_worst_case_and_no_more(history):
+    """The way, a rest there, the measurement, a rest before the next, which does not fit, home."""
+    cell = Cell(history, config_of(poses=POSES[:2], T_base_laser=None), services={"sensor": SILENT})
+    cell.open_gap()
+    cell.run("c1", cell.session.worst_cases()["one measuring pose"] + 2.0)
+    sent: list[tuple[float, ask.Move]] = []
+    while cell.state is State.RUNNING:
+        if sent:
+            cell.offset[-1] = unsettled_rad(cell.now_s + TICK_S, sent[-1][0], sent[-1][1].plan)
+        count = len(cell.log)
+        cell.step()
+        sent += [(cell.now_s, r) for r in cell.log[count:] if isinstance(r, ask.Move)]
+    assert "thermal measurement, 1 poses" in cell.session.result("c1").left
+    assert len(sent) == 2
+    took_s, worst_s = cell.now_s - sent[0][0], sent[0][1].worst_s
+    assert worst_s - 0.5 * TIMES.rest_s < took_s <= worst_s
 
 
 def accuracy(cell: Cell, level=AccuracyLevel.OK, error=SMALL):
