@@ -37,8 +37,8 @@ DRIFT_CAPTION = (
 )
 CELL_CAPTION = (
     "Root mean square over the working poses of the programme, by the simulation's truth, against "
-    "the cold robot with the taught tool. Below: share of all directions, hour by hour; dashed: "
-    "the goal of 95 %."
+    "the cold robot with the taught tool. Below: share of all directions, of each hour, in a "
+    "recording within one hour as it went; dashed: the goal of 95 %."
 )
 CYCLES_CAPTION = (
     "Measured at each cycle's own poses, in which the sensor's noise is contained. In force: the "

@@ -68,6 +68,7 @@ happenings = st.one_of(
     st.tuples(st.just("cancel")),
     st.tuples(st.just("acknowledge")),
     st.tuples(st.just("restart")),
+    st.tuples(st.just("pause"), st.floats(0.05, 2.0)),
 )
 waits = st.one_of(st.floats(0.02, 2.0), st.floats(0.1, 25.0))
 anything = st.lists(st.tuples(waits, happenings), max_size=5)
@@ -223,6 +224,13 @@ class Watched:
             case ("restart",):
                 self.killed_s = cell.now_s
                 cell.restart()
+            case ("pause", pause_s) if self.nothing_moves():
+                cell.pause(min(pause_s, max(cell.ends_s - cell.now_s, 0.0)))
+
+    def nothing_moves(self) -> bool:
+        """Whether a process that stands still could not have stopped anything."""
+        cell = self.cell
+        return not (cell.coming or cell.tool.armed) and cell.now_s - cell.moved_s > 0.1
 
     def let_it_end(self) -> None:
         """No run outlives its gap; then nothing is armed, and nothing runs again."""

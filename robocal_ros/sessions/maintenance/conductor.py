@@ -49,6 +49,8 @@ class Conductor:
             return
         run.at(wall_ns)
         try:
+            if hands.may_wait():
+                return
             if why := hands.gap.over(hands.now_s):
                 self.give_up(why)
                 return

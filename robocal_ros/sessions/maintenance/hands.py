@@ -70,6 +70,10 @@ class Hands:
         """Whether something that lasts so long at the most, way home included, fits the gap."""
         return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
 
+    def may_wait(self) -> bool:
+        """Whether nothing moves, and a heartbeat from after the own pause is yet to come."""
+        return not (self.robot.moving or self.tool.armed) and self.gap.waits(self.now_s)
+
     def handed_out(self) -> list[Request]:
         """The requests that wait; they are somebody else's now."""
         found, self.out = self.out, []

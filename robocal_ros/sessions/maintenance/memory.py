@@ -70,6 +70,7 @@ class ToolRecord:
     answer : "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong
         and has no result; empty: never measured.
     revision : of the tool that was in force in the last run.
+    thermal_id : thermal model that was in force in it; 0: the nominal one.
     candidate : calibration that a full measurement proposes in its place; 0: none.
     wall_ns, full_ns : of its last result, and of the last full one; 0: none.
     drift_rms_m, drift_bound_m : error of the thermal model through which a tool was last measured.
@@ -80,6 +81,7 @@ class ToolRecord:
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
     revision: int = 0
+    thermal_id: int = 0
     candidate: int = 0
     wall_ns: int = 0
     full_ns: int = 0
