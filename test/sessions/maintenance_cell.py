@@ -152,7 +152,9 @@ class Cell:
         self.restart()
 
     def restart(self) -> None:
-        """Another session on the same shelf."""
+        """Another session on the same shelf; what the one before asked for is nobody's answer."""
+        self.due.clear()
+        self.tool.measuring *= -1
         self.session = MaintenanceSession(ARM, self.history, self.config, self.shelf, self._event)
 
     def _event(self, command: Any, outcome: Any) -> None:

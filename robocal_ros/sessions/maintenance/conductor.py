@@ -1,6 +1,8 @@
 """Plays the script of a run from tick to tick, and stops everything where something is odd."""
 
 from collections.abc import Callable
+from pathlib import Path
+from traceback import extract_tb
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -44,6 +46,7 @@ class Conductor:
         if self._unsaved:
             self._save()
         run, hands = self.run, self._hands
+        hands.look_after_tool()
         if run is None:
             hands.keep_disarming()
             return
@@ -63,6 +66,8 @@ class Conductor:
             self.fault(error.code, str(error))
         except RobocalError as error:
             self._failed(error)
+        except Exception as error:  # a defect: the script is over, and the robot may move
+            self.fault(Code.CONFLICT, _defect(error))
 
     def break_off(self, code: Code, reason: str) -> None:
         """Stop the robot, and bring it home; the run ends with this code."""
@@ -94,7 +99,8 @@ class Conductor:
         hands = self._hands
         if self.run is None:
             return
-        if hands.tool.engaged or hands.robot.moving or hands.robot.beside_home():
+        doubt = hands.tool.engaged or hands.tool.armed
+        if doubt or hands.robot.moving or hands.robot.beside_home():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
@@ -150,3 +156,9 @@ class Conductor:
             self._script.close()
         self._script = None
         self._hands.forget_answers()
+
+
+def _defect(error: Exception) -> str:
+    """Where it is, for whoever mends it."""
+    place = extract_tb(error.__traceback__)[-1]
+    return f"defect in {Path(place.filename).name}:{place.lineno}: {type(error).__name__}: {error}"
