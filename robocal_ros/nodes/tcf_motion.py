@@ -36,8 +36,9 @@ SETTINGS = (
     length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
     Setting(
         "gap_stale_s",
-        0.0,
-        "Nothing moves unless gap_open is true and no older; 0: it is not listened to",
+        0.5,
+        "Nothing moves unless gap_open is true and no older; 0: it is not listened to, and "
+        "maintenance_node does not measure with it",
         unit="s",
         low=0.0,
         high=0.5,
@@ -73,7 +74,7 @@ class TcfMotion:
             heartbeat = node.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
             self._sources = GapSources(node, heartbeat)
         else:
-            node.get_logger().warning(f"{UNHEARD}; set it in a cell with maintenance_node")
+            node.get_logger().warning(self.deaf())
         node.add_service(SetBool, "~/arm", self._arm, inactive=True)
         node.add_timer(TICK_S, self._tick, steady=True)
 
@@ -116,6 +117,12 @@ class TcfMotion:
         if self.driver is None:
             raise NotActiveError("no session: activate the node")
         self.driver.require_ready()
+
+    def deaf(self) -> str:
+        """Why what moves would go on in a closed gap; empty: it would stop."""
+        if self._gap is not None:
+            return ""
+        return f"{UNHEARD}; set it to 0.5 in a cell with maintenance_node"
 
     def words(self) -> str:
         """What the diagnostics say."""

@@ -86,6 +86,7 @@ class TcfNode(HouseNode):
             frame=self._frame,
             step=lambda: self._step,
             is_open=lambda: self._session is not None and self._session.run is not None,
+            deaf=lambda: "" if self._motion is None else self._motion.deaf(),
         )
         self._calls = TcfServices(self, runner, self._desk.ask, self._history)
         if settings["motion"] == TRAJECTORY:

@@ -13,7 +13,8 @@ class Gap:
     """Follows the heartbeat ``gap_open`` and the end of the gap that was told; steady clock.
 
     A heartbeat bears no time. One that is taken just after a pause of the own process may have
-    waited all through it: it counts from before the pause.
+    waited all through it: it counts from before the pause. One that the network delivers late
+    counts from its arrival: how late it is nobody here can tell.
 
     Parameters
     ----------
