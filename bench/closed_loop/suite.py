@@ -46,6 +46,10 @@ ENDS_RUN = (events.TOOL_STEP, events.BREAK_OFF)
 Record = Callable[[str, Command, Outcome | None], None]
 
 
+def unrecorded(node: str, command: Command, outcome: Outcome | None) -> None:
+    """Keep nothing of a command."""
+
+
 class Shelf:
     """Keeps the maintenance's memory."""
 
@@ -90,7 +94,7 @@ class Suite:
         history: CalibrationHistory,
         laser: LaserFrame,
         send: Callable[[JointPlan], None],
-        record: Record = lambda node, command, outcome: None,
+        record: Record = unrecorded,
         expected: LearnedProcess | None = None,
     ) -> None:
         self._nominal, self._send, self._record = nominal, send, record
@@ -108,6 +112,7 @@ class Suite:
         )
         self.correction: CorrectionSession | None = None
         self.last_tool: Outcome | None = None  # of a run that has ended
+        self.last_thermal: Outcome | None = None
         self._names = nominal.joint_names
         self._clock = Clock(0.0, 0)
         self._ending: dict[str, int] = {}  # request that a thermal command answers
@@ -175,6 +180,7 @@ class Suite:
     def _thermal_goes_on(self) -> None:
         for outcome in self.thermal.advance(wall_ns=self._clock.now_ns):
             self._record("thermal", outcome.command, outcome)
+            self.last_thermal = outcome
             if (number := self._ending.pop(outcome.command.name, 0)) != 0:
                 document = outcome.document or {}
                 missing = tuple(document.get("poses", {}).get("missing", ()))
