@@ -152,7 +152,7 @@ class Plant:
     # ---- commissioning --------------------------------------------------------------------------
 
     def commission(self) -> None:
-        """Place the sensor, capture the cold reference, measure the healthy tool, enable.
+        """Place the sensor, capture the cold reference, measure the healthy tool.
 
         Raises
         ------
@@ -170,7 +170,6 @@ class Plant:
         if not measured.done:
             raise RobocalError(f"commissioning of the tool: {measured}")
         self.home_from_station(suite)
-        suite.enable()
 
     def measure_drift(self, suite: Suite, cycle_id: str) -> Outcome:
         """A thermal cycle from home to home, outside any gap.

@@ -145,9 +145,10 @@ def run_shift(
         watch(plant := Plant(cell, None))
         return Worker(plan, seed, plant).run()
     expected = taught(nominal, made.robot, seed) if plan.prior == "learned" else None
-    with equipped(nominal, cell, record, expected) as (plant, _):
+    with equipped(nominal, cell, record, expected) as (plant, sessions):
         watch(plant)
         plant.commission()
+        sessions.enable()
         return Worker(plan, seed, plant).run()
 
 
