@@ -40,16 +40,17 @@ the joint readings have passed a measurement's stamp, so it is taken at the same
 too large for that leaves poses unmeasured."""
 
 SWEEP: Mapping[Fault, tuple[float, ...]] = {
-    "collision": (0.1, 0.2, 0.3, 0.5, 1.0, 2.0),
-    "wrong_tool": (0.1, 0.2, 0.3, 0.5, 0.6, 1.0, 2.0, 10.0),
-    "sensor_knocked": (0.05, 0.1, 0.15, 0.2, 0.4, 1.0),
-    "sphere_knocked": (0.05, 0.1, 0.2, 0.4, 1.0),
-    "beam_dirty": (0.05, 0.1, 0.15, 0.2, 0.4, 0.6),
+    "collision": (0.1, 0.2, 0.3, 0.5, 2.0),
+    "wrong_tool": (0.2, 0.6, 1.0, 2.0, 10.0),
+    "sensor_knocked": (0.05, 0.1, 0.15, 0.2, 1.0),
+    "sphere_knocked": (0.05, 0.1, 0.15, 0.2, 1.0),
+    "beam_dirty": (0.1, 0.15, 0.2, 0.4, 0.6),
     "input_latency": (1.0, 4.0, 6.0, 20.0),
-    "lost_messages": (0.02, 0.05, 0.1, 0.2, 0.5),
-    "clock_jump": (0.004, 0.006, 0.02, 0.1, 1.0, 10.0),
+    "lost_messages": (0.02, 0.05, 0.1, 0.2),
+    "clock_jump": (0.002, 0.004, 0.006, 0.02, 1.0, 10.0),
     "sensor_clock_jump": (0.01, 0.1, 1.0, 10.0),
-    "moved_by_hand": (0.05, 0.1, 0.2, 0.4, 1.0),
+    "frozen_encoder": (1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
+    "moved_by_hand": (0.05, 0.1, 0.15, 0.2, 1.0),
 }
 """Sizes in the faults' own units; a fault that is not here is tried at its usual one."""
 

@@ -1,18 +1,23 @@
 """Robot, PLC and suite on one clock: commissioning, gaps, production."""
 
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bench.closed_loop import setting
-from bench.closed_loop.suite import Clock, Suite
+from bench.closed_loop.suite import Clock, Record, Suite, unrecorded
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.joint_correction.refusals import RefusedError
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.travel import joint_way
+from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.sessions import events
 from robocal_ros.sessions.correction import TrajectoryCommand
 from robocal_ros.sessions.events import Command, Outcome
@@ -24,6 +29,7 @@ from robocal_ros.sim.cell_outputs import Happened
 from robocal_ros.sim.cell_samples import CellSamples, Sample
 from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.production import programme
+from robocal_ros.storage.calibrations import CalibrationHistory
 
 Array = NDArray[np.float64]
 
@@ -146,7 +152,7 @@ class Plant:
     # ---- commissioning --------------------------------------------------------------------------
 
     def commission(self) -> None:
-        """Place the sensor, capture the cold reference, measure the healthy tool, enable.
+        """Place the sensor, capture the cold reference, measure the healthy tool.
 
         Raises
         ------
@@ -157,16 +163,26 @@ class Plant:
         if suite is None:
             return
         self.listen(self.now_s + 1.0)
-        for pose in [*np.tile(CYCLE, (ROUNDS, 1)), HOME]:
-            self._go(suite, pose)
-            self.listen(self.now_s + DWELL_S)
+        self._show_ball(suite, ROUNDS)
         for name in (events.CALIBRATE_SENSOR, events.CAPTURE_REFERENCE):
             self._thermal(suite, Command(name, {"by": "commissioning"}))
         measured = self.measure_tool(suite, REFERENCE, "commissioning")
         if not measured.done:
             raise RobocalError(f"commissioning of the tool: {measured}")
         self.home_from_station(suite)
-        suite.enable()
+
+    def measure_drift(self, suite: Suite, cycle_id: str) -> Outcome:
+        """A thermal cycle from home to home, outside any gap.
+
+        Raises
+        ------
+        RobocalError
+            When it does not end.
+        """
+        told = {"cycle_id": cycle_id}
+        self._thermal(suite, Command(events.BEGIN_CYCLE, told))
+        self._show_ball(suite, 1)
+        return self._thermal(suite, Command(events.END_CYCLE, told))
 
     def measure_tool(self, suite: Suite, mode: str, cycle_id: str) -> Outcome:
         """Let the tool's driver measure, outside any gap; the robot stays where that ends.
@@ -191,13 +207,19 @@ class Plant:
         self.send(suite.maintenance.ways.home(STATION, self._q).plan)
         self.listen(self.cell.motion.end_s + 1.0)
 
-    def _go(self, suite: Suite, pose: Array) -> None:
-        self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))
-        self.listen(self.cell.motion.end_s)
+    def _show_ball(self, suite: Suite, rounds: int) -> None:
+        for pose in [*np.tile(CYCLE, (rounds, 1)), HOME]:
+            self.send(joint_way(suite.maintenance.ways.cell, self._q, pose))
+            self.listen(self.cell.motion.end_s)
+            self.listen(self.now_s + DWELL_S)
 
-    def _thermal(self, suite: Suite, command: Command) -> None:
+    def _thermal(self, suite: Suite, command: Command) -> Outcome:
+        before = suite.last_thermal
         suite.thermal_command(command)
-        self._until(lambda: not suite.thermal.waiting)
+        self._until(lambda: suite.last_thermal is not before)
+        if suite.last_thermal is None:
+            raise RobocalError(f"{command.name}: no answer")
+        return suite.last_thermal
 
     def _until(self, done: Callable[[], bool]) -> None:
         end_s = self.now_s + WITHIN_S
@@ -252,3 +274,23 @@ class Plant:
             self.cell.follow(begin_s + time_s, q, qd, qdd)
         self.commanded = np.asarray(q[AT_WORK])
         return self.commanded
+
+
+@contextmanager
+def equipped(
+    nominal: SerialArm,
+    cell: SimulatedCell,
+    record: Record = unrecorded,
+    expected: LearnedProcess | None = None,
+) -> Iterator[tuple[Plant, Suite]]:
+    """A plant with its suite, before the commissioning; what the suite keeps ends with it."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        CalibrationHistory.open(
+            setting.SERIAL, model_hash=nominal.model_hash, state_dir=Path(folder)
+        ) as history,
+    ):
+        plant = Plant(cell, None)
+        laser = setting.laser_of(cell.plan)
+        plant.suite = Suite(nominal, history, laser, plant.send, record, expected)
+        yield plant, plant.suite

@@ -1,23 +1,28 @@
 """Shifts of the cell, with and without its suite, and what came of them."""
 
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.closed_loop import setting
 from bench.closed_loop.earlier import taught
-from bench.closed_loop.plant import AT_WORK, PASS_S, PROGRAMME, REST_S, GapReport, Plant
-from bench.closed_loop.suite import Record, Suite
+from bench.closed_loop.plant import (
+    AT_WORK,
+    LISTEN_S,
+    PASS_S,
+    PROGRAMME,
+    REST_S,
+    GapReport,
+    Plant,
+    equipped,
+)
+from bench.closed_loop.suite import Record, unrecorded
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.thermal_config import Prior
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_faults import Fault
 from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -129,26 +134,21 @@ def run_shift(
     plan: ShiftPlan,
     seed: int,
     suite: bool = True,
-    record: Record = lambda node, command, outcome: None,
+    record: Record = unrecorded,
     watch: Watch = lambda plant: None,
 ) -> ShiftRecord:
     """A whole shift; ``watch`` is given the plant before its commissioning."""
     nominal = load_robot(ROBOT)
     made = kr150_cell(nominal, seed, points=plan.points)
     cell = SimulatedCell(made)
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        CalibrationHistory.open(
-            setting.SERIAL, model_hash=nominal.model_hash, state_dir=Path(folder)
-        ) as history,
-    ):
-        plant = Plant(cell, None)
-        if suite:
-            laser = setting.laser_of(cell.plan)
-            expected = taught(nominal, made.robot, seed) if plan.prior == "learned" else None
-            plant.suite = Suite(nominal, history, laser, plant.send, record, expected)
+    if not suite:
+        watch(plant := Plant(cell, None))
+        return Worker(plan, seed, plant).run()
+    expected = taught(nominal, made.robot, seed) if plan.prior == "learned" else None
+    with equipped(nominal, cell, record, expected) as (plant, sessions):
         watch(plant)
         plant.commission()
+        sessions.enable()
         return Worker(plan, seed, plant).run()
 
 
@@ -169,6 +169,7 @@ class Worker:
             plant.work(plant.now_s + PASS_S + REST_S)
         plant.begin_s = plant.now_s
         ends_s = [*plan.begins_s[1:], plan.hours * HOUR_S]
+        plant.work(plant.begin_s + min(LISTEN_S, plan.first_s))  # the correction wants readings
         self._produce(0, plan.first_s)
         for number, until_s in enumerate(ends_s, start=1):
             self._happens(self._now_s)

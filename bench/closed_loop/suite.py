@@ -20,10 +20,7 @@ from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions import events
-from robocal_ros.sessions.correction import (
-    CorrectionSession,
-    JointCommand,
-)
+from robocal_ros.sessions.correction import CorrectionSession, JointCommand
 from robocal_ros.sessions.drift_following import EXPECTED
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
@@ -42,8 +39,13 @@ Array = NDArray[np.float64]
 
 NS = 1_000_000_000
 POLL_S = 0.1
+ACCURACY_S = 1.0  # so often the thermal node tells its own
 ENDS_RUN = (events.TOOL_STEP, events.BREAK_OFF)
 Record = Callable[[str, Command, Outcome | None], None]
+
+
+def unrecorded(node: str, command: Command, outcome: Outcome | None) -> None:
+    """Keep nothing of a command."""
 
 
 class Shelf:
@@ -90,7 +92,7 @@ class Suite:
         history: CalibrationHistory,
         laser: LaserFrame,
         send: Callable[[JointPlan], None],
-        record: Record = lambda node, command, outcome: None,
+        record: Record = unrecorded,
         expected: LearnedProcess | None = None,
     ) -> None:
         self._nominal, self._send, self._record = nominal, send, record
@@ -108,11 +110,12 @@ class Suite:
         )
         self.correction: CorrectionSession | None = None
         self.last_tool: Outcome | None = None  # of a run that has ended
+        self.last_thermal: Outcome | None = None
         self._names = nominal.joint_names
         self._clock = Clock(0.0, 0)
         self._ending: dict[str, int] = {}  # request that a thermal command answers
         self._measuring = 0  # request that the open run answers
-        self._polled_s = -np.inf
+        self._polled_s = self._told_s = -np.inf
         self._offered: tuple[int, int] = (-1, -1)
 
     # ---- samples --------------------------------------------------------------------------------
@@ -175,6 +178,7 @@ class Suite:
     def _thermal_goes_on(self) -> None:
         for outcome in self.thermal.advance(wall_ns=self._clock.now_ns):
             self._record("thermal", outcome.command, outcome)
+            self.last_thermal = outcome
             if (number := self._ending.pop(outcome.command.name, 0)) != 0:
                 document = outcome.document or {}
                 missing = tuple(document.get("poses", {}).get("missing", ()))
@@ -253,7 +257,7 @@ class Suite:
         for node, session in (("thermal", self.thermal), ("tool", self.tool)):
             for outcome in session.poll():
                 self._record(node, outcome.command, outcome)
-        if self.maintenance.running is not None:
+        if self.maintenance.running is not None and self._polled_s >= self._told_s + ACCURACY_S:
             self._tell_drift()
         if self.correction is None:
             return
@@ -287,6 +291,7 @@ class Suite:
         return self.maintenance.accuracy(self._clock.now_s, self._clock.now_ns)
 
     def _tell_drift(self) -> None:
+        self._told_s = self._clock.now_s
         found = self.thermal.accuracy(self._clock.now_ns)
         drift = Drift(found.level, found.reason, found.error, found.due_in_s)
         self.maintenance.drift(drift, self._clock.now_s)

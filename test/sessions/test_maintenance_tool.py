@@ -144,12 +144,17 @@ def test_a_bent_tool_expires_as_any_other(cell, rolled_back):
     assert level(cell, 30 * DAY_NS) is AccuracyLevel.EXPIRED
 
 
-def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
+def bent_measured_and_accepted(cell: Cell) -> int:
     cell.check = bent()
     number = measured_in_full(cell)
     cell.finish()
     assert level(cell) is AccuracyLevel.DEGRADED
     decide(cell, ACCEPT, number)
+    return number
+
+
+def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
+    bent_measured_and_accepted(cell)
     assert level(cell) is AccuracyLevel.DUE
     said = cell.session.accuracy(cell.now_s, cell.wall_ns)
     assert "measured and accepted; a check has not passed yet" in said.reason
@@ -165,10 +170,7 @@ def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
 
 
 def test_a_drift_beyond_tolerance_degrades_whatever_is_known_of_the_tool(cell):
-    cell.check = bent()
-    number = measured_in_full(cell)
-    cell.finish()
-    decide(cell, ACCEPT, number)
+    bent_measured_and_accepted(cell)
     assert level(cell) is AccuracyLevel.DUE
     beyond_m = 1.1 * cell.config.tolerance_m
     drift = replace(KNOWN, error=ToolError(0.5 * beyond_m, beyond_m))
@@ -179,10 +181,7 @@ def test_a_drift_beyond_tolerance_degrades_whatever_is_known_of_the_tool(cell):
 
 
 def test_another_tool_than_the_measured_one_stays_degraded(cell):
-    cell.check = bent()
-    number = measured_in_full(cell)
-    cell.finish()
-    decide(cell, ACCEPT, number)
+    number = bent_measured_and_accepted(cell)
     decide(cell, ACCEPT, proposed(cell.history))
     assert level(cell) is AccuracyLevel.DEGRADED
     decide(cell, ROLLBACK, number)
@@ -192,10 +191,7 @@ def test_another_tool_than_the_measured_one_stays_degraded(cell):
 
 
 def test_a_measured_tool_whose_check_finds_it_bent_stays_degraded(cell):
-    cell.check = bent()
-    number = measured_in_full(cell)
-    cell.finish()
-    decide(cell, ACCEPT, number)
+    bent_measured_and_accepted(cell)
     cell.run("c2", TOO_SHORT_FOR_FULL_S)
     assert cell.finish().tool_answer == "recalibrate"
     assert level(cell) is AccuracyLevel.DEGRADED
