@@ -7,7 +7,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import ConflictError, InputError
+from robocal_ros.core.errors import InputError
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
@@ -26,7 +26,7 @@ from robocal_ros.nodes.steady_clock import steady_s
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import Phase, ToolDriver
+from robocal_ros.sessions.tool_driving import ToolDriver
 
 TICK_S = 0.01
 
@@ -88,7 +88,7 @@ class TcfMotion:
         """
         require_limits(session.nominal, self._config)
         self._names = session.nominal.joint_names
-        self.driver = ToolDriver(session, self._config, self._send, self._ask)
+        self.driver = ToolDriver(session, self._config, self._send, self._ask, self._closed)
 
     def deactivate(self) -> None:
         """Stop what moves."""
@@ -140,20 +140,18 @@ class TcfMotion:
             self._tick()
 
     def _closed(self, now_s: float) -> str:
-        """Why nothing may move, where somebody says so."""
-        return "" if self._gap is None else self._gap.closed(now_s)
+        """Why nothing may move, where somebody says so; a pause of this process is looked for."""
+        if self._gap is None:
+            return ""
+        self._gap.look(now_s)
+        return self._gap.closed(now_s)
 
     def _tick(self) -> None:
         now_s = steady_s()
         if self._gap is not None:
             self._gap.look(now_s)
-        if self.driver is None:
-            return
-        if (self.driver.armed or self.driver.phase is not Phase.IDLE) and (
-            why := self._closed(now_s)
-        ):
-            self.driver.disarm(why, now_s)
-        self.driver.tick(now_s)
+        if self.driver is not None:
+            self.driver.tick(now_s)
 
     def _arm(self, request: Any, response: Any) -> Any:
         if self.driver is None:
@@ -163,8 +161,6 @@ class TcfMotion:
             response.success, response.message = True, "disarmed: the node is not active"
             return response
         now_s = steady_s()
-        if request.data and (why := self._closed(now_s)):
-            raise ConflictError(f"{why}: nothing may move")
         if request.data:
             self.driver.arm(now_s)
         else:

@@ -56,6 +56,7 @@ class ToolDriver:
     ----------
     send : publishes a plan.
     ask : gives a command to the session.
+    closed : why nothing may move at a time, empty: it may; asked before anything begins.
 
     Attributes
     ----------
@@ -70,9 +71,10 @@ class ToolDriver:
         config: DrivingConfig,
         send: Callable[[JointPlan], None],
         ask: Callable[[Command], object],
+        closed: Callable[[float], str] = lambda now_s: "",
     ) -> None:
         self._session, self._config = session, config
-        self._send, self._ask = send, ask
+        self._send, self._ask, self._closed = send, ask, closed
         self.phase, self.armed, self.told = Phase.IDLE, False, ""
         self._armed_at_s = 0.0
         self._robot = RobotWatch(session.nominal, config.late_s)
@@ -89,8 +91,10 @@ class ToolDriver:
         Raises
         ------
         ConflictError
-            While joint states are missing, a run is open, or the robot moves.
+            While nothing may move, joint states are missing, a run is open, or the robot moves.
         """
+        if why := self._closed(now_s):
+            raise ConflictError(f"{why}: nothing may move")
         if self._robot.silent_s > self._config.silence_s:
             raise ConflictError("joint states are missing: nothing can be armed without them")
         if self.phase is not Phase.IDLE:
@@ -138,6 +142,9 @@ class ToolDriver:
     def tick(self, now_s: float) -> None:
         """Look at everything; call it often, also when nothing arrives."""
         self._robot.silence.look(now_s)
+        busy = self.armed or self.phase is not Phase.IDLE
+        if busy and (why := self._closed(now_s)):
+            self.disarm(why, now_s)
         try:
             self._tick(now_s)
         except RobocalError as error:

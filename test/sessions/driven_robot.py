@@ -9,6 +9,7 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.events import MEASURE_TOOL, Command
+from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 from robocal_ros.sim.beams import RoundTool
@@ -16,6 +17,7 @@ from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.tool_cell import joints_at
 
 PERIOD_S = 0.008
+STALE_S = 0.5  # of the heartbeat
 LAG_S = 0.02  # of the controller behind its trajectory
 HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.05)
 
@@ -31,7 +33,8 @@ class Robot:
         arm = self.true = self.cell.arm
         self.session = ToolSession(arm, history, config_of(self.cell), "test")
         config = DrivingConfig(HOUSING, 0.1, 0.008, 0.05, **changes)
-        self.driver = ToolDriver(self.session, config, self.send, self.ask)
+        self.gap, self.beating = Gap(STALE_S), True
+        self.driver = ToolDriver(self.session, config, self.send, self.ask, self.closed)
         self.tool = RoundTool.cylinder(tool, 0.0025)
         self.rng = np.random.default_rng(3)
         above = self.cell.pose(TAUGHT, 0.0)
@@ -46,6 +49,10 @@ class Robot:
         self.path: list[np.ndarray] = []
         self.silent = False
         self.offset = np.zeros(arm.n)
+
+    def closed(self, now_s: float) -> str:
+        self.gap.look(now_s)
+        return self.gap.closed(now_s)
 
     def send(self, plan: JointPlan) -> None:
         """The controller gets it with a lag, and goes on from where it is and moves by then."""
@@ -86,6 +93,8 @@ class Robot:
 
     def step(self) -> None:
         self.now_s += PERIOD_S
+        if self.beating:
+            self.gap.heard(True, self.now_s)
         while self.coming and self.coming[0][0] <= self.now_s:
             self.receive(*self.coming.pop(0))
         self.q = self.motion.joints(np.array([self.now_s]))[0]

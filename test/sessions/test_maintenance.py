@@ -341,11 +341,11 @@ def test_what_a_dead_tool_node_left_is_stopped_whoever_confirms(cell, how, hears
     assert kinds(cell).count("Stop") == 1
 
 
-def test_a_confirmation_near_home_does_not_hand_over_what_a_dead_tool_node_left(cell):
+def test_a_confirmation_at_home_does_not_hand_over_what_a_dead_tool_node_left(cell):
+    """The way down begins with a rest of 0.3 s."""
     cell.run("c1", LONG_S)
     while not cell.tool.measuring:
         cell.step()
-    cell.pass_time(0.06)
     cell.tool_dies()
     cell.tool = ToolNode()
     cell.session.cancel("by the PLC")
@@ -355,6 +355,7 @@ def test_a_confirmation_near_home_does_not_hand_over_what_a_dead_tool_node_left(
     cell.session.doubt_gap("two publish gap_open")
     over(cell, fault=True)
     assert kinds(cell)[-1] == "Stop"
+    assert cell.at_home()
 
 
 @pytest.mark.parametrize("silent_s", [0.6, 3.0])

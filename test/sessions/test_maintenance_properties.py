@@ -168,7 +168,7 @@ class Watched:
     def _look_at_motion(self, allowed: bool) -> None:
         """Nothing moves in a closed gap, but for as long as nobody could stop it."""
         cell = self.cell
-        if cell.now_s - max(cell.moved_s, self.killed_s) > STANDS_FOR_S:
+        if cell.now_s - max(cell.motion.end_s, self.killed_s) > STANDS_FOR_S:
             self.left, self.killed_s = False, -np.inf
         deaf = self._tool_is_deaf()
         nobody_could = self.killed_s > 0.0 or (cell.silent and (deaf or self.left))

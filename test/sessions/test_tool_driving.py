@@ -75,6 +75,25 @@ def test_it_disarms_itself_after_a_while(robot):
     assert "no run within 60 s" in robot.driver.told
 
 
+def test_no_step_begins_on_a_heartbeat_from_before_a_pause(robot):
+    """Readings that waited all through it are taken before anything else."""
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.run(1.0, until=lambda: robot.driver.phase is Phase.APPROACH)
+    robot.run(0.1)
+    robot.beating = False
+    robot.now_s += robot.sent[-1][1].duration_s + 1.0  # the way to the step is over meanwhile
+    robot.run(0.5)
+    assert len(robot.sent) == 2
+    stopped(robot, "gap_open is silent", follows=False)
+
+
+def test_a_closed_gap_is_not_armed_in(robot):
+    robot.gap.heard(False, robot.now_s)
+    with pytest.raises(ConflictError, match="gap_open is false: nothing may move"):
+        robot.driver.arm(robot.now_s)
+
+
 def stopped(robot, words, *, follows=True):
     """The robot was sent a stop, stands still within its time, and the run has ended."""
     at_s, plan = robot.sent[-1]

@@ -9,7 +9,8 @@ confirmed disarm, so that no motion that was asked for here can be under way, no
 dead node's trajectory either; and the robot rests at home (`Hands` looks).
 
 A node that was started anew confirms too, but knows nothing of that trajectory. So a confirmation
-tells what will be sent, and only a robot that rests after it that nothing is under way any more.
+tells what will be sent; what was sent before it is over where the measurement has been answered, or
+was stopped from here, and the robot rests.
 """
 
 import numpy as np
@@ -26,15 +27,14 @@ class Disarming:
     Attributes
     ----------
     engaged : it may be armed.
-    armed : this node armed it, and since then the robot has not rested with a disarm confirmed.
-    confirmed_s : when a disarm was confirmed last.
+    armed : this node armed it, and what it was to move may still be under way.
     """
 
     def __init__(self) -> None:
         self.engaged = self.armed = False
         self._asked: set[int] = set()
         self._newest, self._heard = 0, False
-        self._asked_s = self.confirmed_s = -np.inf
+        self._asked_s = -np.inf
         self._absent_from_s = np.inf
 
     def doubt(self) -> None:
@@ -56,7 +56,7 @@ class Disarming:
         self._asked.discard(number)
         self._heard |= number == self._newest
         if answer.done:
-            self.engaged, self.confirmed_s = False, now_s
+            self.engaged = False
         self._absent_from_s = min(self._absent_from_s, now_s) if answer.absent else np.inf
 
     def again(self, now_s: float) -> bool:

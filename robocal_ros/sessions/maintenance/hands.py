@@ -60,7 +60,9 @@ class Hands:
         self.tool = Disarming()
         self.measured: list[float] = []
         self.doing = ""
-        self._stop_s = np.inf  # from when on the robot is stopped in the driver's place
+        self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
+        self._told_s = -np.inf  # newest reading at the last confirmation, or stop in its place
+        self._measuring = 0  # number of the measurement that the driver has not answered
         self._numbers = 0
         self._waiting: dict[int, Answer | None] = {}
 
@@ -92,7 +94,9 @@ class Hands:
         doubted = self.tool.engaged
         self.tool.answered(number, answer, self.now_s)
         if doubted and not self.tool.engaged:
-            self._stop_s = self.now_s + self.robot.stops_within_s
+            self._told_s = self.robot.newest_s
+        if number == self._measuring:
+            self._measuring = 0
         if number in self._waiting:
             self._waiting[number] = answer
 
@@ -137,7 +141,7 @@ class Hands:
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
         self.doubt()
-        self.tool.armed, self._stop_s = True, np.inf
+        self.tool.armed, self._deaf_s = True, np.inf
         self.robot.place = STATION
         answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm)
         self.tool.armed = not answer.absent
@@ -149,15 +153,23 @@ class Hands:
         self._ask_disarm()
 
     def look_after_tool(self) -> None:
-        """Stop what its driver does not; do not wait for one that is gone, see `disarming`."""
-        tool, rests = self.tool, self.robot.resting(STANDS_S) is not None
-        if tool.armed and not tool.engaged:
-            tool.armed = not rests or self.now_s < tool.confirmed_s + STANDS_S
-        # One that is deaf may yet send something, so that a robot that stands is held.
-        moves = tool.engaged or self.robot.resting(SETTLED_S) is None
-        if tool.armed and moves and self.now_s >= self._stop_s:
-            self._stop_measured()
-        if tool.gone(self.now_s) and not self.robot.beside_home():
+        """Stop what its driver does not; do not wait for one that is gone, see `disarming`.
+
+        Who has not answered its measurement may be another one: a robot that stands may then be at
+        a corner of what was sent before, where plans rest for a while, and is held.
+        """
+        tool, robot = self.tool, self.robot
+        rests = robot.resting(STANDS_S) is not None
+        since_s = robot.newest_s - self._told_s  # readings that are late do not count against it
+        if tool.armed and tool.engaged:
+            if self.now_s >= self._deaf_s:
+                self._stop_measured()
+        elif tool.armed:
+            tool.armed = not rests or since_s < STANDS_S or self._measuring > 0
+            moves = robot.resting(SETTLED_S) is None or self._measuring > 0
+            if moves and since_s >= robot.stops_within_s:
+                self._stop_measured()
+        if tool.gone(self.now_s) and not robot.beside_home():
             tool.engaged &= not rests
 
     def keep_disarming(self) -> None:
@@ -192,7 +204,7 @@ class Hands:
         SilentError
             When it did not end in time, and not after it was broken off either.
         """
-        number = self.expect(Measure, mode, cycle_id)
+        number = self._measuring = self.expect(Measure, mode, cycle_id)
         until_s = self.now_s + limit_s
         while self._waiting[number] is None and self.now_s < until_s:
             yield
@@ -247,11 +259,11 @@ class Hands:
         elif self.tool.armed and at_once:
             self._stop_measured()
         elif self.tool.engaged and self.tool.armed:
-            self._stop_s = self.now_s + DEAF_S
+            self._deaf_s = self.now_s + DEAF_S
 
     def _stop_measured(self) -> None:
         if (plan := self.robot.stop_measured(self.now_s)) is not None:
-            self._stop_s = np.inf
+            self._deaf_s, self._told_s, self._measuring = np.inf, self.robot.newest_s, 0
             self.request(Stop, plan)
 
     def go_home(self) -> Script[None]:

@@ -126,5 +126,8 @@ class ThermalPart:
         return STANDS_S + self._step_s(route.plan.duration_s, ways.home_s(pose))
 
     def _step_s(self, way_s: float, home_s: float) -> float:
-        """Way, rest, measurement, way home, rest: at the most."""
+        """At the most: a rest at each arrival, before the measurement and after it.
+
+        What stands before a pose that does not fit need not stand again before its way home.
+        """
         return way_s + home_s + 4.0 * self._times.rest_s + self._times.measure_s
