@@ -79,12 +79,17 @@ def _text(cell: Cell | Goal) -> str:
 def _plain(cell: Cell | Goal) -> Any:
     if isinstance(cell, Goal):
         return {
-            "value": cell.value,
+            "value": _finite(cell.value),
             "limit": cell.limit,
             "at_least": cell.at_least,
             "met": cell.met,
         }
-    return cell.item() if isinstance(cell, np.generic) else cell
+    return _finite(cell.item() if isinstance(cell, np.generic) else cell)
+
+
+def _finite(value: Cell) -> Cell:
+    """JSON knows no other numbers."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def show(tables: Sequence[Table]) -> None:

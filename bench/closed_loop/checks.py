@@ -22,7 +22,6 @@ from robocal_ros.sessions.tool_results import QUICK, REFERENCE
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_faults import SIZES, Fault
 from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.sim.motion import JITTER_RAD
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
@@ -54,7 +53,7 @@ class Checked:
 def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterator[Checked]:
     """Every fault that a check can see, at all of its sizes, in the cell of a seed."""
     nominal = load_robot(ROBOT)
-    cell = SimulatedCell(kr150_cell(nominal, seed, points=0, reading_noise_rad=JITTER_RAD))
+    cell = SimulatedCell(kr150_cell(nominal, seed, points=0))
     with (
         tempfile.TemporaryDirectory() as folder,
         CalibrationHistory.open(

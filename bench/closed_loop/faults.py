@@ -81,7 +81,6 @@ class Report:
     who, code : who reported it first, and how; empty and NONE where nobody did.
     gaps : after the fault until somebody gave the right code; one more than there were where
         nobody did.
-    stopped : passes that the correction refused: the robot stood.
     over_s : the longest overrun of a gap.
     """
 
@@ -90,7 +89,6 @@ class Report:
     code: Code
     gaps: float
     harm: Harm
-    stopped: int
     over_s: float
 
     @property
@@ -108,9 +106,8 @@ def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Re
                 who, code = name, found
             if found is RIGHT.get(trial.fault):
                 gaps = min(gaps, float(number))
-    stopped = sum(one.error is None for one in with_suite.passes)
     over_s = max(gap.over_s for gap in with_suite.gaps)
-    return Report(trial, who, code, gaps, harm(with_suite, without), stopped, over_s)
+    return Report(trial, who, code, gaps, harm(with_suite, without), over_s)
 
 
 def _told(gap: GapReport) -> list[tuple[str, Code]]:

@@ -1,12 +1,13 @@
 """How accurate the cell was, by the truth, against the same shift without its suite."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.closed_loop.shift import HOUR_S, ShiftRecord
+from bench.closed_loop.plant import PASS_S, REST_S
+from bench.closed_loop.shift import HOUR_S, ShiftPlan, ShiftRecord
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.core.thermal.drift_history import THRESHOLD_M
 
@@ -27,9 +28,8 @@ class Figures:
         if not error.size:
             return cls(np.nan, np.nan, np.nan)
         length = np.linalg.norm(error, axis=-1)
-        rms = float(np.sqrt(np.mean(length**2)))
         share = float(np.mean(np.abs(error) <= THRESHOLD_M))
-        return cls(rms, float(np.quantile(length, 0.95)), share)
+        return cls(_rms(length), float(np.quantile(length, 0.95)), share)
 
 
 def per_hour(record: ShiftRecord) -> list[Figures]:
@@ -80,15 +80,6 @@ def stated(records: Sequence[ShiftRecord], until_s: float = np.inf) -> Stated:
     )
 
 
-def cycle_rms(record: ShiftRecord) -> dict[int, float]:
-    """Rms error, m, of the production after each gap, where there was any."""
-    found: dict[int, list[Array]] = {}
-    for one in record.passes:
-        if one.error is not None:
-            found.setdefault(one.cycle, []).append(one.error)
-    return {cycle: Figures.of(np.array(errors)).rms_m for cycle, errors in found.items()}
-
-
 @dataclass(frozen=True)
 class Harm:
     """How much worse the suite made it, m; negative where it did good.
@@ -97,40 +88,74 @@ class Harm:
     ----------
     rms_m : over all working poses and passes; ``p99_m`` : their 99 % quantile.
     cycle_m : rms of the worst cycle.
+    refused : passes that only the shift without the suite produced. They are in no other figure;
+        where they are all, these are not a number.
     """
 
     rms_m: float
     p99_m: float
     cycle_m: float
+    refused: int
 
 
 def harm(with_suite: ShiftRecord, without: ShiftRecord) -> Harm:
     """Compare two shifts of one seed, pass by pass where both produced."""
-    pairs = [
-        (a.error, b.error)
+    both = [
+        (a.cycle, a.error, b.error)
         for a, b in zip(with_suite.passes, without.passes, strict=True)
-        if a.error is not None and b.error is not None
+        if b.error is not None
     ]
-    if not pairs:
-        return Harm(0.0, 0.0, 0.0)
-    on, off = (np.linalg.norm(np.array(part), axis=-1) for part in zip(*pairs, strict=True))
-    cycles, others = cycle_rms(with_suite), cycle_rms(without)
+    made = [(cycle, on, off) for cycle, on, off in both if on is not None]
+    refused = len(both) - len(made)
+    if not made:
+        return Harm(np.nan, np.nan, np.nan, refused)
+    cycle = np.array([number for number, _, _ in made])
+    on, off = (np.linalg.norm([one[i] for one in made], axis=-1) for i in (1, 2))
     return Harm(
-        float(np.sqrt(np.mean(on**2)) - np.sqrt(np.mean(off**2))),
+        _rms(on) - _rms(off),
         float(np.quantile(on, 0.99) - np.quantile(off, 0.99)),
-        max(rms_m - others[cycle] for cycle, rms_m in cycles.items()),
+        max(_rms(on[cycle == c]) - _rms(off[cycle == c]) for c in np.unique(cycle)),
+        refused,
     )
 
 
-def gaps_to_recover(record: ShiftRecord, after_s: float, tolerance_m: float) -> int:
-    """Gaps from a time until 95 % of the errors of a pass are within tolerance again.
+def _rms(length: Array) -> float:
+    return float(np.sqrt(np.mean(length**2)))
 
-    All gaps of the shift where they never are.
+
+def gaps_to_recover(record: ShiftRecord, after_s: float, tolerance_m: float) -> int:
+    """Gaps from an incident until each pass is within tolerance again, up to the next incident.
+
+    A pass is where 95 % of its errors are; one that was refused is not. All gaps of the shift
+    where the last pass is not.
     """
-    before = int(after_s // record.plan.every_s)  # gaps that had begun by then, the first at 0
-    for one in record.passes:
-        if one.error is None or one.time_s <= after_s:
-            continue
-        if Figures.of(one.error).p95_m <= tolerance_m:
-            return one.cycle - before
-    return record.plan.cycles
+    plan = record.plan
+    until_s = min((i.at_s for i in plan.incidents if i.at_s > after_s), default=np.inf)
+    passes = [one for one in record.passes if after_s < one.time_s <= until_s]
+    bad = [one.error is None or Figures.of(one.error).p95_m > tolerance_m for one in passes]
+    first_good = max((i + 1 for i, is_bad in enumerate(bad) if is_bad), default=0)
+    if first_good == len(passes):
+        return plan.cycles
+    return passes[first_good].cycle - sum(begin_s < after_s for begin_s in plan.begins_s)
+
+
+def refused(record: ShiftRecord, hours: Collection[int]) -> int:
+    """Passes that were refused in these hours of the shift, the first is 0."""
+    return sum(one.error is None and one.time_s // HOUR_S in hours for one in record.passes)
+
+
+def incident_hours(plan: ShiftPlan) -> dict[int, str]:
+    """What goes wrong in which hour of a shift, the first is 0."""
+    return {int(one.at_s // HOUR_S): one.fault for one in plan.incidents}
+
+
+def within_at_worst(record: ShiftRecord, at_s: float) -> float:
+    """Share of directions below 0.1 mm in an incident's hour, had it come right after a gap.
+
+    All passes between the two gaps are then as the last of them really was.
+    """
+    hour = [one for one in record.passes if one.time_s // HOUR_S == at_s // HOUR_S]
+    hit = max(one.cycle for one in hour if one.time_s - PASS_S - REST_S <= at_s)
+    last = [one.error for one in hour if one.cycle == hit][-1]
+    errors = [last if one.cycle == hit else one.error for one in hour]
+    return Figures.of(np.array([error for error in errors if error is not None])).within

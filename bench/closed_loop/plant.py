@@ -231,14 +231,13 @@ class Plant:
         said = maintenance.status(self.now_s)
         return GapReport(result, said.fault_code, said.fault, max(over_s, 0.0))
 
-    def produce(self) -> Array | None:
-        """One pass of the programme, corrected where there is a suite.
+    def begin_pass(self) -> Array | None:
+        """Begin a pass of the programme, corrected where there is a suite; `PASS_S` long.
 
         Joints (k, n) at the working poses; None where the correction refuses: the robot stands.
         """
         time_s, q, qd, qdd = PROGRAMME
         begin_s = self.now_s
-        end_s = begin_s + PASS_S + REST_S
         if self.suite is not None and self.suite.correction is not None:
             names = self.cell.plan.arm.joint_names
             taught = TrajectoryCommand(names, q, time_s, qd, qdd)
@@ -246,12 +245,10 @@ class Plant:
                 sent = self.suite.correction.trajectory(taught, begin_s)
             except RefusedError as error:
                 self.refused.append((begin_s, str(error)))
-                self.work(end_s)
                 return None
             self.cell.follow(begin_s + time_s, sent.position, sent.velocity, sent.acceleration)
             q = sent.position
         else:
             self.cell.follow(begin_s + time_s, q, qd, qdd)
         self.commanded = np.asarray(q[AT_WORK])
-        self.work(end_s)
         return self.commanded

@@ -2,7 +2,7 @@
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bench.closed_loop import setting
 from bench.closed_loop.earlier import taught
-from bench.closed_loop.plant import PASS_S, REST_S, GapReport, Plant
+from bench.closed_loop.plant import AT_WORK, PASS_S, PROGRAMME, REST_S, GapReport, Plant
 from bench.closed_loop.suite import Record, Suite
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.thermal_config import Prior
@@ -42,9 +42,9 @@ class ShiftPlan:
     Attributes
     ----------
     work_s : production without gaps before the shift, after the commissioning of the cold robot.
-    every_s, gap_s : a gap of this length begins each so often.
+    first_s, every_s, gap_s : a gap of this length begins then, and each so often.
     pauses : from and to, in which nothing is produced.
-    incidents : in their order.
+    incidents : in their order; one within a gap happens at its end.
     begins_h : o'clock.
     prior : what drift to expect: the default, or as earlier shifts of this robot have taught.
     points : of a sphere's cloud; 0: centres alone.
@@ -52,6 +52,7 @@ class ShiftPlan:
 
     hours: float
     work_s: float = 0.0
+    first_s: float = 0.0
     every_s: float = 300.0
     gap_s: float = 90.0
     pauses: tuple[tuple[float, float], ...] = ()
@@ -64,6 +65,11 @@ class ShiftPlan:
     def cycles(self) -> int:
         """Number of gaps."""
         return round(self.hours * HOUR_S / self.every_s)
+
+    @property
+    def begins_s(self) -> list[float]:
+        """When the gaps begin."""
+        return [self.first_s + i * self.every_s for i in range(self.cycles)]
 
 
 def at(hour: int, minute: int = 0, begins_h: float = 8.0) -> float:
@@ -80,6 +86,7 @@ GOLDEN = ShiftPlan(
         Incident(at(13, 15), "sensor_knocked", 1.0),
     ),
 )
+MIDWORK = replace(GOLDEN, first_s=90.0)  # so both incidents fall halfway between two gaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +95,7 @@ class Judged:
 
     Attributes
     ----------
-    time_s : since the shift's begin; ``cycle`` : the gap before it, from 1.
+    time_s : of its end, since the shift's begin; ``cycle`` : the gap before it, from 1; 0: none.
     error : (k, 3) of the tip at the working poses, base, m; None where it was not produced.
     accuracy : what the line read then; None without a suite.
     """
@@ -158,23 +165,42 @@ class Worker:
         plan, plant = self._plan, self._plant
         worked_s = plant.now_s + plan.work_s
         while plant.now_s + PASS_S + REST_S < worked_s:
-            plant.produce()
+            plant.begin_pass()
+            plant.work(plant.now_s + PASS_S + REST_S)
         plant.begin_s = plant.now_s
-        for number in range(1, plan.cycles + 1):
-            self._happens()
+        ends_s = [*plan.begins_s[1:], plan.hours * HOUR_S]
+        self._produce(0, plan.first_s)
+        for number, until_s in enumerate(ends_s, start=1):
+            self._happens(self._now_s)
             self._record.gaps.append(plant.gap(f"cycle-{number}", plan.gap_s))
-            self._produce(number, plant.begin_s + number * plan.every_s)
+            self._produce(number, until_s)
         return self._record
 
     def _produce(self, cycle: int, until_s: float) -> None:
         plant = self._plant
-        while plant.now_s + PASS_S + REST_S < until_s and not self._pauses():
-            self._happens()
-            made = plant.produce()
-            error = None if made is None else plant.cell.tcp_error(made)
+        while self._now_s + PASS_S + REST_S < until_s and not self._pauses():
+            error = self._pass()
             accuracy = None if plant.suite is None else plant.suite.accuracy()
             self._record.passes.append(Judged(self._now_s, cycle, error, accuracy))
-        plant.work(until_s)
+        plant.work(plant.begin_s + until_s)
+
+    def _pass(self) -> Array | None:
+        """Errors (k, 3) of a pass, each as things were when the robot arrived at its pose."""
+        plant, begin_s = self._plant, self._now_s
+        self._happens(begin_s)
+        made = plant.begin_pass()
+        end_s = begin_s + PASS_S + REST_S
+        arrives_s = begin_s + PROGRAMME[0][AT_WORK]
+        error = np.zeros((len(arrives_s), 3))
+        since_s = begin_s
+        for until_s in [*(i.at_s for i in self._waiting if i.at_s < end_s), end_s]:
+            plant.work(plant.begin_s + until_s)
+            if made is not None:
+                there = (since_s <= arrives_s) & (arrives_s < until_s)
+                error[there] = plant.cell.tcp_error(made)[there]
+            since_s = until_s
+            self._happens(until_s)
+        return None if made is None else error
 
     @property
     def _now_s(self) -> float:
@@ -183,7 +209,7 @@ class Worker:
     def _pauses(self) -> bool:
         return any(start <= self._now_s < end for start, end in self._plan.pauses)
 
-    def _happens(self) -> None:
-        while self._waiting and self._now_s >= self._waiting[0].at_s:
+    def _happens(self, now_s: float) -> None:
+        while self._waiting and now_s >= self._waiting[0].at_s:
             incident = self._waiting.pop(0)
             self._plant.cell.set_fault(incident.fault, incident.size)

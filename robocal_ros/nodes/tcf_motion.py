@@ -1,6 +1,5 @@
 """Motion of the tool node: it moves the robot, once armed (docs/tool_motion.md)."""
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,6 +22,7 @@ from robocal_ros.nodes.motion_settings import (
     trajectory_message,
 )
 from robocal_ros.nodes.parameters import Setting, length
+from robocal_ros.nodes.steady_clock import steady_s
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
@@ -93,7 +93,7 @@ class TcfMotion:
     def deactivate(self) -> None:
         """Stop what moves."""
         if self.driver is not None:
-            self.driver.disarm("the node was deactivated", time.monotonic())
+            self.driver.disarm("the node was deactivated", steady_s())
         self.driver = None
 
     def take(self, message: Any) -> None:
@@ -105,7 +105,7 @@ class TcfMotion:
             q = sample.position[sample.order(self._names)]
         except InputError:  # the session counts it; without readings the robot stops
             return
-        self.driver.reading(sample.stamp_ns / NS, q, time.monotonic())
+        self.driver.reading(sample.stamp_ns / NS, q, steady_s())
 
     def beam(self, message: Any) -> None:
         """Take a BeamEvent, usable or not: on its way the tool breaks no beam."""
@@ -131,12 +131,12 @@ class TcfMotion:
     def run_ended(self, outcome: Outcome) -> None:
         """A run without a result stops the robot."""
         if self.driver is not None and outcome.document is None:
-            self.driver.run_failed(outcome.message, time.monotonic())
+            self.driver.run_failed(outcome.message, steady_s())
 
     def _take_gap(self, message: Any) -> None:
         if self._gap is not None:
             self._gap.doubt(self._sources.doubt())
-            self._gap.heard(message.data, time.monotonic())
+            self._gap.heard(message.data, steady_s())
             self._tick()
 
     def _closed(self, now_s: float) -> str:
@@ -144,7 +144,7 @@ class TcfMotion:
         return "" if self._gap is None else self._gap.closed(now_s)
 
     def _tick(self) -> None:
-        now_s = time.monotonic()
+        now_s = steady_s()
         if self._gap is not None:
             self._gap.look(now_s)
         if self.driver is None:
@@ -162,7 +162,7 @@ class TcfMotion:
             # deactivation disarmed; who must know that nothing moves gets a plain answer
             response.success, response.message = True, "disarmed: the node is not active"
             return response
-        now_s = time.monotonic()
+        now_s = steady_s()
         if request.data and (why := self._closed(now_s)):
             raise ConflictError(f"{why}: nothing may move")
         if request.data:

@@ -1,0 +1,175 @@
+"""The closed loop's judging can fail: on a suite that refuses, falls back, or is let off."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench.closed_loop import tables
+from bench.closed_loop.judging import (
+    gaps_to_recover,
+    harm,
+    per_hour,
+    refused,
+    within_at_worst,
+)
+from bench.closed_loop.plant import PASS_S, REST_S
+from bench.closed_loop.shift import (
+    GOLDEN,
+    HOUR_S,
+    MIDWORK,
+    Incident,
+    Judged,
+    ShiftRecord,
+)
+
+TOLERANCE_M = 3e-4
+GOOD, BENT = 5e-5, 2e-3
+POSES = 27
+STRUCK_S = 1500.0
+PLAN = replace(MIDWORK, hours=1.0, incidents=(Incident(STRUCK_S, "collision", 2.0),))
+
+
+def shift(size_m, plan=PLAN):
+    """Passes after each gap; ``size_m`` of a pass's end and cycle: its error, None: refused."""
+    record = ShiftRecord(plan, seed=1)
+    for cycle, begin_s in enumerate(plan.begins_s, start=1):
+        for number in range(1, 4):
+            time_s = begin_s + plan.gap_s + number * (PASS_S + REST_S)
+            if time_s > plan.hours * HOUR_S:
+                break
+            size = size_m(time_s, cycle)
+            error = None if size is None else np.tile([0.0, 0.0, size], (POSES, 1))
+            record.passes.append(Judged(time_s, cycle, error, None))
+    return record
+
+
+def begin_of(cycle):
+    return PLAN.begins_s[cycle - 1]
+
+
+def always(size_m):
+    return shift(lambda time_s, cycle: size_m)
+
+
+def until_gap(cycle_of_recovery, size_m=BENT):
+    """Struck, and right again after a gap."""
+    return shift(lambda t, cycle: size_m if t > STRUCK_S and cycle < cycle_of_recovery else GOOD)
+
+
+# ---- harm ----------------------------------------------------------------------------------------
+
+
+def test_harm_is_the_difference_to_the_shift_without_the_suite():
+    found = harm(always(9e-5), always(5e-5))
+    assert (found.rms_m, found.p99_m, found.cycle_m) == pytest.approx((4e-5, 4e-5, 4e-5))
+    assert found.refused == 0
+
+
+def test_the_worst_cycle_is_not_averaged_away():
+    one_bad = shift(lambda t, cycle: 3e-4 if cycle == 4 else GOOD)
+    found = harm(one_bad, always(GOOD))
+    assert found.cycle_m == pytest.approx(2.5e-4)
+    assert found.rms_m < found.cycle_m / 4.0
+
+
+def test_refused_passes_are_counted():
+    half = shift(lambda t, cycle: None if cycle % 2 else GOOD)
+    found = harm(half, always(GOOD))
+    assert found.refused == sum(one.cycle % 2 for one in half.passes)
+    assert found.rms_m == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_suite_that_refuses_everything_misses_the_goals_of_a_clean_shift():
+    nothing = always(None)
+    assert harm(nothing, always(GOOD)).refused == len(nothing.passes)
+    table = tables.harm_table({"default": [(nothing, always(GOOD))]})
+    assert not table.met
+    json.dumps(table.document(), allow_nan=False)
+
+
+@pytest.mark.parametrize(
+    ("with_suite", "met"),
+    [
+        (always(GOOD + 2e-5), True),
+        (always(GOOD + 4e-5), False),
+        (shift(lambda t, cycle: None if begin_of(4) < t < begin_of(4) + 200.0 else GOOD), False),
+        (shift(lambda t, cycle: GOOD + 1e-4 if cycle == 1 else GOOD - 1e-5), False),
+    ],
+    ids=["within", "rms", "one refused", "99 %"],
+)
+def test_the_goals_of_a_clean_shift(with_suite, met):
+    assert tables.harm_table({"default": [(with_suite, always(GOOD))]}).met is met
+
+
+# ---- recovery ------------------------------------------------------------------------------------
+
+
+def test_the_plan_is_struck_between_two_gaps():
+    assert GOLDEN.begins_s[32] == MIDWORK.incidents[0].at_s  # the bag's falls on a gap's begin
+    for incident in (*MIDWORK.incidents, *PLAN.incidents):
+        plan = MIDWORK if incident in MIDWORK.incidents else PLAN
+        since = [incident.at_s - begin_s for begin_s in plan.begins_s]
+        assert min(one for one in since if one >= 0.0) > plan.gap_s
+
+
+def test_right_after_the_next_gap_is_one_gap():
+    assert gaps_to_recover(until_gap(6), STRUCK_S, TOLERANCE_M) == 1
+    assert gaps_to_recover(until_gap(7), STRUCK_S, TOLERANCE_M) == 2
+
+
+def test_what_is_not_hurt_needs_no_gap():
+    assert gaps_to_recover(always(GOOD), STRUCK_S, TOLERANCE_M) == 0
+
+
+def test_a_good_pass_between_bad_ones_is_no_recovery():
+    relapsed = shift(lambda t, cycle: BENT if t > STRUCK_S and cycle != 6 and cycle < 9 else GOOD)
+    assert gaps_to_recover(relapsed, STRUCK_S, TOLERANCE_M) == 4
+
+
+@pytest.mark.parametrize("size_m", [BENT, None])
+def test_never_right_again_are_all_gaps(size_m):
+    assert gaps_to_recover(until_gap(99, size_m), STRUCK_S, TOLERANCE_M) == PLAN.cycles
+
+
+def test_a_refused_pass_is_no_recovery():
+    refusing = shift(
+        lambda t, cycle: None if cycle == 8 else BENT if STRUCK_S < t < 1800.0 else GOOD
+    )
+    assert gaps_to_recover(refusing, STRUCK_S, TOLERANCE_M) == 4
+
+
+def test_the_next_incident_is_not_the_first_ones():
+    plan = replace(PLAN, incidents=(*PLAN.incidents, Incident(3000.0, "sensor_knocked", 1.0)))
+    record = shift(lambda t, cycle: BENT if STRUCK_S < t < 1700.0 or t > 3000.0 else GOOD, plan)
+    assert gaps_to_recover(record, STRUCK_S, TOLERANCE_M) == 1
+
+
+# ---- share below 0.1 mm --------------------------------------------------------------------------
+
+
+def test_what_is_produced_from_an_incident_to_the_next_gap_counts():
+    record = until_gap(6)
+    bad = sum(STRUCK_S < one.time_s < begin_of(6) for one in record.passes)
+    assert bad == 2
+    within = 1.0 - bad / len(record.passes) / 3  # one direction in three is off
+    assert per_hour(record)[0].within == pytest.approx(within)
+
+
+def test_at_worst_all_passes_between_two_gaps_are_bad():
+    record = until_gap(6)
+    within = 1.0 - 3 / len(record.passes) / 3
+    assert within_at_worst(record, STRUCK_S) == pytest.approx(within)
+
+
+def test_refused_passes_are_told_by_hour():
+    two_hours = replace(PLAN, hours=2.0)
+    record = shift(lambda t, cycle: None if cycle in (14, 15) else GOOD, two_hours)
+    assert (refused(record, {0}), refused(record, {1}), refused(record, {0, 1})) == (0, 6, 6)
+
+
+def test_an_hour_in_which_all_is_refused_misses_its_goal():
+    plan = replace(PLAN, hours=2.0)
+    nothing = shift(lambda t, cycle: None if t > HOUR_S else GOOD, plan)
+    assert not tables.hours_table([(nothing, shift(lambda t, cycle: GOOD, plan))]).met
