@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,7 @@ def test_the_shift_goes_as_it_should(demo):
     for moment in story["moments"]:
         assert f"{moment['with_mm']:.3f}" in printed
     assert "simulated" in printed
+    assert re.search(r"^\d+ s \(goal 180 s\), six nodes", printed, re.MULTILINE)
 
 
 def test_the_gaps_are_kept_and_used(demo):
