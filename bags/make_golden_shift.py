@@ -44,7 +44,7 @@ from robocal_ros.core.samples import (  # noqa: E402
 from robocal_ros.core.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noqa: E402
 from robocal_ros.sessions import records, tool_recorded  # noqa: E402
 from robocal_ros.sessions.edge_log import EDGES  # noqa: E402
-from robocal_ros.sessions.events import Command, Outcome  # noqa: E402
+from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
 from robocal_ros.sessions.observations import JOINTS  # noqa: E402
 from robocal_ros.sessions.temperatures import TEMPERATURES  # noqa: E402
 from robocal_ros.sim.cell_outputs import Happened  # noqa: E402
@@ -116,6 +116,8 @@ class Recorder:
         now_ns = self.plant.clock.now_ns
         if command.stamp_ns is None:  # the maintenance has no clock
             command = replace(command, stamp_ns=now_ns)
+        if command.name == MEASURE_TOOL:  # a run goes by the thermal model of its begin
+            self._show_in_force()
         self._logs[node].write(command, outcome, now_ns)
         self._show_in_force()
 

@@ -93,7 +93,7 @@ def power_table(found: Sequence[Checked]) -> Table:
         for one in own:
             by_size.setdefault(one.trial.size, []).append(one)
         words = ", ".join(
-            f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}"
+            f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}".lstrip(": ")
             for cells in by_size.values()
         )
         smallest = smallest_with_power((one.trial.size, one.right) for one in own)

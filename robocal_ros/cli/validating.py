@@ -201,11 +201,22 @@ class _Session:
             "as_recorded": recorded,
             "differs": replayed["differs"] if recorded else [],
             "settings": settings,
-            "decisions": decisions(replayed, ROUTINE, asked=recorded),
+            "decisions": decisions(self._as_told(replayed["commands"]), ROUTINE, asked=recorded),
             "ignored": replayed["ignored_reasons"],
             "gaps": replayed["gaps"],
             "warnings": [*self._warnings, *replayed["warnings"]],
         }
+
+    def _as_told(self, commands: list[Document]) -> list[Document]:
+        """Each as it was recorded, with its own numbers of runs and calibrations.
+
+        What comes out otherwise here is in ``differs``.
+        """
+        recorded = self._recording.commands
+        if not recorded:
+            return commands
+        told = [as_recorded(*event) if event[1] else {} for event in recorded]
+        return [here | there for here, there in zip(commands, told, strict=True)]
 
 
 class _ReplayError(RobocalError):

@@ -11,6 +11,7 @@ from robocal_ros.cli.bag_truth import told_states
 from robocal_ros.cli.output import Document
 from robocal_ros.report.validation_cell import CellCourse
 from robocal_ros.sessions.replay import topic_kind
+from robocal_ros.sim.cell_faults import SIZES
 from robocal_ros.storage.bags import BagReader
 
 Array = NDArray[np.float64]
@@ -23,6 +24,9 @@ KEYS = {  # of a state, by what it is called here, the first that is told; lengt
     "p95_mm": ("commanded_tcp_error_p95_m",),
     "lambda_without": ("visited_within_share", "within_share"),
     "lambda_with": ("commanded_within_share",),
+}
+UNITS: dict[str, tuple[float, str]] = {
+    fault: (factor, unit) for fault, (_, factor, unit) in SIZES.items()
 }
 
 
@@ -74,9 +78,17 @@ def _faults(hours: Array, truths: Sequence[Mapping[str, Any]]) -> list[Document]
         now: Mapping[str, float] = truth.get("faults", {})
         for name in sorted({*now, *before}):
             if now.get(name) != before.get(name):
-                found.append({"hours": hour, "fault": name, "size": float(now.get(name, 0.0))})
+                size = float(now.get(name, 0.0))
+                told = {"hours": hour, "fault": name, "size": size, "told": _told(name, size)}
+                found.append(told)
         before = now
     return found
+
+
+def _told(fault: str, size: float) -> str:
+    """A size in the fault's own unit; empty where it ended."""
+    factor, unit = UNITS.get(fault, (1.0, ""))
+    return f"{size / factor:.4g} {unit}".strip() if size else ""
 
 
 def _line(reader: BagReader, start_ns: int) -> _Line:

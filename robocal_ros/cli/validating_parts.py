@@ -76,14 +76,16 @@ def _at(truth: Truth, stamp_ns: int) -> Array | None:
     return told[-1] if told else None
 
 
-def decisions(replayed: Document, routine: Sequence[str], *, asked: bool) -> list[dict[str, Any]]:
+def decisions(
+    commands: Sequence[Document], routine: Sequence[str], *, asked: bool
+) -> list[dict[str, Any]]:
     """Commands with their code and reason, without routine steps that were carried out.
 
     ``asked``: somebody gave the commands; else an acceptance that did not come about is none.
     """
     return [
         {name: entry[name] for name in ("stamp", "command", "code", "message")}
-        for entry in replayed["commands"]
+        for entry in commands
         if not (
             entry["command"] in routine if entry["code"] == "ACCEPT" else _unasked(entry, asked)
         )

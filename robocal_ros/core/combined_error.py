@@ -39,7 +39,8 @@ def _square(error: ToolError) -> tuple[float, float]:
         return 0.0, 0.0
     if error.rms_m == 0.0:
         return error.bound_m**2, 0.0
-    wanted = (error.bound_m / error.rms_m) ** 2
+    ratio = error.bound_m / error.rms_m
+    wanted = ratio * ratio  # infinite where ** would raise
     few, many = 0.0, float(np.log(MOST_FREEDOM))
     if wanted <= _over_mean(np.exp(many)):
         return error.bound_m**2, 0.0

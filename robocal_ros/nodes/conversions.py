@@ -21,6 +21,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics.parameters import COLUMNS
 from robocal_ros.core.proposals import Entry
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
@@ -140,17 +141,13 @@ def accuracy_message(
 ) -> AccuracyState:
     """How accurate the robot is believed to be; -1 where the error is not known.
 
-    Raises
-    ------
-    InputError
-        When a figure is not finite.
+    A figure that is not finite makes it a FAULT: the line must not go on with what it read before.
     """
-    rms_mm, bound_mm = (
-        (-1.0, -1.0)
-        if found.error is None
-        else (found.error.rms_m * 1e3, found.error.bound_m * 1e3)
-    )
-    _require_finite("accuracy", [rms_mm, bound_mm, found.due_in_s])
+    error = found.error
+    rms_mm, bound_mm = (-1.0, -1.0) if error is None else (error.rms_m * 1e3, error.bound_m * 1e3)
+    if not all(map(math.isfinite, (rms_mm, bound_mm, found.due_in_s))):
+        words = "a figure of the accuracy is not finite, please report it"
+        found, rms_mm, bound_mm = Accuracy(AccuracyLevel.FAULT, words), -1.0, -1.0
     return AccuracyState(
         header=stamp,
         robot=robot,

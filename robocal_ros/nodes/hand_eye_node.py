@@ -253,10 +253,7 @@ class HandEyeNode(HouseNode):
             if data is None
             else f"{data.kind}, {len(data.samples)} samples of {len(data.captures)} captures"
         )
-        for topic, reasons in session.ignored.items():
-            for reason, count in reasons.items():
-                last = session.ignored.last(topic, reason)
-                values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
+        values |= session.ignored.listed()
         model = session.in_force.model
         taken = "" if model is None else self._conflict(model)
         for fault in (self._guard.fault, session.current.fault, taken):

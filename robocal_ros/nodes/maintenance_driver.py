@@ -81,7 +81,7 @@ class MaintenanceDriver:
             self._answered(number, Answer(Code.CONFLICT, words))
             return
         self._goals[number] = None
-        goal = MeasureTool.Goal(mode=MODE_OF[mode], cycle_id=cycle_id)
+        goal = MeasureTool.Goal(mode=MODE_OF[mode], cycle_id=cycle_id, only_in_gap=True)
         self._measure.send_goal_async(goal).add_done_callback(
             lambda future: self._accepted(number, future)
         )

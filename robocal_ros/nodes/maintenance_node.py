@@ -25,6 +25,7 @@ from robocal_ros.nodes.maintenance_services import MaintenanceServices, Now
 from robocal_ros.nodes.maintenance_settings import SETTINGS, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.steady_clock import steady_s
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
@@ -42,6 +43,7 @@ HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks aft
 NS = 1_000_000_000
 MM = 1e-3
 ENDS = "the node was deactivated"
+LARGEST = 1e9  # mm, s: a figure beyond is a defect, and its square might be infinite
 GAP_OPEN, ACCURACY = "gap_open", "thermal_node/accuracy"
 MEASUREMENTS = {
     POINT: PointStamped,
@@ -106,7 +108,7 @@ class MaintenanceNode(HouseNode):
     def deactivate(self) -> None:
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
-            self._carry_out(self._session.give_up(ENDS, time.monotonic()))
+            self._carry_out(self._session.give_up(ENDS, steady_s()))
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
             self._outputs.accuracy(gone, self._config.tolerance_m, self.now_ns())
@@ -137,12 +139,12 @@ class MaintenanceNode(HouseNode):
             raise InputError(fault)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
-        session.reading(sample.stamp_ns / NS, q, time.monotonic())
+        session.reading(sample.stamp_ns / NS, q, steady_s())
 
     def _take_gap(self, message: Any) -> None:
         if self._session is not None:
             self._session.doubt_gap(self._sources.doubt())
-            self._session.gap(message.data, time.monotonic())
+            self._session.gap(message.data, steady_s())
             self._tick()  # a gap that closes stops the robot now
 
     def _take_measurement(self, message: Any) -> None:
@@ -156,12 +158,12 @@ class MaintenanceNode(HouseNode):
             level = AccuracyLevel(message.state)
         except ValueError as error:
             raise InputError(f"accuracy state {message.state} is unknown") from error
-        known = message.predicted_error_mm >= 0.0 and message.bound_mm >= 0.0
-        rms_m, bound_m = message.predicted_error_mm * MM, message.bound_mm * MM
-        drift = Drift(
-            level, message.reason, ToolError(rms_m, bound_m) if known else None, message.due_in_s
-        )
-        self._session.drift(drift, time.monotonic())
+        rms_mm, bound_mm, due_in_s = message.predicted_error_mm, message.bound_mm, message.due_in_s
+        if not all(abs(figure) <= LARGEST for figure in (rms_mm, bound_mm, due_in_s)):
+            raise InputError(f"rms {rms_mm:g} mm, bound {bound_mm:g} mm, due in {due_in_s:g} s")
+        known = rms_mm >= 0.0 and bound_mm >= 0.0
+        found = ToolError(rms_mm * MM, bound_mm * MM) if known else None
+        self._session.drift(Drift(level, message.reason, found, due_in_s), steady_s())
 
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:
@@ -170,7 +172,7 @@ class MaintenanceNode(HouseNode):
     # ---- time -----------------------------------------------------------------------------------
 
     def _clocks(self) -> Now:
-        return Now(time.monotonic(), time.time_ns())
+        return Now(steady_s(), time.time_ns())
 
     def _tick(self) -> None:
         if self._session is not None:
@@ -199,7 +201,7 @@ class MaintenanceNode(HouseNode):
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
-        status = session.status(time.monotonic())
+        status = session.status(steady_s())
         shown = replace(status, left_s=round(status.left_s))
         if shown != self._shown:
             self._shown = shown
@@ -220,7 +222,7 @@ class MaintenanceNode(HouseNode):
         session, health = self._session, Health()
         if session is None:
             return health
-        status = session.status(time.monotonic())
+        status = session.status(steady_s())
         values: dict[str, object] = {
             "state": status.state.name,
             "doing": status.doing or "nothing",

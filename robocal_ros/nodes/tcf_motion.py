@@ -1,6 +1,5 @@
 """Motion of the tool node: it moves the robot, once armed (docs/tool_motion.md)."""
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -23,6 +22,7 @@ from robocal_ros.nodes.motion_settings import (
     trajectory_message,
 )
 from robocal_ros.nodes.parameters import Setting, length
+from robocal_ros.nodes.steady_clock import steady_s
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
@@ -36,8 +36,9 @@ SETTINGS = (
     length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
     Setting(
         "gap_stale_s",
-        0.0,
-        "Nothing moves unless gap_open is true and no older; 0: it is not listened to",
+        0.5,
+        "Nothing moves unless gap_open is true and no older; 0: it is not listened to, and "
+        "maintenance_node does not measure with it",
         unit="s",
         low=0.0,
         high=0.5,
@@ -73,7 +74,7 @@ class TcfMotion:
             heartbeat = node.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
             self._sources = GapSources(node, heartbeat)
         else:
-            node.get_logger().warning(f"{UNHEARD}; set it in a cell with maintenance_node")
+            node.get_logger().warning(self.deaf())
         node.add_service(SetBool, "~/arm", self._arm, inactive=True)
         node.add_timer(TICK_S, self._tick, steady=True)
 
@@ -92,7 +93,7 @@ class TcfMotion:
     def deactivate(self) -> None:
         """Stop what moves."""
         if self.driver is not None:
-            self.driver.disarm("the node was deactivated", time.monotonic())
+            self.driver.disarm("the node was deactivated", steady_s())
         self.driver = None
 
     def take(self, message: Any) -> None:
@@ -104,7 +105,7 @@ class TcfMotion:
             q = sample.position[sample.order(self._names)]
         except InputError:  # the session counts it; without readings the robot stops
             return
-        self.driver.reading(sample.stamp_ns / NS, q, time.monotonic())
+        self.driver.reading(sample.stamp_ns / NS, q, steady_s())
 
     def beam(self, message: Any) -> None:
         """Take a BeamEvent, usable or not: on its way the tool breaks no beam."""
@@ -117,6 +118,12 @@ class TcfMotion:
             raise NotActiveError("no session: activate the node")
         self.driver.require_ready()
 
+    def deaf(self) -> str:
+        """Why what moves would go on in a closed gap; empty: it would stop."""
+        if self._gap is not None:
+            return ""
+        return f"{UNHEARD}; set it to 0.5 in a cell with maintenance_node"
+
     def words(self) -> str:
         """What the diagnostics say."""
         return "inactive" if self.driver is None else self.driver.words()
@@ -124,12 +131,12 @@ class TcfMotion:
     def run_ended(self, outcome: Outcome) -> None:
         """A run without a result stops the robot."""
         if self.driver is not None and outcome.document is None:
-            self.driver.run_failed(outcome.message, time.monotonic())
+            self.driver.run_failed(outcome.message, steady_s())
 
     def _take_gap(self, message: Any) -> None:
         if self._gap is not None:
             self._gap.doubt(self._sources.doubt())
-            self._gap.heard(message.data, time.monotonic())
+            self._gap.heard(message.data, steady_s())
             self._tick()
 
     def _closed(self, now_s: float) -> str:
@@ -137,7 +144,7 @@ class TcfMotion:
         return "" if self._gap is None else self._gap.closed(now_s)
 
     def _tick(self) -> None:
-        now_s = time.monotonic()
+        now_s = steady_s()
         if self._gap is not None:
             self._gap.look(now_s)
         if self.driver is None:
@@ -155,7 +162,7 @@ class TcfMotion:
             # deactivation disarmed; who must know that nothing moves gets a plain answer
             response.success, response.message = True, "disarmed: the node is not active"
             return response
-        now_s = time.monotonic()
+        now_s = steady_s()
         if request.data and (why := self._closed(now_s)):
             raise ConflictError(f"{why}: nothing may move")
         if request.data:

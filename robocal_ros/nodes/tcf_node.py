@@ -86,6 +86,7 @@ class TcfNode(HouseNode):
             frame=self._frame,
             step=lambda: self._step,
             is_open=lambda: self._session is not None and self._session.run is not None,
+            deaf=lambda: "" if self._motion is None else self._motion.deaf(),
         )
         self._calls = TcfServices(self, runner, self._desk.ask, self._history)
         if settings["motion"] == TRAJECTORY:
@@ -260,10 +261,7 @@ class TcfNode(HouseNode):
         if self._motion is not None:
             values["motion"] = self._motion.words()
         values["last run"] = "none" if self._last is None else self._last.message
-        for topic, reasons in session.ignored.items():
-            for reason, count in reasons.items():
-                last = session.ignored.last(topic, reason)
-                values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
+        values |= session.ignored.listed()
         for fault in (self._guard.fault, session.current.fault):
             if fault:
                 health.worsen(ERROR, fault)

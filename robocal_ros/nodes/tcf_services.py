@@ -44,6 +44,7 @@ class Runner:
     frame : the measured tool of an outcome.
     step : the step that is awaited.
     is_open : whether a run is.
+    deaf : why the node would drive on in a closed gap; empty: it would not.
     """
 
     def __init__(
@@ -55,9 +56,11 @@ class Runner:
         frame: Callable[[Outcome], ToolFrame],
         step: Callable[[], ToolStep],
         is_open: Callable[[], bool],
+        deaf: Callable[[], str],
     ) -> None:
         self.begin, self.ended, self.cancel = begin, ended, cancel
         self.last, self.frame, self.step, self.is_open = last, frame, step, is_open
+        self.deaf = deaf
 
 
 class TcfServices:
@@ -103,6 +106,8 @@ class TcfServices:
             if request.mode not in MODES:
                 words = f"mode {request.mode} is none of FULL, QUICK, REFERENCE"
                 return self._end(goal, Code.BAD_INPUT, words)
+            if request.only_in_gap and (why := self._runner.deaf()):
+                return self._end(goal, Code.CONFLICT, f"{self._node.get_name()}: {why}")
             outcome = await self._runner.begin(MODES[request.mode], request.cycle_id, "action")
             if outcome.done and not outcome.repeated:
                 self._goal = goal

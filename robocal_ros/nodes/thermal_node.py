@@ -213,11 +213,7 @@ class ThermalNode(HouseNode):
         named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
         values["cycle"] = f"{named}{visited} of {poses} poses measured"
         values["joint gaps"] = session.desk.stream.gap_count
-        ignored = session.desk.ignored
-        for topic, reasons in ignored.items():
-            for reason, count in reasons.items():
-                last = ignored.last(topic, reason)
-                values[f"{topic} ignored: {reason}"] = f"{count}, last: {last}"
+        values |= session.desk.ignored.listed()
         if self._guard.fault:
             health.worsen(ERROR, self._guard.fault)
         if session.fault:

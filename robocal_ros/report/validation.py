@@ -11,6 +11,13 @@ Document = dict[str, Any]
 
 ERRORS = {"without": "nominal", "in_force": "in_force", "after": "candidate"}
 ERROR_KEYS = ("mean_mm", "rms_mm", "p95_mm", "max_mm", "share_within_tolerance")
+NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")  # the last: the model stays
+CYCLE = ("bag", "cycle", "stamp", "hours", "samples", "code", "revision")
+DECISION = ("bag", "node", "stamp", "command", "code", "message")
+HOUR = (
+    "bag", "hour", "minutes", "rms_without_mm", "rms_with_mm", "lambda_without", "lambda_with",
+    "bound_mm", "p95_mm", "time_below_bound",
+)  # fmt: skip
 
 
 def summary_rows(bags: Sequence[Document]) -> list[Document]:
@@ -24,7 +31,7 @@ def summary_rows(bags: Sequence[Document]) -> list[Document]:
 
 
 def _row(bag: Document, session: Document) -> Document:
-    refused = [d for d in session["decisions"] if d["code"] != "ACCEPT"]
+    refused = [d for d in session["decisions"] if d["code"] not in NO_FAULT]
     own = {"thermal": _thermal, "tool": _tool, "hand_eye": _hand_eye}[session["kind"]](session)
     return {
         "bag": bag["bag"],
@@ -101,7 +108,7 @@ def bags_table(bags: Sequence[Document]) -> str:
 
 def cycles_table(bags: Sequence[Document]) -> str:
     """Every thermal cycle as CSV."""
-    return _csv([_cycle(bag, cycle) for bag, cycle in thermal_cycles(bags)])
+    return _csv([_cycle(bag, cycle) for bag, cycle in thermal_cycles(bags)], CYCLE)
 
 
 def thermal_cycles(bags: Sequence[Document]) -> list[tuple[Document, Document]]:
@@ -141,14 +148,15 @@ def decisions_table(bags: Sequence[Document]) -> str:
             for bag in bags
             for node, decisions in _decided(bag)
             for decision in decisions
-        ]
+        ],
+        DECISION,
     )
 
 
 def hours_table(bags: Sequence[Document]) -> str:
     """Every hour of each simulated cell as CSV."""
     cells = [(bag["bag"], bag["cell"]) for bag in bags if bag.get("cell")]
-    return _csv([{"bag": name, **hour} for name, cell in cells for hour in cell["by_hour"]])
+    return _csv([{"bag": name, **hour} for name, cell in cells for hour in cell["by_hour"]], HOUR)
 
 
 def _decided(bag: Document) -> list[tuple[str | None, Sequence[Document]]]:
@@ -157,8 +165,9 @@ def _decided(bag: Document) -> list[tuple[str | None, Sequence[Document]]]:
     return [*sessions, *bag.get("other_decisions", {}).items()]
 
 
-def _csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    columns = list(dict.fromkeys(name for row in rows for name in row))
+def _csv(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
+    """``first``: columns that a table without rows has too."""
+    columns = list(dict.fromkeys((*first, *(name for row in rows for name in row))))
     stream = io.StringIO()
     writer = csv.DictWriter(stream, columns, lineterminator="\n")
     writer.writeheader()

@@ -35,7 +35,8 @@ class CellCourse:
     lambda_without, lambda_with : (t,) share of directions within `TOLERANCE_MM`.
     bound_mm : (t,) what the line was told: 95 % of the errors are below.
     tolerance_mm : error that the process allows; None where the line was told nothing.
-    faults : each with ``hours``, ``fault`` and ``size`` (SI; 0: it ended).
+    faults : each with ``hours``, ``fault``, ``size`` (SI; 0: it ended) and ``told``, the size in
+        words.
     """
 
     hours: Array
@@ -137,6 +138,17 @@ def _name_faults(axes: Axes, course: CellCourse, per_hour: float) -> None:
 
 
 def _shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
+    """Of each hour; within the first one as it went."""
+    if course.hours[-1] <= 1.0:
+        for shares, color in ((course.lambda_without, BEFORE), (course.lambda_with, AFTER)):
+            axes.plot(course.hours * per_hour, 100.0 * shares, color=color, lw=1.8)
+    else:
+        _hourly_shares(axes, course, per_hour)
+    axes.axhline(100.0 * GOAL, color=FAINT, lw=0.8, ls=(0, (4, 3)))
+    axes.set(ylabel=f"directions within\n{TOLERANCE_MM:g} mm, %", ylim=(0.0, 103.0))
+
+
+def _hourly_shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
     for row in course.document()["by_hour"]:
         begin = row["hour"] - 1.0
         ends = begin * per_hour, min(begin + 1.0, float(course.hours[-1])) * per_hour
@@ -144,5 +156,3 @@ def _shares(axes: Axes, course: CellCourse, per_hour: float) -> None:
             share = row[f"lambda_{name}"]
             if share is not None:
                 axes.plot(ends, (100.0 * share,) * 2, color=color, lw=2.4, solid_capstyle="butt")
-    axes.axhline(100.0 * GOAL, color=FAINT, lw=0.8, ls=(0, (4, 3)))
-    axes.set(ylabel=f"directions within\n{TOLERANCE_MM:g} mm, %", ylim=(0.0, 103.0))

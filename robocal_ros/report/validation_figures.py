@@ -24,12 +24,12 @@ from robocal_ros.report.figures import (
     svg,
     titled,
 )
+from robocal_ros.report.validation import NO_FAULT
 from robocal_ros.report.validation_cell import CellCourse, cell_figure
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
-_NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")
 MOST_NAMED = 8  # runs that have their name below the axis
 DRIFT_CAPTION = (
     "The parameters that moved most in units of their own standard deviation; the band is two "
@@ -37,8 +37,8 @@ DRIFT_CAPTION = (
 )
 CELL_CAPTION = (
     "Root mean square over the working poses of the programme, by the simulation's truth, against "
-    "the cold robot with the taught tool. Below: share of all directions, hour by hour; dashed: "
-    "the goal of 95 %."
+    "the cold robot with the taught tool. Below: share of all directions, of each hour, in a "
+    "recording within one hour as it went; dashed: the goal of 95 %."
 )
 CYCLES_CAPTION = (
     "Measured at each cycle's own poses, in which the sensor's noise is contained. In force: the "
@@ -120,7 +120,7 @@ def accuracy_by_cycle(cycles: Sequence[Document], mark: str = "") -> Figure:
                 [cycle["hours"] for cycle in known], bound, color=INK, lw=1.0, ls=(0, (2, 2)),
                 label="95 % bound",
             )  # fmt: skip
-        faults = [cycle for cycle in cycles if cycle["verdict"]["code"] not in _NO_FAULT]
+        faults = [cycle for cycle in cycles if cycle["verdict"]["code"] not in NO_FAULT]
         if faults:
             axes.plot(
                 [cycle["hours"] for cycle in faults],

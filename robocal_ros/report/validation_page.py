@@ -166,15 +166,15 @@ def _cell(cell: Document) -> list[str]:
         f"λ: share of all directions within {TOLERANCE_MM:g} mm.</p>"
     )
     faults = [
-        (f"{one['hours']:.2f} h", f"{one['fault'].replace('_', ' ')} {_size(one)}")
+        (_after(one["hours"]), f"{one['fault'].replace('_', ' ')} {one['told'] or 'ends'}")
         for one in cell["faults"]
     ]
     told = ["<h3>Faults that were simulated</h3>", listed(faults)] if faults else []
     return [table(head, body), note, *told]
 
 
-def _size(fault: Document) -> str:
-    return f"{fault['size']:.4g} (SI)" if fault["size"] else "ends"
+def _after(hours: float) -> str:
+    return f"{hours:.2f} h" if hours >= 1.0 else f"{hours * 60.0:.1f} min"
 
 
 def _session(session: Document) -> list[str]:
@@ -222,7 +222,8 @@ def _cycles(session: Document) -> str:
     note = (
         '<p class="faint">Rms in mm. Candidate: each pose predicted from the others; expected: the '
         "same from the covariances. Bound: below it 95 % of the tool's errors were expected before "
-        "the cycle, throughout the workspace. λ: of the true errors after the cycle where they are "
+        "the cycle, at the session's work_poses, without any throughout the workspace. λ: of the "
+        "true errors after the cycle where they are "
         "known, else of those measured with the model in force before it. Rejected: samples that "
         "the others contradict.</p>"
     )

@@ -13,7 +13,8 @@ class Gap:
     """Follows the heartbeat ``gap_open`` and the end of the gap that was told; steady clock.
 
     A heartbeat bears no time. One that is taken just after a pause of the own process may have
-    waited all through it: it counts from before the pause.
+    waited all through it: it counts from before the pause. One that the network delivers late
+    counts from its arrival: how late it is nobody here can tell.
 
     Parameters
     ----------
@@ -74,6 +75,15 @@ class Gap:
         if not 0.0 <= silent_s <= self._stale_s:
             return f"gap_open is silent for more than {self._stale_s:g} s"
         return "" if self._open else "gap_open is false"
+
+    def waits(self, now_s: float) -> bool:
+        """Whether no heartbeat is fresh for a pause of the own process alone.
+
+        All that is known is from before the pause; a PLC that lives says more within ``stale_s``.
+        """
+        if not self._heard_s < self._drained_s or now_s > self._drained_s + self._stale_s:
+            return False
+        return self._open and not self._doubt and self.left_s(now_s) > 0.0
 
     def over(self, now_s: float) -> str:
         """Why the run must end: the gap is closed, or its time has run out; else empty."""

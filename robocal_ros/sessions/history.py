@@ -39,8 +39,8 @@ class History(Protocol):
     def head(self, kind: str = ...) -> Head:
         """What is in force."""
 
-    def pending(self, kind: str = ...) -> Sequence[Entry]:
-        """Candidates that wait for a decision."""
+    def pending(self, kind: str = ..., limit: int = ...) -> Sequence[Entry]:
+        """Candidates that wait for a decision, newest first; ``limit``: so many at the most."""
 
     def decisions(self, after_seq: int = ...) -> Sequence[Decision]:
         """Decisions after a sequence number, oldest first."""

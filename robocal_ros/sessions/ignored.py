@@ -27,9 +27,13 @@ class Ignored(dict[str, Counter[str]]):
         counter[key] += count
         self._last[topic, key] = reason
 
-    def last(self, topic: str, key: str) -> str:
-        """The latest reason that was counted under a key, with its numbers."""
-        return self._last[topic, key]
+    def listed(self) -> dict[str, str]:
+        """All reasons with their counts and the latest words, as nodes show them."""
+        return {
+            f"{topic} ignored: {key}": f"{count}, last: {self._last[topic, key]}"
+            for topic, counter in self.items()
+            for key, count in counter.items()
+        }
 
     def words(self) -> str:
         """Tell the most frequent reason of each topic; empty when nothing was ignored."""

@@ -14,6 +14,7 @@ from robocal_ros.sessions.records import digest, read_command
 from robocal_ros.sessions.temperatures import TEMPERATURES
 
 EVENTS = "session_events"
+NOT_BITS = "not to the last bit"
 UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
 
 
@@ -248,10 +249,18 @@ def _take(
     if recorded:
         if recorded["id"] and outcome.calibration_id:
             ids.setdefault(int(recorded["id"]), outcome.calibration_id)
-        here = (int(outcome.status), outcome.samples, digest(outcome.document))
-        if here != (recorded["status"], recorded["samples"], recorded["digest"]):
-            report.differs.append(
-                f"{outcome.command.name} at {outcome.command.stamp_ns} ns: recorded "
-                f"'{recorded['message']}', here '{outcome.message}'"
-            )
+        report.differs += _difference(outcome, recorded)
     return _submit_next(session, expected, ids)
+
+
+def _difference(outcome: Outcome, recorded: Mapping[str, Any]) -> list[str]:
+    """In what an outcome is not the recorded one, in words; empty where it is, bit for bit."""
+    counted, bits = (int(outcome.status), outcome.samples), digest(outcome.document)
+    same = counted == (recorded["status"], recorded["samples"])
+    if same and bits == recorded["digest"]:
+        return []
+    which = f"{outcome.command.name} at {outcome.command.stamp_ns} ns"
+    told, found = recorded["message"], outcome.message
+    if same and told == found:
+        return [f"{which}: as recorded in its words, {NOT_BITS}: '{told}'"]
+    return [f"{which}: recorded '{told}', here '{found}'"]

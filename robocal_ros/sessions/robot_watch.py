@@ -121,6 +121,11 @@ class RobotWatch:
         (first_s, first), (last_s, last) = recent[0], recent[-1]
         return q, (last - first) / (last_s - first_s)
 
+    def tells_speed(self, within_s: float) -> bool:
+        """Whether the readings that give a velocity span no more than this."""
+        recent = self._since(VELOCITY_S)
+        return recent is not None and recent[-1][0] - recent[0][0] <= within_s
+
     def _since(self, span_s: float) -> list[tuple[float, Array]] | None:
         """Readings of the last ``span_s``; None before there are enough."""
         readings = list(self._readings)

@@ -8,9 +8,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from robocal_ros.core.codes import Code
 from robocal_ros.core.correction_record import CorrectionRecord
 from robocal_ros.core.errors import InputError, WrongRobotError
-from robocal_ros.core.proposals import THERMAL, Candidate, Decision, Entry, Head, State
+from robocal_ros.core.proposals import THERMAL, Candidate, Decision, Entry, Head
 from robocal_ros.storage.correction_records import read_corrections
 from robocal_ros.storage.history_file import (
     HistoryFile,
@@ -31,6 +32,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
+
+# As `Ledger.state`, but without reading those that were refused or decided.
+_PENDING = (
+    "WHERE kind = ? AND based_on = ? AND code = ? AND NOT EXISTS (SELECT 1 FROM decisions "
+    "WHERE calibration_id = calibrations.id AND action <> 'rollback') ORDER BY id DESC LIMIT ?"
+)
 
 BUSY_TIMEOUT_S = 2.0
 """Longest wait for another process's change, itself a matter of milliseconds."""
@@ -174,13 +181,12 @@ class HistoryReader:
         with self._reading() as connection:
             return self._entry(calibration_id, read_candidate(connection, calibration_id))
 
-    def pending(self, kind: str = THERMAL) -> tuple[Entry, ...]:
-        """Calibrations that can be accepted now, newest first."""
+    def pending(self, kind: str = THERMAL, limit: int = -1) -> tuple[Entry, ...]:
+        """Calibrations that can be accepted now, newest first; ``limit``: so many at the most."""
         with self._reading() as connection:
             revision, _ = self._ledger.head(kind)
-            where = "WHERE kind = ? AND based_on = ? ORDER BY id DESC"
-            entries = [self._entry(*r) for r in read_candidates(connection, where, kind, revision)]
-        return tuple(entry for entry in entries if entry.state is State.PENDING)
+            rows = read_candidates(connection, _PENDING, kind, revision, Code.ACCEPT, limit)
+            return tuple(self._entry(*row) for row in rows)
 
     def decisions(self, after_seq: int = 0) -> tuple[Decision, ...]:
         """Decisions of every kind after a sequence number, oldest first."""

@@ -76,6 +76,8 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
             taught_tool TEXT NOT NULL)""",
         *_append_only("corrections"),
     ),
+    # What waits is asked for all the time, and must not take longer with each year.
+    ("CREATE INDEX of_a_revision ON calibrations (kind, based_on, code)",),
 )
 """Script ``n`` brings schema version ``n`` to ``n + 1``; shipped ones are never edited."""
 

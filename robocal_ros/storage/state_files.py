@@ -54,12 +54,14 @@ class StateFile:
         Raises
         ------
         StorageError
-            When it cannot be written; the one before is still there.
+            When it cannot be written, or a number is not finite; the one before is still there.
         """
         try:
             write_text(self.path, json.dumps(document, allow_nan=False), durable=True)
         except InputError as error:
             raise StorageError(str(error)) from error
+        except ValueError as error:
+            raise StorageError(f"{self.path}: {error}") from error
 
     def _sync(self, folder: Path) -> None:
         try:

@@ -56,8 +56,8 @@ def test_the_course_is_what_was_told(bag: Path) -> None:
     np.testing.assert_allclose(course.bound_mm, [np.nan, 0.2, 0.2, 0.2])
     assert course.tolerance_mm == pytest.approx(0.3)
     assert list(course.faults) == [
-        {"hours": 1.0, "fault": "collision", "size": 2e-3},
-        {"hours": 1.5, "fault": "collision", "size": 0.0},
+        {"hours": 1.0, "fault": "collision", "size": 2e-3, "told": "2 mm"},
+        {"hours": 1.5, "fault": "collision", "size": 0.0, "told": ""},
     ]
 
 

@@ -72,3 +72,9 @@ def test_one_error_alone_is_itself():
 def test_a_bound_counts_where_no_rms_is_told():
     both = both_errors(ToolError(0.0, 1e-3), ToolError(1e-4, 2e-4))
     assert both.bound_m >= 1e-3
+
+
+def test_an_rms_that_is_all_but_none_is_no_crash():
+    """A Gaussian error on one line, the widest that there is: its bound stays."""
+    both = both_errors(ToolError(1e-200, 1e-3), ToolError(0.0, 0.0))
+    assert both.bound_m == pytest.approx(1e-3, rel=1e-9)

@@ -70,9 +70,12 @@ class LiveCell:
     """All nodes as processes; time is real.
 
     ``busy``: with limits for a machine that has other work too; else all as it is set.
+    ``listens``: tcf_node does, to ``gap_open``.
     """
 
-    def __init__(self, graph: Any, folder: Path, *, busy: bool = True, **faults: Any) -> None:
+    def __init__(
+        self, graph: Any, folder: Path, *, busy: bool = True, listens: bool = True, **faults: Any
+    ) -> None:
         self.graph = graph
         self.beat_s, self.times = (BEAT_S, BUSY_TIMES) if busy else (PLC_BEAT_S, {})
         self.arm = load_robot("ur10")
@@ -104,7 +107,8 @@ class LiveCell:
             "gap_stale_s": 0.5,
         } | (BUSY if busy else {})
         out = {"~/joint_trajectory": ROBOT}
-        self.tcf = graph.start("tcf_node", self.tool | {"motion": "trajectory"}, out)
+        own = {"motion": "trajectory"} | ({} if listens else {"gap_stale_s": 0.0})
+        self.tcf = graph.start("tcf_node", self.tool | own, out)
         self.thermal = graph.start(
             "thermal_node", {"robot": "ur10", "serial": SERIAL, "sphere_radius_mm": 19.05}
         )

@@ -1,5 +1,6 @@
 """The calls of a PLC to a maintenance node that has nothing to move: no poses, no beams."""
 
+import os
 import signal
 import sqlite3
 import time
@@ -22,7 +23,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.maintenance_node import ACCURACY, MaintenanceNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -103,6 +104,21 @@ def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
     assert plc.call(GetMaintenance, "status", cycle_id="4712").status == Code.BAD_INPUT
     names = [event.command for event in plc.events]
     assert names == ["run_maintenance", "maintenance_ended"]
+
+
+def test_a_disk_that_takes_its_time_breaks_no_cycle_off(plc, graph, monkeypatch):
+    fsync = os.fsync
+
+    def slow(descriptor: int) -> None:
+        time.sleep(0.35)  # file and folder: the heartbeat is older than gap_stale_s afterwards
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    assert plc.run("4711").success
+    monkeypatch.undo()
+    graph.spin_until(lambda: plc.run("4711").result.code != Code.NONE, "it ends")
+    ended = plc.run("4711").result
+    assert (ended.code, ended.complete) == (Code.ACCEPT, True), ended.message
 
 
 def test_the_action_does_the_same(plc, graph):
@@ -222,6 +238,21 @@ def test_a_decision_that_comes_twice_is_made_once(plc, graph):
     assert names == ["accept", "accept", "rollback", "rollback", "reject", "reject"]  # one refused
 
 
+def test_an_acceptance_by_trigger_that_comes_twice_is_made_once(plc, graph):
+    (first,) = candidates(graph, 1)
+    assert plc.trigger("accept") == f"{first} ACCEPT revision 1: calibration {first} in force"
+    for _ in range(2):
+        assert plc.trigger("accept") == f"{first} ACCEPT calibration {first} is in force already"
+    assert [event.command for event in plc.events] == ["accept"]
+    (second,) = candidates(graph, 1, based_on=1)
+    assert plc.call(Decide, "accept", id=second, by="plc").revision == 2
+    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait")  # not its own
+    (third,) = candidates(graph, 1, based_on=2)
+    assert plc.trigger("accept").startswith(f"{third} ACCEPT revision 3")
+    assert plc.trigger("rollback").startswith(f"{second} ACCEPT revision 4")
+    assert plc.trigger("accept").startswith("0 CONFLICT one candidate must wait")
+
+
 def test_the_last_acceptance_is_taken_back_once(plc, graph):
     (first,) = candidates(graph, 1)
     assert plc.call(Decide, "accept", id=first).revision == 1
@@ -278,7 +309,7 @@ def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
 
     graph.spin_until(ended, "a has ended")
     (goal,) = calls._goals  # its caller is not told yet
-    session.run("b", 30.0, time.monotonic(), time.time_ns())
+    session.run("b", 30.0, *plc.node._clocks())
     assert calls._cancel(goal) is CancelResponse.REJECT
     graph.spin_until(lambda: session.running is None, "b has ended")
     assert session.result("b").code is Code.ACCEPT
@@ -298,6 +329,24 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     assert plc.statuses[-1].last.code == Code.CONFLICT
     graph.spin_until(lambda: plc.states[-1].state == AccuracyState.FAULT, "the line is told")
     assert "deactivated" in plc.states[-1].reason
+
+
+@pytest.mark.parametrize("name", ["predicted_error_mm", "bound_mm", "due_in_s"])
+def test_a_figure_that_cannot_be_is_no_drift(graph, name):
+    poses = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
+    node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})
+    states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
+    drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
+    known = {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
+    for count, value in enumerate((np.nan, np.inf, -np.inf, 1e300), 1):
+        drift.publish(AccuracyState(state=AccuracyState.OK, **(known | {name: value})))
+        graph.spin_until(lambda n=count: node.inputs[ACCURACY].invalid == n, f"{value} is refused")
+        states.clear()
+        graph.spin_until(lambda: states, "the line is told")
+        assert states[-1].reason == "drift: the thermal node is silent"
+    drift.publish(AccuracyState(state=AccuracyState.OK, **known))
+    graph.spin_until(lambda: states[-1].state == AccuracyState.OK, "the next one counts")
+    assert (states[-1].predicted_error_mm, states[-1].bound_mm) == pytest.approx((0.1, 0.2))
 
 
 def test_a_second_publisher_of_the_heartbeat_closes_the_gap(plc, graph):
@@ -333,6 +382,21 @@ def test_heartbeats_that_waited_for_the_node_do_not_count(graph):
         assert refused.message.startswith("gap_open is silent for more than 0.5 s")
     plc.beating = True
     graph.spin_until(lambda: plc.run("e").success, "heartbeats count again")
+
+
+def test_a_heartbeat_from_before_the_host_was_suspended_is_old(plc, graph, monkeypatch):
+    clock = time.clock_gettime
+
+    def woken(which: int) -> float:
+        return clock(which) + 3600.0 * (which == time.CLOCK_BOOTTIME)
+
+    plc.beating = False
+    monkeypatch.setattr(time, "clock_gettime", woken)
+    refused = plc.run("4711")
+    assert refused.status == Code.CONFLICT, refused.message
+    assert refused.message.startswith("gap_open is silent for more than 0.5 s")
+    plc.beating = True
+    graph.spin_until(lambda: plc.run("4711").success, "heartbeats count again")
 
 
 def test_a_state_that_is_lost_is_a_fault(plc, graph):

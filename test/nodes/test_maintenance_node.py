@@ -136,6 +136,22 @@ def test_calls_are_answered_at_once_while_the_robot_moves(graph: Any, tmp_path: 
     assert np.max(np.abs(cell.sent[-1].points[-1].velocities)) == 0.0
 
 
+def test_a_driver_that_would_not_stop_at_the_gaps_end_measures_nothing(
+    graph: Any, tmp_path: Path
+) -> None:
+    cell = LiveCell(graph, tmp_path, listens=False)
+    for name in ("c0", "c1"):  # one that a busy machine broke off at home may be asked for again
+        ended = cell.run(name, GAP_S)
+        if ended.success:
+            break
+    assert ended.success, ended.message
+    result = ended.result
+    assert (result.tool_code, result.left) == (Code.CONFLICT, ["tool measurement (quick)"])
+    assert "tcf_node: gap_open is not listened to: gap_stale_s is 0; set it to 0.5" in ended.message
+    assert cell.sent == []
+    assert cell.statuses[-1].disarmed
+
+
 def test_the_tool_node_stops_at_the_gaps_end_without_this_node(graph: Any, tmp_path: Path) -> None:
     cell = LiveCell(graph, tmp_path)
     cell.begin("c1", GAP_S)

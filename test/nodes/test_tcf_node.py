@@ -9,7 +9,7 @@ from geometry_msgs.msg import TransformStamped
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import CalibrationQuality, ToolFrame
 from robocal_msgs.srv import Decide
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
 from tool_driver import TAUGHT, TRUTH
@@ -60,6 +60,14 @@ def test_a_bent_tool_is_measured_accepted_and_published(graph: Any, cell: LiveCe
     quick = cell.measure(QUICK)
     assert quick.answer == MeasureTool.Result.RECALIBRATE
     assert abs(quick.deviation_mm - 1.0) < 4.0 * quick.sigma_mm
+
+
+def test_it_moves_nothing_without_a_heartbeat(graph: Any, tmp_path: Any) -> None:
+    cell = LiveCell(graph, tmp_path, TRUTH, motion="trajectory")
+    cell.rest(0.1)
+    refused = graph.call(SetBool, "/tcf_node/arm", data=True)
+    assert not refused.success
+    assert refused.message.startswith("gap_open was never heard")
 
 
 def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Any) -> None:

@@ -18,7 +18,7 @@ from history_content import content
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
-from robocal_msgs.msg import KinematicModel, SessionEvent
+from robocal_msgs.msg import AccuracyState, KinematicModel, SessionEvent
 from robocal_msgs.srv import Decide, ListCalibrations
 from sensor_msgs.msg import JointState
 from shift import Shift, built, postures, warmed
@@ -233,6 +233,26 @@ def robocal(graph: Any, *arguments: str) -> subprocess.CompletedProcess[str]:
         timeout=30,
         check=False,
     )
+
+
+def test_an_accuracy_that_is_no_number_is_a_fault_and_ends_nothing(graph, visits, nominal):
+    cell = Cell(graph)
+    cell.play(visits[0])
+    captured = cell.call("capture_reference")
+    assert captured.success, captured.message
+    model = model_document(nominal)
+    model["mdh"][1][1] = 1e200  # m: its square is infinite
+    absurd = Proposal(
+        model_hash=nominal.model_hash, based_on=0, cycle_id="", stamp_ns=1, created_ns=1,
+        software="test", method="map", code=Code.ACCEPT, reason="", document={}, model=model,
+    )  # fmt: skip
+    with CalibrationHistory.open(cell.serial, state_dir=graph.state) as other:
+        other.accept(other.propose(absurd), by="me", reason="", wall_ns=1)
+    graph.spin_until(lambda: "not finite" in cell.accuracies[-1].reason, "the line is told")
+    said = cell.accuracies[-1]
+    assert (said.state, said.bound_mm) == (AccuracyState.FAULT, -1.0)
+    assert cell.call("rollback").success
+    graph.spin_until(lambda: cell.accuracies[-1].state != AccuracyState.FAULT, "it goes on")
 
 
 def test_a_restarted_node_has_what_was_last_accepted(graph, visits):

@@ -57,6 +57,7 @@ class Cell:
             "--sigma-mm", 0.03, "--output", laser, "--robot", "ur10", "--station", "station",
         )  # fmt: skip
         settings = {"laser": str(laser), "taught_xyz_mm": "[0.0, 0.0, 150.0]", "motion": motion}
+        settings["gap_stale_s"] = 0.0  # a station of its own, without a PLC
         self.tcf = graph.start("tcf_node", settings)
         self.client = ActionClient(graph.probe, MeasureTool, "/tcf_node/measure")
         graph.spin_until(self.client.server_is_ready, "the action appears")

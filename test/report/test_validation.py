@@ -180,7 +180,7 @@ COURSE = CellCourse(
     lambda_with=np.array([1.0, 0.9, 0.0, np.nan]),
     bound_mm=np.array([np.nan, 0.2, 0.2, 0.2]),
     tolerance_mm=0.3,
-    faults=[{"hours": 1.0, "fault": "collision", "size": 2e-3}],
+    faults=[{"hours": 1.0, "fault": "collision", "size": 2e-3, "told": "2 mm"}],
 )
 
 
@@ -202,10 +202,19 @@ def test_the_page_tells_of_the_cell():
     told = bag("one.mcap", simulated=True) | {"cell": COURSE.document()}
     html = page(REPORT | {"bags": [told]}, {"one.mcap": [cell_figures(COURSE)]})
     assert html.count("<svg") == 1
-    for said in ("collision 0.002 (SI)", "95.0%", "1.00 h", "<b>1.155 mm</b> with it"):
+    for said in ("collision 2 mm", "95.0%", "1.00 h", "<b>1.155 mm</b> with it"):
         assert said in html
     (row, _) = csv.DictReader(io.StringIO(hours_table([told])))
     assert float(row["lambda_with"]) == pytest.approx(0.95)
+    without = hours_table([bag("two.mcap")])
+    assert hours_table([told]).startswith(without)
+    assert without.split(",")[:2] == ["bag", "hour"]
+
+
+def test_tables_without_a_row_have_their_columns():
+    for table in (cycles_table([]), decisions_table([])):
+        (head,) = table.splitlines()
+        assert head.startswith("bag,")
 
 
 def test_many_runs_are_drawn_over_time():

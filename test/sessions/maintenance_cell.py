@@ -32,6 +32,7 @@ TICK_S = 0.02
 LAG_S = 0.02  # of the controller
 BEAT_S = 0.2
 STALE_S = 0.5
+LATE_S = 0.04  # after a pause, until the beat that waited is delivered
 WALL_NS = 1_700_000_000_000_000_000
 LONG_S = 120.0  # a gap in which all fits
 OK, REFUSED, SILENT, SLOW = "ok", "refused", "silent", "slow"
@@ -88,15 +89,17 @@ DOWN = backwards(Ways(ARM, config_of()).home(STATION, AT_BEAMS).plan)  # as the 
 
 
 class Shelf:
-    """Keeps a document; may be full."""
+    """Keeps a document; may be full, or slow: ``takes`` passes the time of a write."""
 
     def __init__(self) -> None:
         self.document: dict[str, Any] | None = None
+        self.takes: Callable[[], None] = lambda: None
 
     def load(self) -> dict[str, Any] | None:
         return self.document
 
     def save(self, document: Any) -> None:
+        self.takes()
         self.document = dict(document)
 
 
@@ -138,6 +141,7 @@ class Cell:
         self.tool = ToolNode()
         self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
         self.beats_every_s = BEAT_S
+        self.waiting: tuple[float, bool] | None = None  # a beat, and when it is delivered
         self.silent, self.offset = False, np.zeros(ARM.n)
         self.log: list[ask.Request] = []
         self.events: list[tuple[str, Any]] = []
@@ -148,7 +152,9 @@ class Cell:
         self.restart()
 
     def restart(self) -> None:
-        """Another session on the same shelf."""
+        """Another session on the same shelf; what the one before asked for is nobody's answer."""
+        self.due.clear()
+        self.tool.measuring *= -1
         self.session = MaintenanceSession(ARM, self.history, self.config, self.shelf, self._event)
 
     def _event(self, command: Any, outcome: Any) -> None:
@@ -162,16 +168,16 @@ class Cell:
 
     def run(self, cycle_id: str, gap_s: float) -> Code:
         """Call; a run that truly begins is noted."""
-        known = self.session.result(cycle_id) is not None
+        known, begin_s = self.session.result(cycle_id) is not None, self.now_s
         try:
-            self.session.run(cycle_id, gap_s, self.now_s, self.wall_ns)
+            self.session.run(cycle_id, gap_s, begin_s, self.wall_ns)
         except RobocalError as error:
             return error.code
         if not known:
             if cycle_id in self.begun:
                 raise NeverError(f"cycle {cycle_id} ran twice")
             self.begun.append(cycle_id)
-            self.ends_s = self.now_s + gap_s
+            self.ends_s = begin_s + gap_s
         return Code.ACCEPT
 
     def finish(self, within_s: float = 200.0) -> Any:
@@ -192,6 +198,16 @@ class Cell:
 
     # ---- time -----------------------------------------------------------------------------------
 
+    def pause(self, seconds: float) -> None:
+        """The session's process stands still; of the beats that come the newest waits for it."""
+        end_s = self.now_s + seconds
+        while self.now_s < end_s:
+            self.now_s += TICK_S
+            self._controller_goes_on()
+            if self._beat_is_due():
+                self.beat_s = self.now_s
+                self.waiting = end_s + LATE_S, self.is_open
+
     def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / TICK_S)):
             self.step()
@@ -199,13 +215,7 @@ class Cell:
     def step(self) -> None:
         self.now_s += TICK_S
         self._beat()
-        while self.coming and self.coming[0][0] <= self.now_s:
-            at_s, plan = self.coming.pop(0)
-            self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
-        q = self.motion.joints(np.array([self.now_s]))[0]
-        if np.max(np.abs(q - self.q)) > 1e-7:
-            self.moved_s = self.now_s
-        self.q = q
+        self._controller_goes_on()
         self._tool_goes_on()
         if not self.silent:
             self.session.reading(self.now_s, self.q + self.offset, self.now_s)
@@ -217,8 +227,23 @@ class Cell:
         for request in self.session.tick(self.now_s, self.wall_ns):
             self._carry_out(request)
 
+    def _controller_goes_on(self) -> None:
+        while self.coming and self.coming[0][0] <= self.now_s:
+            at_s, plan = self.coming.pop(0)
+            self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
+        q = self.motion.joints(np.array([self.now_s]))[0]
+        if np.max(np.abs(q - self.q)) > 1e-7:
+            self.moved_s = self.now_s
+        self.q = q
+
+    def _beat_is_due(self) -> bool:
+        return self.beating and self.now_s >= self.beat_s + self.beats_every_s
+
     def _beat(self) -> None:
-        if self.beating and self.now_s >= self.beat_s + self.beats_every_s:
+        if self.waiting is not None and self.now_s >= self.waiting[0]:
+            self.heard, self.waiting = self.waiting[1], None
+            self.session.gap(self.heard, self.now_s)
+        if self._beat_is_due():
             self.beat_s, self.heard = self.now_s, self.is_open
             self.session.gap(self.is_open, self.now_s)
         if self.drift is not None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.sessions.gap import Gap
+from robocal_ros.sessions.gap import STALL_S, Gap
 
 TICK_S, BEAT_S, STALE_S = 0.02, 0.2, 0.5
 LATE_S = 0.05  # after a pause, until the last beat that waited is delivered
@@ -69,3 +69,19 @@ def test_no_old_beat_keeps_the_gap_open_whatever_pauses(seed):
                 del beats_s[0]
             if now_s > dies_s + STALE_S:
                 assert gap.closed(now_s), (seed, now_s, dies_s)
+
+
+def test_one_late_beat_holds_the_gap_open_no_longer_than_the_plc_is_told():
+    """As docs/plc.md: lost and sent again, the last one before the PLC dies; no pause."""
+    gap = Gap(STALE_S)
+    sent_s = heartbeats(gap, 0.0, 2.0) + BEAT_S
+    gap.heard(True, sent_s - BEAT_S)
+    arrives_s = sent_s - BEAT_S + STALE_S  # later, and the gap would have closed before
+    for now_s in np.arange(sent_s, arrives_s - TICK_S, TICK_S):
+        gap.look(now_s)
+        assert not gap.closed(now_s)
+    gap.heard(True, arrives_s)
+    bound_s = 2.0 * STALE_S - BEAT_S
+    assert not gap.closed(sent_s + bound_s - TICK_S)
+    assert gap.closed(sent_s + bound_s + TICK_S)
+    assert bound_s + STALL_S == pytest.approx(0.9)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from maintenance_cell import (
     ARM,
+    BEAT_S,
     CELL,
+    DRIVING,
     HOME,
     LONG_S,
     POSES,
@@ -14,6 +16,7 @@ from maintenance_cell import (
     SILENT,
     SLOW,
     STALE_S,
+    TICK_S,
     TIMES,
     Cell,
     ToolNode,
@@ -25,6 +28,7 @@ from maintenance_cell import (
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, LimitError, StorageError
+from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import LEAVE
@@ -32,6 +36,9 @@ from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.hands import DEAF_S
+from robocal_ros.sessions.maintenance.mover import Mover
+from robocal_ros.sessions.robot_watch import VELOCITY_S
+from robocal_ros.sessions.tool_driving import SETTLED_S
 from robocal_ros.sim.joint_motion import JointMotion
 
 SMALL = ToolError(1e-4, 1.5e-4)
@@ -254,7 +261,7 @@ def test_a_tool_node_that_died_at_home_is_a_fault_that_can_be_acknowledged(cell)
 
 
 def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
-    """Nobody but itself can tell that nothing is under way."""
+    """One that is there must confirm, the same or a new one, and the robot must rest."""
     until_moving(cell, "tool")
     cell.tool_dies()
     cell.is_open = False
@@ -314,6 +321,62 @@ def test_a_deaf_tool_node_is_stopped_by_what_armed_it(cell, how):
         cell.session.acknowledge("me")
 
 
+@pytest.mark.parametrize(
+    ("how", "hears_s"), [("closed", BEAT_S), ("silent", STALE_S), ("cancelled", 0.0)]
+)
+def test_what_a_dead_tool_node_left_is_stopped_whoever_confirms(cell, how, hears_s):
+    """Started anew it confirms at once, but knows nothing of the plan that the controller has."""
+    until_moving(cell, "tool")
+    cell.tool_dies()
+    cell.tool = ToolNode()
+    if how == "cancelled":
+        cell.session.cancel("by the PLC")
+    else:
+        cell.is_open, cell.beating = how == "silent", how != "silent"
+    believed_s = DRIVING.late_s + SHORTEST_STOP_S + SETTLED_S
+    cell.pass_time(hears_s + believed_s + SHORTEST_STOP_S + 0.1)
+    assert cell.moved_s < cell.now_s - TICK_S
+    cell.finish()
+    over(cell, fault=how != "cancelled")
+    assert kinds(cell).count("Stop") == 1
+
+
+def test_a_confirmation_near_home_does_not_hand_over_what_a_dead_tool_node_left(cell):
+    cell.run("c1", LONG_S)
+    while not cell.tool.measuring:
+        cell.step()
+    cell.pass_time(0.06)
+    cell.tool_dies()
+    cell.tool = ToolNode()
+    cell.session.cancel("by the PLC")
+    while not cell.session.status(cell.now_s).disarmed:
+        cell.step()
+    assert cell.session.status(cell.now_s).at_home
+    cell.session.doubt_gap("two publish gap_open")
+    over(cell, fault=True)
+    assert kinds(cell)[-1] == "Stop"
+
+
+@pytest.mark.parametrize("silent_s", [0.6, 3.0])
+def test_a_deaf_tool_node_is_stopped_once_joint_states_are_back(cell, silent_s):
+    """Not before: nobody knows where to stop from. One that stands by then is not pushed."""
+    until_moving(cell, "tool")
+    cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    cell.silent = True
+    cell.is_open = False
+    cell.pass_time(silent_s)
+    assert "Stop" not in kinds(cell)
+    moving = cell.moved_s == cell.now_s
+    assert moving == (silent_s < 1.0)
+    cell.silent, heard_s, q = False, cell.now_s, cell.q
+    cell.pass_time(1.5)
+    assert kinds(cell).count("Stop") == 1
+    if moving:
+        assert cell.moved_s <= heard_s + VELOCITY_S + SHORTEST_STOP_S + 0.1
+    else:
+        np.testing.assert_allclose(cell.q, q, atol=1e-6)
+
+
 @pytest.mark.parametrize("how", ["closed", "cancelled"])
 def test_a_tool_node_that_hears_is_left_to_stop_by_itself(cell, how):
     """Two stops at once would pull the robot to and fro; nor is one left for the next run."""
@@ -345,6 +408,19 @@ def test_nodes_that_fail_leave_the_robot_at_home(cell, service, how):
     cell.run("c1", LONG_S)
     assert cell.finish().code is Code.ACCEPT
     over(cell)
+
+
+def test_a_defect_is_a_fault_and_no_cycle_is_left_without_a_code(cell, monkeypatch):
+    until_moving(cell, "thermal")
+    with monkeypatch.context() as patch:
+        patch.setattr(Mover, "arrived", lambda mover, now_s: 1 / 0)
+        cell.step()
+    result = cell.session.result("c1")
+    assert result.code is Code.CONFLICT
+    assert "ZeroDivisionError: division by zero" in result.message
+    assert "defect in test_maintenance.py:" in result.message
+    assert kinds(cell)[-1] == "Stop"
+    over(cell, fault=True)
 
 
 def test_silent_joint_states_stop_the_robot(cell):
@@ -596,6 +672,36 @@ def test_worst_cases_hold(cell):
         begun |= {type(r).__name__: cell.now_s for r in cell.log[count:]}
     took = cell.now_s - begun["Arm"]
     assert cell.config.times.check_s < took < worst["tool measurement (quick)"]
+
+
+def unsettled_rad(now_s: float, sent_s: float, plan: JointPlan) -> float:
+    """By how much the last joint is off, so that each rest takes nearly `rest_s`."""
+    late_s = TIMES.rest_s - 3 * TICK_S
+    arrives_s = sent_s + plan.duration_s + late_s
+    rests_s = arrives_s + late_s
+    if now_s < arrives_s:
+        return 1e-3
+    calm = rests_s <= now_s < rests_s + 0.1
+    trembles = now_s < rests_s + TIMES.measure_s + late_s and not calm
+    return 2e-4 * (round(now_s / TICK_S) % 2) * trembles
+
+
+def test_a_pose_takes_its_worst_case_and_no_more(history):
+    """The way, a rest there, the measurement, a rest before the next, which does not fit, home."""
+    cell = Cell(history, config_of(poses=POSES[:2], T_base_laser=None), services={"sensor": SILENT})
+    cell.open_gap()
+    cell.run("c1", cell.session.worst_cases()["one measuring pose"] + 2.0)
+    sent: list[tuple[float, ask.Move]] = []
+    while cell.state is State.RUNNING:
+        if sent:
+            cell.offset[-1] = unsettled_rad(cell.now_s + TICK_S, sent[-1][0], sent[-1][1].plan)
+        count = len(cell.log)
+        cell.step()
+        sent += [(cell.now_s, r) for r in cell.log[count:] if isinstance(r, ask.Move)]
+    assert "thermal measurement, 1 poses" in cell.session.result("c1").left
+    assert len(sent) == 2
+    took_s, worst_s = cell.now_s - sent[0][0], sent[0][1].worst_s
+    assert worst_s - 0.5 * TIMES.rest_s < took_s <= worst_s
 
 
 def accuracy(cell: Cell, level=AccuracyLevel.OK, error=SMALL):

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from maintenance_cell import (
     ARM,
     BEAT_S,
+    DRIVING,
     HOME,
     KNOWN,
     OK,
@@ -42,28 +43,51 @@ from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.proposals import Action
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.maintenance import AcceptBounds, State
+from robocal_ros.sessions.maintenance.hands import DEAF_S
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.tool_config import rows_of
+from robocal_ros.sessions.tool_driving import SETTLED_S
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 BUSY = (State.RUNNING, State.BREAKING_OFF)
 SERVICES = ("thermal", "arm", "disarm", "cancel", "measure", "sensor")
 STOPS_WITHIN_S = SHORTEST_STOP_S + 0.1  # with a tick and the controller's lag
+# A node that was started anew confirms that nothing moves: it is believed until a stop were over.
+LOOKED_AT_S = DRIVING.late_s + SHORTEST_STOP_S + SETTLED_S
+STANDS_FOR_S = 0.3
 
 BOUNDS = AcceptBounds(automatic=True)
 
 happenings = st.one_of(
     st.tuples(st.just("gap"), st.sampled_from(["open", "closed", "silent"])),
     st.tuples(st.just("beat"), st.sampled_from([BEAT_S, 0.9 * STALE_S, 1.5 * STALE_S])),
-    st.tuples(st.just("tool"), st.sampled_from(["dies", "starts"])),
+    st.tuples(st.just("tool"), st.sampled_from(["dies", "starts", "starts anew"])),
     st.tuples(st.just("joints"), st.sampled_from(["heard", "silent", "off", "far"])),
     st.tuples(st.just("service"), st.sampled_from(SERVICES), st.sampled_from([OK, SILENT])),
     st.tuples(st.just("run"), st.sampled_from(["first", "second"]), st.floats(1.0, 70.0)),
     st.tuples(st.just("cancel")),
     st.tuples(st.just("acknowledge")),
     st.tuples(st.just("restart")),
+    st.tuples(st.just("pause"), st.floats(0.05, 2.0)),
 )
 waits = st.one_of(st.floats(0.02, 2.0), st.floats(0.1, 25.0))
+anything = st.lists(st.tuples(waits, happenings), max_size=5)
+failures = st.sampled_from(
+    [
+        *(("gap", how) for how in ("closed", "silent")),
+        *(("tool", how) for how in ("dies", "starts", "starts anew")),
+        *(("joints", how) for how in ("silent", "heard")),
+        *(("service", name, SILENT) for name in ("disarm", "cancel")),
+        ("cancel",),
+        ("restart",),
+    ]
+)
+while_the_tool_moves = st.lists(
+    st.tuples(st.floats(0.02, 0.6), failures), min_size=2, max_size=6, unique_by=lambda one: one[1]
+)
+scenes = st.one_of(
+    st.tuples(st.just(False), anything), st.tuples(st.just(True), while_the_tool_moves)
+)
 DEAF = {"disarm": SILENT, "cancel": SILENT}
 services = st.one_of(
     st.sampled_from([{}, DEAF]),
@@ -122,7 +146,9 @@ class Watched:
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
         self.forbidden_s = np.inf  # since when nothing may move
-        self.blind = False  # nobody could have stopped the robot
+        self.within_s = STOPS_WITHIN_S
+        self.left = False  # the robot drives what a tool node left that is gone
+        self.killed_s = -np.inf  # the session was; what it moved is driven to its end
 
     def pass_time(self, seconds: float) -> None:
         for _ in range(max(round(seconds / TICK_S), 1)):
@@ -137,16 +163,33 @@ class Watched:
             assert not cell.tool.armed, "handed over armed"
         fresh = cell.heard and cell.now_s - cell.beat_s <= STALE_S
         allowed = fresh and cell.now_s < cell.ends_s
-        self.forbidden_s = np.inf if allowed else min(self.forbidden_s, cell.now_s)
-        self.blind |= cell.silent and self.tool_is_deaf()
-        if not self.blind:
-            assert cell.moved_s <= self.forbidden_s + STOPS_WITHIN_S, "moves in a closed gap"
+        self._look_at_motion(allowed)
 
-    def tool_is_deaf(self) -> bool:
+    def _look_at_motion(self, allowed: bool) -> None:
+        """Nothing moves in a closed gap, but for as long as nobody could stop it."""
+        cell = self.cell
+        if cell.now_s - max(cell.moved_s, self.killed_s) > STANDS_FOR_S:
+            self.left, self.killed_s = False, -np.inf
+        deaf = self._tool_is_deaf()
+        nobody_could = self.killed_s > 0.0 or (cell.silent and (deaf or self.left))
+        if allowed or nobody_could:
+            self.forbidden_s, self.within_s = np.inf, STOPS_WITHIN_S
+            return
+        self.forbidden_s = min(self.forbidden_s, cell.now_s)
+        later_s = LOOKED_AT_S if self.left else DEAF_S if deaf else 0.0
+        self.within_s = max(self.within_s, STOPS_WITHIN_S + later_s)
+        assert cell.moved_s <= self.forbidden_s + self.within_s, "moves in a closed gap"
+
+    def _tool_is_deaf(self) -> bool:
         """Nothing that it is told stops the tool node, or what it left behind."""
         how = [self.cell.services.get(name, OK) for name in ("disarm", "cancel")]
         deaf = self.cell.tool.measuring != 0 and how[0] == SILENT and how[1] != OK
         return deaf or not self.cell.tool.there
+
+    def until_the_tool_moves(self) -> None:
+        """As far as the run comes to it."""
+        while self.cell.state in BUSY and not self.cell.tool.measuring:
+            self.step()
 
     def do(self, happening: tuple[Any, ...]) -> None:
         cell = self.cell
@@ -157,10 +200,12 @@ class Watched:
                 cell.beating, cell.is_open = how != "silent", how != "closed"
             case ("beat", every_s):
                 cell.beats_every_s = every_s
-            case ("tool", "dies"):
-                cell.tool_dies()
-            case ("tool", "starts") if not cell.tool.there:
-                cell.tool = ToolNode()
+            case ("tool", how):
+                self.left |= how != "starts" and cell.tool.measuring != 0
+                if how != "starts":
+                    cell.tool_dies()
+                if how != "dies" and not cell.tool.there:
+                    cell.tool = ToolNode()
             case ("service", name, how):
                 cell.services[name] = how
             case ("joints", how):
@@ -176,8 +221,16 @@ class Watched:
                     assert not status.disarmed or not status.at_home
                 else:
                     assert cell.session.status(cell.now_s).state is not State.FAULT
-            case ("restart",) if cell.state not in BUSY:
+            case ("restart",):
+                self.killed_s = cell.now_s
                 cell.restart()
+            case ("pause", pause_s) if self.nothing_moves():
+                cell.pause(min(pause_s, max(cell.ends_s - cell.now_s, 0.0)))
+
+    def nothing_moves(self) -> bool:
+        """Whether a process that stands still could not have stopped anything."""
+        cell = self.cell
+        return not (cell.coming or cell.tool.armed) and cell.now_s - cell.moved_s > 0.1
 
     def let_it_end(self) -> None:
         """No run outlives its gap; then nothing is armed, and nothing runs again."""
@@ -202,11 +255,11 @@ class Watched:
     services,
     st.booleans(),
     st.tuples(gaps, st.sampled_from([0, 1, 3])),
-    st.lists(st.tuples(waits, happenings), max_size=5),
+    scenes,
 )
-def test_nothing_that_must_not_be(broken, right, gap, happening):
-    gap_s, poses = gap
-    config = config_of(bounds=BOUNDS, poses=POSES[:poses])
+def test_nothing_that_must_not_be(broken, right, gap, scene):
+    (gap_s, poses), (at_tool, happening) = gap, scene
+    config = config_of(bounds=BOUNDS, poses=POSES[: 0 if at_tool else poses])
     with (
         tempfile.TemporaryDirectory() as folder,
         CalibrationHistory.open("K1", state_dir=Path(folder)) as history,
@@ -216,6 +269,8 @@ def test_nothing_that_must_not_be(broken, right, gap, happening):
         watched = Watched(cell)
         cell.open_gap()
         cell.run("first", gap_s)
+        if at_tool:
+            watched.until_the_tool_moves()
         for wait_s, what in happening:
             watched.pass_time(wait_s)
             watched.do(what)

@@ -1,5 +1,9 @@
 """What is known of the tool: when it was checked, which one, and what may be concluded."""
 
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +20,7 @@ from maintenance_cell import (
     Cell,
     bent,
     config_of,
+    kinds,
     new_tool,
     opened,
     passed,
@@ -27,13 +32,15 @@ from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
-from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
+from robocal_ros.sessions.gap import STALL_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.settling import HELD_S
 from robocal_ros.sessions.tool_config import rows_of
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -220,6 +227,79 @@ def test_a_full_measurement_of_another_tool_is_not_credited(cell):
     assert level(cell) is AccuracyLevel.DEGRADED
 
 
+@pytest.fixture
+def checked(history) -> Cell:
+    """A tool that passed its check with the second of two thermal models; the next is far off."""
+    cell = opened(history, config=config_of(check_every_s=1e6))
+    for kelvin in (10.0, 20.0):
+        decide(cell, ACCEPT, thermal_proposed(history, kelvin))
+    decide(cell, ACCEPT, proposed(history))
+    cell.run("c1", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    assert level(cell) is AccuracyLevel.OK
+    cell.log.clear()
+    return cell
+
+
+OTHER_MODEL = "another thermal model is in force than it was checked with: check it"
+
+
+def is_due_until_checked(cell: Cell, *, error_known: bool) -> None:
+    assert level(cell) is AccuracyLevel.DUE
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert OTHER_MODEL in said.reason
+    assert (said.error is not None) == error_known
+    cell.restart()
+    assert level(cell) is AccuracyLevel.DUE
+    cell.pass_time(0.3)
+    cell.run("c2", LONG_S)
+    assert cell.finish().tool_answer == "pass"
+    assert modes(cell) == ["quick"]
+    assert level(cell) is AccuracyLevel.OK
+
+
+@pytest.mark.parametrize("by", ["the PLC", "another process"])
+def test_a_thermal_model_that_is_rolled_back_leaves_the_tool_due(checked, by):
+    """What was wrong with it may be in the tool."""
+    history = checked.history
+    first = next(d.calibration_id for d in history.decisions() if d.kind == THERMAL)
+    if by == "the PLC":
+        decide(checked, ROLLBACK, first)
+    else:
+        history.rollback(first, kind=THERMAL, by=by, reason="", wall_ns=0)
+    is_due_until_checked(checked, error_known=False)
+
+
+def test_a_thermal_model_that_is_accepted_leaves_the_tool_due(checked):
+    decide(checked, ACCEPT, thermal_proposed(checked.history, 30.0))
+    is_due_until_checked(checked, error_known=True)
+
+
+def test_the_model_that_a_tool_was_checked_with_may_come_back(checked):
+    history = checked.history
+    back = history.head(THERMAL).calibration_id
+    history.rollback(0, kind=THERMAL, by="a person", reason="", wall_ns=0)
+    assert level(checked) is AccuracyLevel.DUE
+    decide(checked, ROLLBACK, back)
+    assert level(checked) is AccuracyLevel.OK
+
+
+def test_a_tool_of_another_thermal_model_that_comes_back_is_due(checked):
+    history, tool = checked.history, checked.history.head(TOOL).calibration_id
+    decide(checked, ACCEPT, thermal_proposed(history, 30.0))
+    decide(checked, ACCEPT, proposed(history))
+    checked.run("c2", LONG_S)
+    assert checked.finish().tool_answer == "pass"
+    assert level(checked) is AccuracyLevel.OK
+    decide(checked, ROLLBACK, tool)
+    assert level(checked) is AccuracyLevel.DUE
+    checked.log.clear()
+    checked.run("c3", LONG_S)
+    checked.finish()
+    assert modes(checked) == ["quick"]
+    assert level(checked) is AccuracyLevel.OK
+
+
 def automatic(history, **changes) -> Cell:
     """A cell that may accept without a person, whose tool is found bent."""
     config = config_of(bounds=AcceptBounds(automatic=True), **changes)
@@ -344,12 +424,107 @@ def test_a_tool_of_another_thermal_revision_is_stale(cell):
     assert modes(cell) == ["full"]
 
 
+def copied(history: CalibrationHistory, calibration_id: int, count: int) -> None:
+    """So many more of a calibration, as other nodes would propose them."""
+    columns = (
+        "kind, model_hash, based_on, cycle_id, stamp_ns, created_ns, software, method, code, reason"
+    )
+    with closing(sqlite3.connect(history.path)) as raw, raw:
+        raw.execute(
+            "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < ?) "
+            f"INSERT INTO calibrations ({columns}) "
+            f"SELECT {columns} FROM calibrations, n WHERE id = ?",
+            (count, calibration_id),
+        )
+        raw.execute(
+            "INSERT INTO payloads SELECT c.id, p.name, p.data, p.sha256 FROM calibrations c, "
+            "payloads p WHERE p.calibration_id = ? AND c.id NOT IN "
+            "(SELECT calibration_id FROM payloads)",
+            (calibration_id,),
+        )
+
+
+def test_a_status_is_no_pause_however_many_candidates_wait(cell):
+    """It is asked for five times a second by the process that looks after the robot."""
+    history = cell.history
+    copied(history, proposed(history), 9_998)
+    outdated = proposed(history, thermal_revision=3)
+    copied(history, outdated, 10_000)
+    copied(history, thermal_proposed(history, 1.0), 9_999)
+    took_s = []
+    for _ in range(5):
+        begin_s = time.perf_counter()
+        status = cell.session.status(cell.now_s)
+        took_s.append(time.perf_counter() - begin_s)
+    assert (status.thermal_pending, status.tool_pending) == (30_000, 0)
+    assert min(took_s) < 0.1 * STALL_S
+    number = proposed(history)
+    assert cell.session.status(cell.now_s).tool_pending == number
+
+
 def test_a_tool_of_another_thermal_revision_is_not_accepted_without_a_person(history):
     cell = automatic(history)
     number = measured_in_full(cell, thermal_revision=3)
     result = cell.finish()
     assert f"tool candidate {number} waits for a decision: tool {number} was" in result.message
     assert result.accepted == ()
+
+
+@contextmanager
+def held_by_another(history: CalibrationHistory) -> Iterator[None]:
+    """Another process is in the middle of a change of the history."""
+    history.wait_at_most(0.0)
+    with closing(sqlite3.connect(history.path, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield
+        other.execute("ROLLBACK")
+
+
+def accepts(cell: Cell) -> list[Code]:
+    return [outcome.status for name, outcome in cell.events if name == ACCEPT]
+
+
+def until_back_home(cell: Cell) -> None:
+    """Until a measurement has ended, and the robot is at home again."""
+    while cell.tool.measuring or cell.tool.armed or not cell.at_home():
+        cell.step()
+        assert cell.now_s < cell.ends_s
+
+
+@pytest.mark.parametrize("kind", ["thermal", "tool"])
+def test_an_acceptance_that_meets_a_held_history_comes_later(history, kind):
+    cell = automatic(history, poses=POSES[: len(POSES) * (kind == "thermal")])
+    if kind == "thermal":
+        cell.check = passed()
+        number = thermal_candidate(cell)
+        cell.run("c1", LONG_S)
+        while kinds(cell)[-1:] != ["EndCycle"]:
+            cell.step()
+            assert cell.now_s < cell.ends_s
+    else:
+        number = measured_in_full(cell)
+        until_back_home(cell)
+    with held_by_another(history):
+        cell.pass_time(HELD_S / 2.0)
+        assert cell.state is State.RUNNING
+        assert history.head(kind).calibration_id is None
+    cell.check = passed()
+    assert cell.finish().accepted == (number,)
+    assert accepts(cell) == [Code.ACCEPT]  # told once
+
+
+def test_an_acceptance_waits_no_longer_than_it_may(history):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    with held_by_another(history):
+        until_back_home(cell)
+        home_s = cell.now_s
+        result = cell.finish()
+    assert HELD_S <= cell.now_s - home_s < HELD_S + 1.0
+    assert result.accepted == ()
+    assert "another process holds it" in result.message
+    assert cell.session.status(cell.now_s).tool_pending == number
+    assert accepts(cell) == [Code.STORAGE_FAILED]
 
 
 def until_verified(cell: Cell) -> None:

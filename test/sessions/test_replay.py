@@ -29,6 +29,7 @@ from robocal_ros.sessions.records import (
     read_command,
 )
 from robocal_ros.sessions.replay import (
+    NOT_BITS,
     feed,
     input_topics,
     read_events,
@@ -182,6 +183,21 @@ def test_other_samples_are_reported_as_a_difference(nominal, visits, tmp_path):
     report = replay(session_in(tmp_path / "again", nominal), lost, commands, None, take_message)
     assert report.differs
     assert "identify at" in report.differs[0]
+
+
+def test_a_difference_that_no_words_tell_is_called_so(nominal, visits, tmp_path):
+    """As from another processor, on which a sum is rounded otherwise."""
+    log = live(session_in(tmp_path / "live", nominal), visits)
+    _, commands = read_events(log)
+    samples = [recorded(s) for part in visits for s in part]
+    rounded = [
+        (command, outcome | ({"digest": "0" * 16} if outcome["digest"] else {}))
+        for command, outcome in commands
+    ]
+    again = session_in(tmp_path / "again", nominal)
+    report = replay(again, samples, rounded, None, take_message)
+    assert report.differs
+    assert all(f"as recorded in its words, {NOT_BITS}" in words for words in report.differs)
 
 
 def test_a_recording_that_began_later_starts_from_what_was_then_in_force(nominal, visits, tmp_path):

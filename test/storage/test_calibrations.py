@@ -148,6 +148,35 @@ class TestDecisions:
         assert (decision.action, decision.by, decision.reason) == (Action.ACCEPT, "Ada", "tested")
         assert (decision.head_before, decision.head_after) == (0, 1)
 
+    def test_the_newest_is_found_as_soon_however_many_were_refused(
+        self, history: CalibrationHistory
+    ) -> None:
+        def steps() -> int:
+            """Of SQLite's machine."""
+            count = 0
+
+            def step() -> None:
+                nonlocal count
+                count += 1
+
+            history._file.connection.set_progress_handler(step, 1)
+            assert [entry.id for entry in history.pending(limit=1)] == [newest]
+            history._file.connection.set_progress_handler(None, 0)
+            return count
+
+        for _ in range(3):
+            newest = history.propose(proposal())
+            history.propose(proposal(code=Code.WORSE_THAN_CURRENT))
+        few = steps()
+        with contextlib.closing(sqlite3.connect(history.path)) as raw, raw:
+            raw.executemany(
+                "INSERT INTO calibrations SELECT NULL, kind, model_hash, based_on, cycle_id, "
+                "stamp_ns, created_ns, software, method, code, reason, candidate_rms_mm "
+                "FROM calibrations WHERE id = ?",
+                [(newest + 1,)] * 10_000,
+            )
+        assert steps() == few
+
     def test_second_candidate_goes_stale(self, history: CalibrationHistory) -> None:
         first, second = history.propose(proposal()), history.propose(proposal())
         assert [e.id for e in history.pending()] == [second, first]

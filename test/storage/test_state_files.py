@@ -52,3 +52,12 @@ def test_a_state_that_is_no_document_is_refused(history):
         keeper.path.write_text(text)
         with pytest.raises(StorageError):
             keeper.load()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_number_that_is_not_finite_is_not_kept(history, bad):
+    keeper = StateFile(history, "maintenance")
+    keeper.save({"a": 1})
+    with pytest.raises(StorageError, match=r"state\.json: .*not JSON compliant"):
+        keeper.save({"a": bad})
+    assert keeper.load() == {"a": 1}

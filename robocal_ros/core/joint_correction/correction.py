@@ -164,9 +164,10 @@ class JointCorrection:
     def inverse(self) -> "JointCorrection":
         """The correction with the models exchanged: from corrected to taught joints.
 
-        Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1 and all six
-        equations hold; with a free axis it chooses another turn, which differs by the second
-        order of the shift: `staged.StagedCorrection.uncorrect` refines it.
+        Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1, all six
+        equations hold and no singularity lies within the shift (beyond it stands the mirrored
+        posture); with a free axis it chooses another turn, which differs by the second order of
+        the shift. `staged.StagedCorrection.uncorrect` refines both.
         """
         if self._inverse is None:
             self._inverse = JointCorrection(self.models[[2, 3, 0, 1]], self.largest, self.free_axis)

@@ -11,6 +11,7 @@ hands         what a script does with robot and nodes
 mover         one motion at a time, supervised
 ways          the ways that the robot may take
 deciding      accept, reject, roll back; what needs no person
+settling      what a run decides itself, with patience
 memory        what outlives a restart
 accuracy      drift, tool and faults in one state
 status        what is said

@@ -34,17 +34,23 @@ class _Finding:
 
 
 def accuracy_of(
-    config: MaintenanceConfig, drift: Drift | None, memory: Memory, tool: Head, wall_ns: int
+    config: MaintenanceConfig,
+    drift: Drift | None,
+    memory: Memory,
+    tool: Head,
+    thermal_id: int,
+    wall_ns: int,
 ) -> Accuracy:
     """Judge everything at once; ``drift`` None: the thermal node is silent.
 
-    ``tool``: the one in force. The worst part gives the level.
+    ``tool``, ``thermal_id``: tool and thermal model (0: nominal) in force. The worst part gives the
+    level.
     """
     parts = []
     if len(config.poses):
         parts.append(_thermal(drift))
     if config.T_base_laser is not None:
-        parts.append(_tool(config, memory.tool, tool, wall_ns))
+        parts.append(_tool(config, memory.tool, tool, thermal_id, wall_ns))
     errors = [part.error for part in parts if part.error is not None]
     known = both_errors(*errors) if len(errors) == 2 else errors[0] if errors else None
     error = known if len(errors) == len(parts) else None
@@ -71,7 +77,9 @@ def _thermal(drift: Drift | None) -> _Finding:
     return _Finding(drift.level, f"drift: {drift.reason}", drift.error, drift.due_in_s)
 
 
-def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: int) -> _Finding:
+def _tool(
+    config: MaintenanceConfig, record: ToolRecord, tool: Head, thermal_id: int, wall_ns: int
+) -> _Finding:
     age_s = (wall_ns - record.wall_ns) / NS
     due_in_s = config.tool_due_s - age_s
     if not record.wall_ns:
@@ -95,6 +103,12 @@ def _tool(config: MaintenanceConfig, record: ToolRecord, tool: Head, wall_ns: in
     if not same:
         words = "tool: another one is in force than was checked: check it"
         return _Finding(AccuracyLevel.DUE, words, None, 0.0)
+    if record.thermal_id != thermal_id:
+        # A newer model knows the drift since the check. An older one was left for a reason, which
+        # may be in the tool.
+        words = "tool: another thermal model is in force than it was checked with: check it"
+        known = error if thermal_id > record.thermal_id else None
+        return _Finding(AccuracyLevel.DUE, words, known, 0.0)
     if record.answer == "cannot tell" or due_in_s <= 0.0:
         words = f"tool: {when}, {record.words}"
         return _Finding(AccuracyLevel.DUE, words, error, min(due_in_s, 0.0))

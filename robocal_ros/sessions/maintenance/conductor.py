@@ -1,6 +1,8 @@
 """Plays the script of a run from tick to tick, and stops everything where something is odd."""
 
 from collections.abc import Callable
+from pathlib import Path
+from traceback import extract_tb
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -31,6 +33,7 @@ class Conductor:
         self.run: Run | None = None
         self.broken: tuple[Code, str] | None = None
         self._script: Script[None] | None = None
+        self._unsaved = False
 
     def begin(self, run: Run) -> None:
         """A run begins at the next tick; nothing moves before the tool's driver is disarmed."""
@@ -40,12 +43,17 @@ class Conductor:
 
     def tick(self, wall_ns: int) -> None:
         """Look after gap and robot, then go on."""
+        if self._unsaved:
+            self._save()
         run, hands = self.run, self._hands
+        hands.look_after_tool()
         if run is None:
             hands.keep_disarming()
             return
         run.at(wall_ns)
         try:
+            if hands.may_wait():
+                return
             if why := hands.gap.over(hands.now_s):
                 self.give_up(why)
                 return
@@ -58,6 +66,8 @@ class Conductor:
             self.fault(error.code, str(error))
         except RobocalError as error:
             self._failed(error)
+        except Exception as error:  # a defect: the script is over, and the robot may move
+            self.fault(Code.CONFLICT, _defect(error))
 
     def break_off(self, code: Code, reason: str) -> None:
         """Stop the robot, and bring it home; the run ends with this code."""
@@ -78,14 +88,19 @@ class Conductor:
             hands.disengage()
         self.run, hands.doing = None, "fault"
         self._tell(FAULT, {}, code, reason)
-        self._keep(run, code, reason, fault=reason)
+        self._note(run, code, reason, fault=reason)
+        # A stop does not wait for the disk: without this write too the next start finds a fault.
+        self._unsaved = bool(hands.out) and not at_once
+        if not self._unsaved:
+            self._save()
 
     def give_up(self, why: str, at_once: bool = False) -> None:
         """End the run now: at home and disarmed it just ends, anywhere else it is a `fault`."""
         hands = self._hands
         if self.run is None:
             return
-        if hands.tool.engaged or hands.robot.moving or hands.robot.beside_home():
+        doubt = hands.tool.engaged or hands.tool.armed
+        if doubt or hands.robot.moving or hands.robot.beside_home():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
@@ -117,22 +132,33 @@ class Conductor:
         self._close_script()
         run, self.run = self.run, None
         self._hands.doing = ""
-        self._keep(run, code, message)
+        self._note(run, code, message)
+        self._save()
 
-    def _keep(self, run: Run | None, code: Code, message: str, fault: str = "") -> None:
+    def _note(self, run: Run | None, code: Code, message: str, fault: str = "") -> None:
+        if run is None:
+            self._memory.set_fault(code, fault)
+            return
+        result = run.ended(code, message)
+        self._tell(ENDED, result.document(), code, message)
+        self._memory.end(result, code if fault else Code.NONE, fault)
+
+    def _save(self) -> None:
+        self._unsaved, memory = False, self._memory
         try:
-            if run is not None:
-                result = run.ended(code, message)
-                self._tell(ENDED, result.document(), code, message)
-                self._memory.end(result, code if fault else Code.NONE, fault)
-            else:
-                self._memory.set_fault(code, fault)
+            memory.save()
         except RobocalError as error:  # what is in memory holds; it is a fault all the same
-            self._memory.fault_code = error.code
-            self._memory.fault = f"{fault}; {error}" if fault else str(error)
+            memory.fault_code = error.code
+            memory.fault = f"{memory.fault}; {error}" if memory.fault else str(error)
 
     def _close_script(self) -> None:
         if self._script is not None:
             self._script.close()
         self._script = None
         self._hands.forget_answers()
+
+
+def _defect(error: Exception) -> str:
+    """Where it is, for whoever mends it."""
+    place = extract_tb(error.__traceback__)[-1]
+    return f"defect in {Path(place.filename).name}:{place.lineno}: {type(error).__name__}: {error}"

@@ -39,6 +39,14 @@ class Decider:
         found = self._history.pending(kind)
         return [entry for entry in found if not self._outdated(entry)]
 
+    def newest(self, kind: str) -> Entry | None:
+        """The first of them, however many there are; None where nothing waits.
+
+        Where the newest tool is outdated, those measured before it are too: revisions only grow.
+        """
+        found = self._history.pending(kind, 1)
+        return found[0] if found and not self._outdated(found[0]) else None
+
     def _outdated(self, entry: Entry) -> str:
         """Why it is STALE although its own kind's revision is in force; else empty."""
         try:
@@ -54,6 +62,10 @@ class Decider:
     def revision(self, kind: str) -> int:
         """Of what is in force."""
         return self.head(kind).revision
+
+    def thermal_id(self) -> int:
+        """The thermal model in force; 0: the nominal one."""
+        return self.head(THERMAL).calibration_id or 0
 
     def in_force(self, kind: str, calibration_id: int) -> bool:
         """Whether it is this one."""
@@ -102,7 +114,7 @@ class Decider:
         ConflictError
             When nothing waits, or candidates of both kinds.
         """
-        newest = [found[0] for kind in KINDS if (found := self.pending(kind))]
+        newest = [found for kind in KINDS if (found := self.newest(kind))]
         if len(newest) != 1:
             words = ", ".join(f"{entry.id} ({entry.kind})" for entry in newest) or "none"
             raise ConflictError(f"one candidate must wait, found {words}: decide by id")
@@ -112,7 +124,7 @@ class Decider:
         """A decision without an id; each outcome as soon as it is made.
 
         Accept: the one candidate that waits. Reject: all that wait. Rollback: take the last
-        acceptance back. The last two may come twice: nothing more is done.
+        acceptance back. Each may come twice: nothing more is done.
 
         Raises
         ------
@@ -123,7 +135,7 @@ class Decider:
             yield self._take_back(by, wall_ns)
             return
         if name == ACCEPT:
-            yield self.decide(name, self.only_pending().id, by, "", wall_ns)
+            yield self.decide(name, self._meant(by), by, "", wall_ns)
             return
         waiting = [entry.id for kind in KINDS for entry in self.pending(kind)]
         if not waiting:
@@ -134,6 +146,14 @@ class Decider:
             except RobocalError as error:  # those before it stay rejected, and are told
                 command = Command(name, {"id": number, "by": by, "reason": ""})
                 yield Outcome(command, error.code, str(error))
+
+    def _meant(self, by: str) -> int:
+        """The candidate to accept; where none waits, what the same caller accepted just before."""
+        waits = any(self.pending(kind) for kind in KINDS)
+        made = [] if waits else [d for d in self._history.decisions() if d.kind in KINDS]
+        if made and made[-1].action is Action.ACCEPT and made[-1].by == by:
+            return made[-1].calibration_id or 0
+        return self.only_pending().id
 
     def _take_back(self, by: str, wall_ns: int) -> Outcome:
         made = [d for d in self._history.decisions() if d.kind in KINDS]

@@ -7,6 +7,9 @@ cannot move anything: its service has not existed for `GONE_S`, with each disarm
 node that starts is found sooner, and starts disarmed); this node has not armed it since the last
 confirmed disarm, so that no motion that was asked for here can be under way, not the rest of a
 dead node's trajectory either; and the robot rests at home (`Hands` looks).
+
+A node that was started anew confirms too, but knows nothing of that trajectory. So a confirmation
+tells what will be sent, and only a robot that rests after it that nothing is under way any more.
 """
 
 import numpy as np
@@ -23,14 +26,15 @@ class Disarming:
     Attributes
     ----------
     engaged : it may be armed.
-    armed : this node armed it, and no disarm was confirmed since.
+    armed : this node armed it, and since then the robot has not rested with a disarm confirmed.
+    confirmed_s : when a disarm was confirmed last.
     """
 
     def __init__(self) -> None:
         self.engaged = self.armed = False
         self._asked: set[int] = set()
         self._newest, self._heard = 0, False
-        self._asked_s = -np.inf
+        self._asked_s = self.confirmed_s = -np.inf
         self._absent_from_s = np.inf
 
     def doubt(self) -> None:
@@ -52,7 +56,7 @@ class Disarming:
         self._asked.discard(number)
         self._heard |= number == self._newest
         if answer.done:
-            self.engaged = self.armed = False
+            self.engaged, self.confirmed_s = False, now_s
         self._absent_from_s = min(self._absent_from_s, now_s) if answer.absent else np.inf
 
     def again(self, now_s: float) -> bool:

@@ -60,7 +60,7 @@ class Hands:
         self.tool = Disarming()
         self.measured: list[float] = []
         self.doing = ""
-        self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
+        self._stop_s = np.inf  # from when on the robot is stopped in the driver's place
         self._numbers = 0
         self._waiting: dict[int, Answer | None] = {}
 
@@ -69,6 +69,10 @@ class Hands:
     def fits(self, worst_s: float) -> bool:
         """Whether something that lasts so long at the most, way home included, fits the gap."""
         return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
+
+    def may_wait(self) -> bool:
+        """Whether nothing moves, and a heartbeat from after the own pause is yet to come."""
+        return not (self.robot.moving or self.tool.armed) and self.gap.waits(self.now_s)
 
     def handed_out(self) -> list[Request]:
         """The requests that wait; they are somebody else's now."""
@@ -85,7 +89,10 @@ class Hands:
 
     def answered(self, number: int, answer: Answer) -> None:
         """An answer came; one that nobody waits for is none."""
+        doubted = self.tool.engaged
         self.tool.answered(number, answer, self.now_s)
+        if doubted and not self.tool.engaged:
+            self._stop_s = self.now_s + self.robot.stops_within_s
         if number in self._waiting:
             self._waiting[number] = answer
 
@@ -130,7 +137,7 @@ class Hands:
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
         self.doubt()
-        self.tool.armed, self._deaf_s = True, np.inf
+        self.tool.armed, self._stop_s = True, np.inf
         self.robot.place = STATION
         answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm)
         self.tool.armed = not answer.absent
@@ -141,9 +148,20 @@ class Hands:
         self.request(CancelMeasure)
         self._ask_disarm()
 
+    def look_after_tool(self) -> None:
+        """Stop what its driver does not; do not wait for one that is gone, see `disarming`."""
+        tool, rests = self.tool, self.robot.resting(STANDS_S) is not None
+        if tool.armed and not tool.engaged:
+            tool.armed = not rests or self.now_s < tool.confirmed_s + STANDS_S
+        # One that is deaf may yet send something, so that a robot that stands is held.
+        moves = tool.engaged or self.robot.resting(SETTLED_S) is None
+        if tool.armed and moves and self.now_s >= self._stop_s:
+            self._stop_measured()
+        if tool.gone(self.now_s) and not self.robot.beside_home():
+            tool.engaged &= not rests
+
     def keep_disarming(self) -> None:
         """Ask again where nobody confirmed."""
-        self._let_go()
         if self.tool.again(self.now_s):
             self._ask_disarm()
 
@@ -162,17 +180,9 @@ class Hands:
                 words = f"the tool node does not confirm that it disarmed; {self.tool.words()}"
                 raise FaultError(Code.CONFLICT, words)
             yield
-            self._let_go()
 
     def _ask_disarm(self) -> None:
         self.tool.asked(self.request(Disarm), self.now_s)
-
-    def _let_go(self) -> None:
-        """Stop what a deaf driver moves; do not wait for one that is gone, see `disarming`."""
-        if self.tool.armed and self.now_s >= self._deaf_s:
-            self._stop_measured()
-        if self.tool.gone(self.now_s) and not self.robot.beside_home():
-            self.tool.engaged &= self.robot.resting(STANDS_S) is None
 
     def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[Answer]:
         """Let the armed driver measure, for a limited time; a longer run is broken off.
@@ -193,7 +203,7 @@ class Hands:
     # ---- motions --------------------------------------------------------------------------------
 
     def stand(self, span_s: float = SETTLED_S) -> Script[Array]:
-        """Wait until the robot rests; its joints (n,).
+        """Wait until the robot rests, and nothing that this node armed moves it; its joints (n,).
 
         Raises
         ------
@@ -201,7 +211,7 @@ class Hands:
             When it does not come to rest.
         """
         until_s = self.now_s + self.config.times.rest_s
-        while (q := self.robot.resting(span_s)) is None:
+        while (q := self.robot.resting(span_s)) is None or self.tool.armed:
             if self.now_s >= until_s:
                 words = "the robot does not come to rest, or its joint states are missing"
                 raise FaultError(Code.CONFLICT, words)
@@ -236,12 +246,12 @@ class Hands:
             self.request(Stop, plan)
         elif self.tool.armed and at_once:
             self._stop_measured()
-        elif self.tool.armed:
-            self._deaf_s = self.now_s + DEAF_S
+        elif self.tool.engaged and self.tool.armed:
+            self._stop_s = self.now_s + DEAF_S
 
     def _stop_measured(self) -> None:
-        self._deaf_s = np.inf
         if (plan := self.robot.stop_measured(self.now_s)) is not None:
+            self._stop_s = np.inf
             self.request(Stop, plan)
 
     def go_home(self) -> Script[None]:

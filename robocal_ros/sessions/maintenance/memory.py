@@ -70,6 +70,7 @@ class ToolRecord:
     answer : "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong
         and has no result; empty: never measured.
     revision : of the tool that was in force in the last run.
+    thermal_id : thermal model that was in force in it; 0: the nominal one.
     candidate : calibration that a full measurement proposes in its place; 0: none.
     wall_ns, full_ns : of its last result, and of the last full one; 0: none.
     drift_rms_m, drift_bound_m : error of the thermal model through which a tool was last measured.
@@ -80,6 +81,7 @@ class ToolRecord:
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
     revision: int = 0
+    thermal_id: int = 0
     candidate: int = 0
     wall_ns: int = 0
     full_ns: int = 0
@@ -119,6 +121,7 @@ class Memory:
             memory = cls(keeper)
             known = "ended cycles, whose ids would run again, the last check, an open fault"
             memory.set_fault(error.code, f"{error} ({known}): see where the robot is")
+            memory.save()
             return memory
         if document is None:
             return cls(keeper)
@@ -135,6 +138,7 @@ class Memory:
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
             result = CycleResult(memory.running, Code.CONFLICT, words)
             memory.end(result, Code.CONFLICT, words)
+            memory.save()
         return memory
 
     def begin(self, cycle_id: str) -> None:
@@ -147,14 +151,13 @@ class Memory:
             raise
 
     def end(self, result: CycleResult, fault_code: Code = Code.NONE, fault: str = "") -> None:
-        """It has ended, for good."""
+        """It has ended, for good; `save` keeps that."""
         self.running = ""
         self.cycles[result.cycle_id] = result
         while len(self.cycles) > REMEMBERED:
             del self.cycles[next(iter(self.cycles))]
         if fault:
             self.fault_code, self.fault = fault_code, fault
-        self.save()
 
     def note_tool(self, **known: Any) -> None:
         """The tool was measured."""
@@ -162,9 +165,8 @@ class Memory:
         self.save()
 
     def set_fault(self, code: Code, words: str) -> None:
-        """A fault."""
+        """A fault; `save` keeps it."""
         self.fault_code, self.fault = code, words
-        self.save()
 
     def clear_fault(self) -> None:
         """Its end; it stays where that cannot be kept."""

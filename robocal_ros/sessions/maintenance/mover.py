@@ -6,10 +6,10 @@ from numpy.typing import NDArray
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.motion.stopping import stop
+from robocal_ros.core.motion.stopping import stop, stop_time
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Line, Route, Ways
-from robocal_ros.sessions.robot_watch import RobotWatch
+from robocal_ros.sessions.robot_watch import VELOCITY_S, RobotWatch
 
 Array = NDArray[np.float64]
 
@@ -28,12 +28,16 @@ class Mover:
     Attributes
     ----------
     place : point, line or station at which it was last known to be.
+    stops_within_s : a stop that was sent is over in the readings by then, from any speed.
     """
 
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
         self._config, self._ways = config, ways
         self._arm = ways.cell.arm
-        self._watch = RobotWatch(self._arm, config.driving.late_s)
+        driving = config.driving
+        self._watch = RobotWatch(self._arm, driving.late_s)
+        fastest = driving.limits.of_joints(self._arm)[0]
+        self.stops_within_s = driving.late_s + float(stop_time(self._arm, driving.limits, fastest))
         self._q: Array | None = None
         self._route: Route | None = None
         self._sent_s = 0.0
@@ -169,8 +173,11 @@ class Mover:
         return stop(self._arm, self._config.driving.limits, *state)
 
     def stop_measured(self, now_s: float) -> JointPlan | None:
-        """The stop of whatever moves the robot, from its readings alone; None while these fail."""
-        if self.silent:
+        """The stop of whatever moves the robot, from its readings alone; None while these fail.
+
+        Just after a silence too: its mean speed would drive on a robot that has stopped meanwhile.
+        """
+        if self.silent or not self._watch.tells_speed(VELOCITY_S + self._config.driving.silence_s):
             return None
         state = self._watch.state(now_s, keeps=False)
         return stop(self._arm, self._config.driving.limits, *state)

@@ -6,13 +6,14 @@ from dataclasses import replace
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.sessions.events import ACCEPT, LEAVE, Command, Outcome
+from robocal_ros.sessions.events import LEAVE, Command, Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
+from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
 from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.settling import is_accepted, settled
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
 
@@ -92,17 +93,17 @@ class Run:
         if not (answer.done and answer.candidate_id):
             return
         # EXPIRED was said before this measurement, and must not keep its result waiting.
-        why = self._decider.withheld(answer.candidate_id) or self._unsound(AccuracyLevel.FAULT)
-        if why:
-            withheld = withholding(THERMAL, answer.candidate_id, why)
-            self._decided(withheld)
-            self._tell(withheld.message)
-            return
-        within = "within the configured bounds"
-        done = self._decider.decide(ACCEPT, answer.candidate_id, BY, within, self.wall_ns)
-        self._decided(done)
-        self._tell(done.message)
-        if done.done:
+        found = yield from settled(
+            self._hands,
+            self._decider,
+            THERMAL,
+            answer.candidate_id,
+            lambda: self._unsound(AccuracyLevel.FAULT),
+            self.wall_ns,
+        )
+        self._decided(found)
+        self._tell(found.message)
+        if is_accepted(found):
             self._accepted(answer.candidate_id)
 
     def _measure_tool(self) -> Script[None]:

@@ -253,8 +253,8 @@ class MaintenanceSession:
         named = last.cycle_id if last is not None else ""
         thermal, tool, trouble = 0, 0, ""
         try:
-            pending = [self._decider.pending(kind) for kind in (THERMAL, TOOL)]
-            thermal, tool = (found[0].id if found else 0 for found in pending)
+            newest = [self._decider.newest(kind) for kind in (THERMAL, TOOL)]
+            thermal, tool = (found.id if found else 0 for found in newest)
         except RobocalError as error:
             trouble = str(error)
         return Status(
@@ -275,9 +275,9 @@ class MaintenanceSession:
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""
-        return accuracy_of(
-            self.config, self._heard_drift(now_s), self._memory, self._decider.head(TOOL), wall_ns
-        )
+        tool, thermal_id = self._decider.head(TOOL), self._decider.thermal_id()
+        drift = self._heard_drift(now_s)
+        return accuracy_of(self.config, drift, self._memory, tool, thermal_id, wall_ns)
 
     def _heard_drift(self, now_s: float) -> Drift | None:
         """None while the thermal part is silent."""

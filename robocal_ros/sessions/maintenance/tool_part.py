@@ -9,10 +9,11 @@ from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import ToolError
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.config import Times
-from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
+from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.settling import is_accepted, patiently, settled
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook
 from robocal_ros.sessions.tool_driving import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
@@ -81,16 +82,18 @@ class ToolPart:
         self._decided, self._unsure, self._drift = decided, unsure, drift
         self._times = hands.config.times
         self._checked = 0  # revision of the tool that the last measurement was about
+        self._through = 0  # thermal model that gave its flange poses
         self.wall_ns = 0
         self.outcome = ToolOutcome()
 
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
         record, config = self._memory.tool, self._hands.config
-        if config.T_base_laser is None or self._decider.pending(TOOL):
+        if config.T_base_laser is None or self._decider.newest(TOOL):
             return ""
         known = 0 < record.wall_ns <= self.wall_ns
         known = known and record.revision == self._decider.revision(TOOL)
+        known = known and record.thermal_id == self._decider.thermal_id()
         if known and record.answer in ("recalibrate", "cannot tell"):
             return FULL
         known = known and record.answer != "failed"
@@ -102,8 +105,8 @@ class ToolPart:
         outcome = self.outcome
         wanted = self.wants()
         if not wanted:
-            if waiting := self._decider.pending(TOOL):
-                outcome.told = f"tool candidate {waiting[0].id} waits for a decision"
+            if waiting := self._decider.newest(TOOL):
+                outcome.told = f"tool candidate {waiting.id} waits for a decision"
             return
         if wanted == QUICK:
             if not (yield from self._check(cycle_id, "check", outcome)):
@@ -147,26 +150,19 @@ class ToolPart:
         if not answer.done:
             outcome.told = f"tool measurement {answer.candidate_id}: {answer.message}"
             return
-        if why := self._withheld(answer.candidate_id):
-            withheld = withholding(TOOL, answer.candidate_id, why)
-            self._decided(withheld)
-            outcome.told = withheld.message
-            return
-        done = self._decider.decide(
-            "accept", answer.candidate_id, BY, "within the configured bounds", self.wall_ns
+        found = yield from settled(
+            self._hands, self._decider, TOOL, answer.candidate_id, self._doubt, self.wall_ns
         )
-        self._decided(done)
-        if not done.done:
-            outcome.told = done.message
+        self._decided(found)
+        if not is_accepted(found):
+            outcome.told = found.message
             return
         outcome.accepted = True
         yield from self._verify(cycle_id, outcome)
 
-    def _withheld(self, candidate_id: int) -> str:
-        """Why the candidate waits for a person; empty: it need not."""
-        if self._book.moved:
-            return MOVED
-        return self._decider.withheld(candidate_id) or self._unsure()
+    def _doubt(self) -> str:
+        """Why a candidate inside the bounds waits for a person all the same; empty: it need not."""
+        return MOVED if self._book.moved else self._unsure()
 
     def _verify(self, cycle_id: str, outcome: ToolOutcome) -> Script[None]:
         """Check the tool that was just accepted; one that is not right is taken back."""
@@ -176,11 +172,14 @@ class ToolPart:
         elif not verified:
             outcome.left = "verification of the accepted tool"
         elif outcome.checked == "recalibrate":
-            self._take_back(outcome)
+            yield from self._take_back(outcome)
 
-    def _take_back(self, outcome: ToolOutcome) -> None:
+    def _take_back(self, outcome: ToolOutcome) -> Script[None]:
+        def act() -> Outcome:
+            return self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
+
         try:
-            back = self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
+            back = yield from patiently(self._hands, act)
             self._decided(back)
             why = "" if back.done else back.message
         except RobocalError as error:
@@ -196,6 +195,7 @@ class ToolPart:
     def _measured(self, mode: str, cycle_id: str, outcome: ToolOutcome) -> Script[Answer | None]:
         """From home and back home; None where it did not fit, or gave no result for this tool."""
         hands = self._hands
+        yield  # what was kept just before may have taken its time: the gap is looked at again
         if hands.tool.absent:
             outcome.left = f"tool measurement ({mode})"
             outcome.last = Answer(Code.CONFLICT, hands.tool.words(), absent=True)
@@ -205,7 +205,7 @@ class ToolPart:
             return None
         hands.doing = f"tool measurement ({mode})"
         yield from hands.stand(STANDS_S)
-        self._checked = self._decider.revision(TOOL)
+        self._checked, self._through = self._decider.revision(TOOL), self._decider.thermal_id()
         try:
             answer = yield from hands.arm()
             if answer.done:
@@ -226,7 +226,11 @@ class ToolPart:
         outcome.told = f"{outcome.left}: {answer.message}"
         if answer.code in FAILED:  # what an older check found of the tool holds no more
             self._memory.note_tool(
-                answer="failed", words=answer.message, revision=self._checked, candidate=0
+                answer="failed",
+                words=answer.message,
+                revision=self._checked,
+                thermal_id=self._through,
+                candidate=0,
             )
         return None
 
@@ -237,6 +241,7 @@ class ToolPart:
             deviation_mm=answer.deviation_mm,
             sigma_mm=answer.sigma_mm,
             revision=self._checked,
+            thermal_id=self._through,
             candidate=candidate,
             wall_ns=self.wall_ns,
         )

@@ -1,0 +1,137 @@
+"""A process that stands still now and then: a write that takes its time, a busy machine."""
+
+import pytest
+from maintenance_cell import (
+    BEAT_S,
+    KNOWN,
+    LAG_S,
+    LATE_S,
+    LONG_S,
+    STALE_S,
+    TICK_S,
+    Cell,
+    bent,
+    config_of,
+    kinds,
+    new_tool,
+    opened,
+    passed,
+    proposed,
+)
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.sessions.gap import DRAIN_S
+from robocal_ros.sessions.maintenance import AcceptBounds, State
+
+PAUSES_S = (0.3, 0.6, 3.0)
+FRESH_WITHIN_S = DRAIN_S + STALE_S  # after a pause
+
+
+@pytest.fixture
+def cell(history) -> Cell:
+    return opened(history)
+
+
+@pytest.mark.parametrize("pause_s", PAUSES_S)
+def test_a_write_that_takes_its_time_breaks_no_cycle_off(cell, pause_s):
+    cell.shelf.takes = lambda: cell.pause(pause_s)
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    result = cell.finish()
+    assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
+    assert result.tool_answer == "pass"
+
+
+@pytest.mark.parametrize("pause_s", PAUSES_S)
+def test_nor_does_one_between_two_measurements(history, pause_s):
+    """Check, full measurement and acceptance are each kept before the tool node is armed again."""
+    cell = opened(
+        history,
+        config=config_of(bounds=AcceptBounds(automatic=True)),
+        check=bent(),
+        drift=KNOWN,
+    )
+
+    def full(cell: Cell):
+        cell.check = passed()
+        return new_tool(proposed(cell.history))
+
+    cell.full = full
+    cell.shelf.takes = lambda: cell.pause(pause_s)
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
+    assert (len(result.accepted), result.tool_answer) == (1, "pass")
+
+
+@pytest.mark.parametrize("dies", ["before", "after"])
+def test_nothing_moves_where_the_plc_dies_while_a_cycle_is_written(cell, dies):
+    """What it sent before counts for nothing, when the process goes on."""
+
+    def takes() -> None:
+        cell.shelf.takes = lambda: None
+        cell.beating = dies == "after"
+        cell.pause(0.6)
+        cell.beating = False
+
+    cell.shelf.takes = takes
+    cell.run("c1", LONG_S)
+    before_s = cell.now_s
+    result = cell.finish()
+    assert cell.now_s <= before_s + FRESH_WITHIN_S + 2.0 * TICK_S
+    assert result.code is Code.CONFLICT
+    assert "gap_open is silent for more than 0.5 s" in result.message
+    assert set(kinds(cell)) <= {"Disarm", "CancelMeasure"}
+
+
+def test_a_false_that_waited_ends_the_cycle_at_once(cell):
+    def takes() -> None:
+        cell.shelf.takes = lambda: None
+        cell.is_open = False
+        cell.pause(0.6)
+
+    cell.shelf.takes = takes
+    cell.run("c1", LONG_S)
+    before_s = cell.now_s
+    result = cell.finish()
+    assert cell.now_s <= before_s + LATE_S + 2.0 * TICK_S
+    assert result.code is Code.CONFLICT
+    assert set(kinds(cell)) <= {"Disarm", "CancelMeasure"}
+
+
+def test_a_pause_in_a_motion_stops_the_robot(cell):
+    cell.run("c1", LONG_S)
+    while "Move" not in kinds(cell):
+        cell.step()
+    cell.pause(0.6)
+    result = cell.finish()
+    assert result.code is Code.CONFLICT
+    assert cell.state is State.FAULT
+    assert "Stop" in kinds(cell)
+
+
+def test_a_stop_does_not_wait_for_the_disk(cell):
+    cell.run("c1", LONG_S)
+    while "Move" not in kinds(cell):
+        cell.step()
+    cell.pass_time(0.5)
+    cell.shelf.takes = lambda: cell.pause(0.6)
+    cell.is_open, closed_s = False, cell.now_s
+    while cell.state is State.RUNNING:
+        cell.step()
+    cell.pass_time(1.0)
+    assert cell.moved_s <= closed_s + BEAT_S + SHORTEST_STOP_S + LAG_S + 2.0 * TICK_S
+    cell.restart()
+    assert "gap_open is false" in cell.session.status(cell.now_s).fault
+
+
+def test_a_fault_that_is_not_on_the_disk_yet_outlives_a_kill(cell):
+    cell.run("c1", LONG_S)
+    while "Move" not in kinds(cell):
+        cell.step()
+    cell.is_open = False
+    while cell.state is State.RUNNING:
+        cell.step()
+    cell.restart()
+    status = cell.session.status(cell.now_s)
+    assert (status.state, status.last.code) == (State.FAULT, Code.CONFLICT)
