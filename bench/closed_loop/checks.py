@@ -93,13 +93,13 @@ def power_table(found: Sequence[Checked]) -> Table:
         for one in own:
             by_size.setdefault(one.trial.size, []).append(one)
         words = ", ".join(
-            f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}"
+            f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}".lstrip(": ")
             for cells in by_size.values()
         )
         smallest = smallest_with_power((one.trial.size, one.right) for one in own)
         told = [c.code.name for c in own if smallest is None or c.trial.size < smallest]
         below = ", ".join(f"{name} {count}" for name, count in Counter(told).most_common())
-        usual = [c.right for c in by_size.get(SIZES[fault][0], own)]
+        usual = [c.right for c in by_size.get(SIZES.get(fault, (0.0,))[0], own)]
         share = 100.0 * sum(usual) / len(usual)
         table.add(
             fault, RIGHT[fault].name, words,

@@ -43,7 +43,7 @@ SWEEP: Mapping[Fault, tuple[float, ...]] = {
     "collision": (0.1, 0.2, 0.3, 0.5, 2.0),
     "wrong_tool": (0.2, 0.6, 1.0, 2.0, 10.0),
     "sensor_knocked": (0.05, 0.1, 0.15, 0.2, 1.0),
-    "sphere_knocked": (0.05, 0.1, 0.15, 0.2, 1.0),
+    "sphere_knocked": (0.02, 0.05, 0.1, 0.15, 0.2, 1.0),
     "beam_dirty": (0.1, 0.15, 0.2, 0.4, 0.6),
     "input_latency": (1.0, 4.0, 6.0, 20.0),
     "lost_messages": (0.02, 0.05, 0.1, 0.2),

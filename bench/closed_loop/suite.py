@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 
 NS = 1_000_000_000
 POLL_S = 0.1
-ACCURACY_S = 1.0  # so often the thermal node tells its own
 ENDS_RUN = (events.TOOL_STEP, events.BREAK_OFF)
 Record = Callable[[str, Command, Outcome | None], None]
 
@@ -115,7 +114,7 @@ class Suite:
         self._clock = Clock(0.0, 0)
         self._ending: dict[str, int] = {}  # request that a thermal command answers
         self._measuring = 0  # request that the open run answers
-        self._polled_s = self._told_s = -np.inf
+        self._polled_s = -np.inf
         self._offered: tuple[int, int] = (-1, -1)
 
     # ---- samples --------------------------------------------------------------------------------
@@ -257,7 +256,7 @@ class Suite:
         for node, session in (("thermal", self.thermal), ("tool", self.tool)):
             for outcome in session.poll():
                 self._record(node, outcome.command, outcome)
-        if self.maintenance.running is not None and self._polled_s >= self._told_s + ACCURACY_S:
+        if self.maintenance.running is not None:
             self._tell_drift()
         if self.correction is None:
             return
@@ -291,7 +290,6 @@ class Suite:
         return self.maintenance.accuracy(self._clock.now_s, self._clock.now_ns)
 
     def _tell_drift(self) -> None:
-        self._told_s = self._clock.now_s
         found = self.thermal.accuracy(self._clock.now_ns)
         drift = Drift(found.level, found.reason, found.error, found.due_in_s)
         self.maintenance.drift(drift, self._clock.now_s)

@@ -1,0 +1,58 @@
+"""The table of the fault checks can miss its goals; it says what was told of smaller faults."""
+
+import pytest
+
+from bench.closed_loop.checks import SEEN_BY_CHECK, SEEN_BY_CYCLE, Checked, power_table
+from bench.closed_loop.faults import RIGHT, SWEEP, Trial
+from robocal_ros.core.codes import Code
+from robocal_ros.sim.cell_faults import SIZES
+
+CELLS = range(10)
+TRIED = (*SEEN_BY_CHECK, *SEEN_BY_CYCLE)
+
+
+def found(fault, code_of):
+    """``code_of`` a size and a cell."""
+    return [
+        Checked(Trial(fault, size, cell), code_of(size, cell))
+        for cell in CELLS
+        for size in SWEEP.get(fault, (0.0,))
+    ]
+
+
+@pytest.mark.parametrize("fault", TRIED)
+def test_a_sweep_holds_the_usual_size_and_something_below_it(fault):
+    if fault not in SIZES:
+        assert fault not in SWEEP
+        return
+    assert SIZES[fault][0] in SWEEP[fault]
+    assert min(SWEEP[fault]) < SIZES[fault][0]
+
+
+@pytest.mark.parametrize("fault", TRIED)
+def test_a_fault_that_is_always_told_meets_its_goal(fault):
+    table = power_table(found(fault, lambda size, cell: RIGHT[fault]))
+    assert table.met
+    assert table.texts()[0][4] == ""
+
+
+@pytest.mark.parametrize(("missed", "met"), [(1, True), (2, False)])
+@pytest.mark.parametrize("fault", TRIED)
+def test_a_fault_that_is_told_in_fewer_than_nine_of_ten_cells_misses_it(fault, missed, met):
+    table = power_table(
+        found(fault, lambda size, cell: Code.ACCEPT if cell < missed else RIGHT[fault])
+    )
+    assert table.met is met
+
+
+def test_another_code_is_not_the_right_one():
+    assert not power_table(found("wrong_tool", lambda size, cell: Code.LIMIT_EXCEEDED)).met
+
+
+def test_what_is_told_of_smaller_faults_is_said():
+    table = power_table(
+        found("collision", lambda s, cell: Code.LIMIT_EXCEEDED if s >= 0.3 else Code.ACCEPT)
+    )
+    _, _, tried, smallest, below, _, _ = table.texts()[0]
+    assert "0.2 mm: 0/10, 0.3 mm: 10/10" in tried
+    assert (smallest, below) == ("0.3 mm", "ACCEPT 20")
