@@ -8,12 +8,13 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: the comparison is per thread
 
 import argparse
+import importlib
 import json
 import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,58 +25,29 @@ OUT = ROOT / "out" / "bench"
 KEPT = ROOT / "docs" / "figures"  # the last figures that stand in the documents
 
 
-def _parts() -> dict[str, Callable[[], Sequence[Table]]]:
-    from bench import (
-        correction,
-        correction_stream,
-        files,
-        hand_eye,
-        hand_eye_camera,
-        hand_eye_profiles,
-        hand_eye_tracker,
-        monte_carlo,
-        real_data,
-        replay_speed,
-        speed,
-        startup,
-        thermal,
-        tool,
-    )
-    from bench.closed_loop import checks
-    from bench.closed_loop import tables as closed_loop
+# Each part's module, which makes its ``tables()``; imported when asked for, since some load much.
+PARTS = {
+    "real_data": "real_data",
+    "monte_carlo": "monte_carlo",
+    "thermal": "thermal",
+    "tool": "tool",
+    "hand_eye": "hand_eye",
+    "hand_eye_camera": "hand_eye_camera",
+    "hand_eye_tracker": "hand_eye_tracker",
+    "speed": "times",
+    "correction": "correction",
+    "startup": "startup",
+    "correction_stream": "correction_stream",
+    "closed_loop": "closed_loop.tables",
+    "fault_checks": "closed_loop.checks",
+    "files": "files",
+    "replay_speed": "replay_speed",
+}
 
-    def times() -> Sequence[Table]:
-        return [
-            *speed.tables(),
-            *(of.speed_table() for of in (thermal, tool, hand_eye_profiles, hand_eye_camera)),
-        ]
 
-    def start() -> Sequence[Table]:
-        if startup.EXECUTABLES.is_dir():
-            return [startup.start_times()]
-        print("no nodes in install/ (run `make setup`): their start is left out")
-        return []
-
-    def streams() -> Sequence[Table]:
-        return correction_stream.tables() if startup.EXECUTABLES.is_dir() else []
-
-    return {
-        "real_data": real_data.tables,
-        "monte_carlo": monte_carlo.tables,
-        "thermal": thermal.tables,
-        "tool": tool.tables,
-        "hand_eye": hand_eye.tables,
-        "hand_eye_camera": hand_eye_camera.tables,
-        "hand_eye_tracker": hand_eye_tracker.tables,
-        "speed": times,
-        "correction": correction.tables,
-        "startup": start,
-        "correction_stream": streams,
-        "closed_loop": closed_loop.tables,
-        "fault_checks": checks.tables,
-        "files": lambda: [files.file_times()],
-        "replay_speed": replay_speed.tables,
-    }
+def _tables(part: str) -> Sequence[Table]:
+    made: Sequence[Table] = importlib.import_module(f"bench.{PARTS[part]}").tables()
+    return made
 
 
 def _commit() -> str:
@@ -117,20 +89,19 @@ def _write(folder: Path, part: str, tables: Sequence[Table], about: dict[str, st
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the chosen parts. 1 when a goal is missed."""
-    parts = _parts()
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
-    parser.add_argument("part", nargs="*", choices=[*parts, []], help=f"of {', '.join(parts)}")
+    parser.add_argument("part", nargs="*", choices=[*PARTS, []], help=f"of {', '.join(PARTS)}")
     parser.add_argument("--keep", action="store_true", help="write docs/figures too")
     given = parser.parse_args(arguments)
     chosen = given.part
     tables: list[Table] = []
     missed: list[str] = []
-    for name, make in parts.items():
+    for name in PARTS:
         if chosen and name not in chosen:
             continue
         start = time.monotonic()
         try:
-            made = make()
+            made = _tables(name)
         except subprocess.CalledProcessError as error:
             print(error.stderr, file=sys.stderr)
             missed.append(f"{name} could not be measured")

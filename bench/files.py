@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,11 @@ from robocal_ros.storage.tables import read_measurements, write_measurements
 ROUNDS = 5
 ROWS = 12_000
 MESSAGES = 20_000
+
+
+def tables() -> Sequence[Table]:
+    """All tables of this module."""
+    return [file_times()]
 
 
 def file_times() -> Table:
