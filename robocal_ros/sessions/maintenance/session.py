@@ -34,7 +34,6 @@ from robocal_ros.sessions.tool_results import FULL, QUICK
 Array = NDArray[np.float64]
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
-UNCONFIRMED = "the tool node has not confirmed that it is disarmed"
 MOST_ID = 100  # characters of a cycle's name
 
 
@@ -116,8 +115,7 @@ class MaintenanceSession:
             raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
         if (open_run := self._conductor.run) is not None:
             raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
-        if hands.tool.engaged:
-            raise ConflictError(f"{UNCONFIRMED}; {hands.tool.words()}")
+        hands.tool.require_disarmed()
         if why := hands.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
         hands.gap.begin(gap_s, now_s)
@@ -183,7 +181,8 @@ class MaintenanceSession:
         Raises
         ------
         ConflictError
-            While the tool node has not confirmed that it is disarmed, and is not gone.
+            While the tool node has not confirmed that it is disarmed, and is not gone, or what
+            it sent may still be driven.
         LimitError
             While the robot is not at home.
         StorageError
@@ -191,8 +190,7 @@ class MaintenanceSession:
         """
         if not self._memory.fault:
             return "there is no fault"
-        if self._hands.tool.engaged:
-            raise ConflictError(f"{UNCONFIRMED}; {self._hands.tool.words()}")
+        self._hands.tool.require_disarmed()
         if away := self._hands.robot.beside_home():
             raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
         words = f"acknowledged: {self._memory.fault}"
@@ -263,7 +261,7 @@ class MaintenanceSession:
             doing=hands.doing,
             left_s=0.0 if run is None else max(hands.gap.left_s(now_s), 0.0),
             at_home=not hands.robot.beside_home(),
-            disarmed=not hands.tool.engaged,
+            disarmed=not hands.tool.doubted,
             last=last,
             thermal_pending=thermal,
             tool_pending=tool,

@@ -29,7 +29,8 @@ class Status:
     cycle_id : that runs, or ran last.
     doing : in words.
     left_s : of the gap; 0 while nothing runs.
-    at_home, disarmed : of the robot and of the tool's driver, as far as is known.
+    at_home, disarmed : of the robot and of the tool's driver, as far as is known; disarmed is one
+        of which nothing is under way either.
     last : how the last cycle ended; None before any.
     thermal_pending, tool_pending : newest candidates that wait for a decision; 0: none.
     fault_code, fault : NONE and empty without one.
