@@ -25,7 +25,7 @@ from robocal_ros.nodes.maintenance_services import MaintenanceServices, Now
 from robocal_ros.nodes.maintenance_settings import SETTINGS, session_config
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
-from robocal_ros.nodes.steady_clock import steady_s
+from robocal_ros.nodes.steady_clock import SteadyClock
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
@@ -62,6 +62,7 @@ class MaintenanceNode(HouseNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._session: MaintenanceSession | None = None
+        self._steady = SteadyClock(self._slept)
         self._history: CalibrationHistory | None = None
         self._calls: MaintenanceServices | None = None
         self._driver: MaintenanceDriver | None = None
@@ -108,7 +109,7 @@ class MaintenanceNode(HouseNode):
     def deactivate(self) -> None:
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
-            self._carry_out(self._session.give_up(ENDS, steady_s()))
+            self._carry_out(self._session.give_up(ENDS, self._steady.now_s()))
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
             self._outputs.accuracy(gone, self._config.tolerance_m, self.now_ns())
@@ -139,12 +140,12 @@ class MaintenanceNode(HouseNode):
             raise InputError(fault)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
-        session.reading(sample.stamp_ns / NS, q, steady_s())
+        session.reading(sample.stamp_ns / NS, q, self._steady.now_s())
 
     def _take_gap(self, message: Any) -> None:
         if self._session is not None:
             self._session.doubt_gap(self._sources.doubt())
-            self._session.gap(message.data, steady_s())
+            self._session.gap(message.data, self._steady.now_s())
             self._tick()  # a gap that closes stops the robot now
 
     def _take_measurement(self, message: Any) -> None:
@@ -163,7 +164,7 @@ class MaintenanceNode(HouseNode):
             raise InputError(f"rms {rms_mm:g} mm, bound {bound_mm:g} mm, due in {due_in_s:g} s")
         known = rms_mm >= 0.0 and bound_mm >= 0.0
         found = ToolError(rms_mm * MM, bound_mm * MM) if known else None
-        self._session.drift(Drift(level, message.reason, found, due_in_s), steady_s())
+        self._session.drift(Drift(level, message.reason, found, due_in_s), self._steady.now_s())
 
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:
@@ -172,7 +173,11 @@ class MaintenanceNode(HouseNode):
     # ---- time -----------------------------------------------------------------------------------
 
     def _clocks(self) -> Now:
-        return Now(steady_s(), time.time_ns())
+        return Now(self._steady.now_s(), time.time_ns())
+
+    def _slept(self, for_s: float) -> None:
+        if self._session is not None:
+            self._session.slept(for_s)
 
     def _tick(self) -> None:
         if self._session is not None:
@@ -201,7 +206,7 @@ class MaintenanceNode(HouseNode):
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
-        status = session.status(steady_s())
+        status = session.status(self._steady.now_s())
         shown = replace(status, left_s=round(status.left_s))
         if shown != self._shown:
             self._shown = shown
@@ -222,7 +227,7 @@ class MaintenanceNode(HouseNode):
         session, health = self._session, Health()
         if session is None:
             return health
-        status = session.status(steady_s())
+        status = session.status(self._steady.now_s())
         values: dict[str, object] = {
             "state": status.state.name,
             "doing": status.doing or "nothing",

@@ -22,7 +22,7 @@ from robocal_ros.nodes.motion_settings import (
     trajectory_message,
 )
 from robocal_ros.nodes.parameters import Setting, length
-from robocal_ros.nodes.steady_clock import steady_s
+from robocal_ros.nodes.steady_clock import SteadyClock
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
@@ -67,6 +67,7 @@ class TcfMotion:
         )
         self._names: tuple[str, ...] = ()
         self.driver: ToolDriver | None = None
+        self._steady = SteadyClock(self._slept)
         self._output = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
         stale_s = settings["gap_stale_s"]
         self._gap = Gap(stale_s) if stale_s > 0.0 else None
@@ -93,7 +94,7 @@ class TcfMotion:
     def deactivate(self) -> None:
         """Stop what moves."""
         if self.driver is not None:
-            self.driver.disarm("the node was deactivated", steady_s())
+            self.driver.disarm("the node was deactivated", self._steady.now_s())
         self.driver = None
 
     def take(self, message: Any) -> None:
@@ -105,7 +106,7 @@ class TcfMotion:
             q = sample.position[sample.order(self._names)]
         except InputError:  # the session counts it; without readings the robot stops
             return
-        self.driver.reading(sample.stamp_ns / NS, q, steady_s())
+        self.driver.reading(sample.stamp_ns / NS, q, self._steady.now_s())
 
     def beam(self, message: Any) -> None:
         """Take a BeamEvent, usable or not: on its way the tool breaks no beam."""
@@ -131,13 +132,17 @@ class TcfMotion:
     def run_ended(self, outcome: Outcome) -> None:
         """A run without a result stops the robot."""
         if self.driver is not None and outcome.document is None:
-            self.driver.run_failed(outcome.message, steady_s())
+            self.driver.run_failed(outcome.message, self._steady.now_s())
 
     def _take_gap(self, message: Any) -> None:
         if self._gap is not None:
             self._gap.doubt(self._sources.doubt())
-            self._gap.heard(message.data, steady_s())
+            self._gap.heard(message.data, self._steady.now_s())
             self._tick()
+
+    def _slept(self, for_s: float) -> None:
+        if self.driver is not None:
+            self.driver.slept(for_s)
 
     def _closed(self, now_s: float) -> str:
         """Why nothing may move, where somebody says so; a pause of this process is looked for."""
@@ -147,7 +152,7 @@ class TcfMotion:
         return self._gap.closed(now_s)
 
     def _tick(self) -> None:
-        now_s = steady_s()
+        now_s = self._steady.now_s()
         if self._gap is not None:
             self._gap.look(now_s)
         if self.driver is not None:
@@ -160,7 +165,7 @@ class TcfMotion:
             # deactivation disarmed; who must know that nothing moves gets a plain answer
             response.success, response.message = True, "disarmed: the node is not active"
             return response
-        now_s = steady_s()
+        now_s = self._steady.now_s()
         if request.data:
             self.driver.arm(now_s)
         else:

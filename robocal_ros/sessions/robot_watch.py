@@ -53,6 +53,11 @@ class RobotWatch:
         """A plan was sent."""
         self._plan, self._cell, self._sent_s = plan, cell, now_s
 
+    def slept(self, for_s: float) -> None:
+        """The host was suspended for so long, and the plan with it: its controller is there too."""
+        self._sent_s += for_s
+        self._heard_s += for_s
+
     def forget(self) -> None:
         """No plan is in force any more."""
         self._plan = None
@@ -72,9 +77,13 @@ class RobotWatch:
         """How long the joint states have been silent."""
         return self.silence.lasts_s if self._readings else np.inf
 
+    def driven_s(self, now_s: float) -> float:
+        """How long the plan has been driven."""
+        return now_s - self._sent_s
+
     def overdue_s(self, now_s: float) -> float:
         """How long ago the plan ended; negative before."""
-        return -np.inf if self._plan is None else now_s - self._sent_s - self._plan.duration_s
+        return -np.inf if self._plan is None else self.driven_s(now_s) - self._plan.duration_s
 
     def at_end(self, now_s: float) -> bool:
         """Whether the plan has ended, with the robot where it ends."""
@@ -114,7 +123,7 @@ class RobotWatch:
         """
         q = self._readings[-1][1]
         if self._plan is not None and keeps:
-            return self._plan.at(now_s - self._sent_s)
+            return self._plan.at(self.driven_s(now_s))
         recent = self._since(VELOCITY_S)
         if recent is None:
             return q, np.zeros_like(q)

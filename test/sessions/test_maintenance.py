@@ -349,13 +349,18 @@ def test_a_confirmation_at_home_does_not_hand_over_what_a_dead_tool_node_left(ce
     cell.tool_dies()
     cell.tool = ToolNode()
     cell.session.cancel("by the PLC")
-    while not cell.session.status(cell.now_s).disarmed:
-        cell.step()
-    assert cell.session.status(cell.now_s).at_home
+    cell.pass_time(0.1)  # it has confirmed
+    status = cell.session.status(cell.now_s)
+    assert (status.at_home, status.disarmed) == (True, False)
     cell.session.doubt_gap("two publish gap_open")
+    cell.step()
+    with pytest.raises(ConflictError, match="may still be driven"):
+        cell.session.acknowledge("me")
     over(cell, fault=True)
     assert kinds(cell)[-1] == "Stop"
     assert cell.at_home()
+    assert cell.session.status(cell.now_s).disarmed
+    cell.session.acknowledge("me")
 
 
 @pytest.mark.parametrize("silent_s", [0.6, 3.0])

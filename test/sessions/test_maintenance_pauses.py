@@ -1,8 +1,10 @@
 """A process that stands still now and then: a write that takes its time, a busy machine."""
 
+import numpy as np
 import pytest
 from maintenance_cell import (
     BEAT_S,
+    DRIVING,
     KNOWN,
     LAG_S,
     LATE_S,
@@ -23,6 +25,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.gap import DRAIN_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
+from robocal_ros.sessions.maintenance.requests import Stop
 
 PAUSES_S = (0.3, 0.6, 3.0)
 FRESH_WITHIN_S = DRAIN_S + STALE_S  # after a pause
@@ -108,6 +111,21 @@ def test_a_pause_in_a_motion_stops_the_robot(cell):
     assert result.code is Code.CONFLICT
     assert cell.state is State.FAULT
     assert "Stop" in kinds(cell)
+
+
+def test_a_stop_after_a_suspend_begins_where_the_robot_stands(cell):
+    """Host and controller slept in the middle of a motion."""
+    cell.run("c1", LONG_S)
+    while "Move" not in kinds(cell):
+        cell.step()
+    cell.pass_time(0.6)
+    assert cell.moved_s == cell.now_s
+    cell.session.slept(3600.0)
+    asked = cell.session.tick(cell.now_s + 3600.0 + TICK_S, cell.wall_ns)
+    (stop,) = (request.plan for request in asked if isinstance(request, Stop))
+    behind_rad = DRIVING.limits.joint_velocity * (LAG_S + TICK_S)
+    assert np.max(np.abs(stop.q[0] - cell.q)) <= behind_rad
+    assert "gap_open is silent" in cell.session.status(cell.now_s).fault
 
 
 def test_a_stop_does_not_wait_for_the_disk(cell):

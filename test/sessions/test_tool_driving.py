@@ -142,6 +142,20 @@ def test_silent_joint_states_stop_it(robot, phase):
     stopped(robot, "joint states are silent")
 
 
+@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+def test_a_stop_after_a_suspend_begins_where_the_robot_stands(robot, phase):
+    """Host and controller slept in the middle of a motion."""
+    driving(robot, phase)
+    q = robot.q.copy()
+    robot.now_s += 3600.0
+    robot.driver.slept(3600.0)
+    robot.driver.tick(robot.now_s)
+    at_s, plan = robot.sent[-1]
+    assert at_s == robot.now_s
+    assert np.max(np.abs(plan.q[0] - q)) <= MotionLimits().joint_velocity * (LAG_S + PERIOD_S)
+    assert "gap_open is silent" in robot.driver.told
+
+
 def test_a_break_on_the_way_stops_it(robot):
     driving(robot, Phase.APPROACH)
     robot.edges.insert(0, EdgeSample(robot.ns(robot.now_s), "", "x", True, 1e-4))

@@ -99,8 +99,7 @@ class Conductor:
         hands = self._hands
         if self.run is None:
             return
-        doubt = hands.tool.engaged or hands.tool.armed
-        if doubt or hands.robot.moving or hands.robot.beside_home():
+        if hands.tool.doubted or hands.robot.moving or hands.robot.beside_home():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
@@ -114,7 +113,7 @@ class Conductor:
     def _script_ended(self, run: Run) -> None:
         if away := self._hands.robot.beside_home():
             self.fault(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
-        elif self._hands.tool.engaged:
+        elif self._hands.tool.doubted:
             self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)

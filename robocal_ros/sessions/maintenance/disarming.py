@@ -10,15 +10,17 @@ dead node's trajectory either; and the robot rests at home (`Hands` looks).
 
 A node that was started anew confirms too, but knows nothing of that trajectory. So a confirmation
 tells what will be sent; what was sent before it is over where the measurement has been answered, or
-was stopped from here, and the robot rests.
+was stopped from here, and the robot rests: until then it is in doubt as well.
 """
 
 import numpy as np
 
+from robocal_ros.core.errors import ConflictError
 from robocal_ros.sessions.maintenance.requests import Answer
 
 AGAIN_S = 0.5
 GONE_S = 5.0
+SENT = "what the tool node sent may still be driven: wait until the robot rests"
 
 
 class Disarming:
@@ -64,6 +66,11 @@ class Disarming:
         return self.engaged and now_s >= self._asked_s + AGAIN_S
 
     @property
+    def doubted(self) -> bool:
+        """Whether it may move the robot, or the controller what it sent."""
+        return self.engaged or self.armed
+
+    @property
     def absent(self) -> bool:
         """Whether the driver is not there, as far as the newest answer tells."""
         return bool(self._absent_from_s < np.inf)
@@ -77,3 +84,11 @@ class Disarming:
         if self.absent:
             return "the tool node is not there: start it, or leave 'laser' empty"
         return "the tool node is silent: wait for it, or start it anew"
+
+    def require_disarmed(self) -> None:
+        """Refuse, with a `ConflictError`, what needs a robot that nothing moves from there."""
+        if self.engaged:
+            words = "the tool node has not confirmed that it is disarmed"
+            raise ConflictError(f"{words}; {self.words()}")
+        if self.armed:
+            raise ConflictError(SENT)

@@ -40,7 +40,6 @@ class Mover:
         self.stops_within_s = driving.late_s + float(stop_time(self._arm, driving.limits, fastest))
         self._q: Array | None = None
         self._route: Route | None = None
-        self._sent_s = 0.0
         self.place: Line = (HOME, HOME)
         self.newest_s = -np.inf  # stamp of the newest reading
 
@@ -53,6 +52,10 @@ class Mover:
     def look(self, now_s: float) -> None:
         """Count silence; call it often."""
         self._watch.silence.look(now_s)
+
+    def slept(self, for_s: float) -> None:
+        """The host was suspended for so long."""
+        self._watch.slept(for_s)
 
     @property
     def moving(self) -> bool:
@@ -122,7 +125,7 @@ class Mover:
 
     def start(self, route: Route, now_s: float) -> None:
         """A route was sent."""
-        self._route, self._sent_s = route, now_s
+        self._route = route
         self._watch.follow(route.plan, self._ways.cell, now_s)
 
     def arrived(self, now_s: float) -> bool:
@@ -165,7 +168,7 @@ class Mover:
         if self._route is None or not self._watch.heard:
             return None
         state = self._watch.state(now_s, keeps=self._kept(*self._watch.away()))
-        self.place = self._route.line_at(now_s - self._sent_s)
+        self.place = self._route.line_at(self._watch.driven_s(now_s))
         if self.place == (STATION[0], HOME):
             self.place = STATION
         self._route = None

@@ -2,7 +2,8 @@
 
 Whoever drives it gives what happens (`gap`, `reading`, `measured`, `answered`, `drift`) and calls
 `tick` often, at least every 20 ms; `tick` gives the requests that are to be carried out at once, in
-their order. Times ``now_s`` are of one steady clock; ``wall_ns`` is the wall clock, for records.
+their order. Times ``now_s`` are of one steady clock, which goes on while the host is suspended;
+``wall_ns`` is the wall clock, for records.
 """
 
 from collections.abc import Callable
@@ -12,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.core.errors import ConflictError, InputError, LimitError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, TOOL
+from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift, accuracy_of
@@ -25,7 +26,7 @@ from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import CycleResult, Keeper, Memory
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
-from robocal_ros.sessions.maintenance.status import State, Status
+from robocal_ros.sessions.maintenance.status import State, Status, status_of
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import worst_s
 from robocal_ros.sessions.maintenance.ways import HOME, Ways
@@ -34,7 +35,6 @@ from robocal_ros.sessions.tool_results import FULL, QUICK
 Array = NDArray[np.float64]
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
-UNCONFIRMED = "the tool node has not confirmed that it is disarmed"
 MOST_ID = 100  # characters of a cycle's name
 
 
@@ -82,6 +82,10 @@ class MaintenanceSession:
         """Take joints (n,), in the arm's order; ``stamp_s`` on their own clock."""
         self._hands.robot.reading(stamp_s, q, now_s)
 
+    def slept(self, for_s: float) -> None:
+        """The host was suspended; call it before anything else with a time of afterwards."""
+        self._hands.robot.slept(for_s)
+
     def measured(self, stamp_s: float) -> None:
         """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
         self._hands.measured.append(stamp_s)
@@ -116,8 +120,7 @@ class MaintenanceSession:
             raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
         if (open_run := self._conductor.run) is not None:
             raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
-        if hands.tool.engaged:
-            raise ConflictError(f"{UNCONFIRMED}; {hands.tool.words()}")
+        hands.tool.require_disarmed()
         if why := hands.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
         hands.gap.begin(gap_s, now_s)
@@ -183,7 +186,8 @@ class MaintenanceSession:
         Raises
         ------
         ConflictError
-            While the tool node has not confirmed that it is disarmed, and is not gone.
+            While the tool node has not confirmed that it is disarmed, and is not gone, or what
+            it sent may still be driven.
         LimitError
             While the robot is not at home.
         StorageError
@@ -191,8 +195,7 @@ class MaintenanceSession:
         """
         if not self._memory.fault:
             return "there is no fault"
-        if self._hands.tool.engaged:
-            raise ConflictError(f"{UNCONFIRMED}; {self._hands.tool.words()}")
+        self._hands.tool.require_disarmed()
         if away := self._hands.robot.beside_home():
             raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
         words = f"acknowledged: {self._memory.fault}"
@@ -248,30 +251,7 @@ class MaintenanceSession:
 
     def status(self, now_s: float) -> Status:
         """Everything at once."""
-        memory, hands, run = self._memory, self._hands, self._conductor.run
-        last = next(reversed(memory.cycles.values()), None)
-        named = last.cycle_id if last is not None else ""
-        thermal, tool, trouble = 0, 0, ""
-        try:
-            newest = [self._decider.newest(kind) for kind in (THERMAL, TOOL)]
-            thermal, tool = (found.id if found else 0 for found in newest)
-        except RobocalError as error:
-            trouble = str(error)
-        return Status(
-            state=self.state,
-            cycle_id=named if run is None else run.result.cycle_id,
-            doing=hands.doing,
-            left_s=0.0 if run is None else max(hands.gap.left_s(now_s), 0.0),
-            at_home=not hands.robot.beside_home(),
-            disarmed=not hands.tool.engaged,
-            last=last,
-            thermal_pending=thermal,
-            tool_pending=tool,
-            fault_code=memory.fault_code,
-            fault=memory.fault,
-            closed=hands.gap.closed(now_s),
-            trouble=trouble,
-        )
+        return status_of(self.state, self.running, self._memory, self._hands, self._decider, now_s)
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""

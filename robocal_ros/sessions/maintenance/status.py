@@ -4,7 +4,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from robocal_ros.core.codes import Code
-from robocal_ros.sessions.maintenance.memory import CycleResult
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.proposals import THERMAL, TOOL
+from robocal_ros.sessions.maintenance.deciding import Decider
+from robocal_ros.sessions.maintenance.hands import Hands
+from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
 
 
 class State(IntEnum):
@@ -29,7 +33,8 @@ class Status:
     cycle_id : that runs, or ran last.
     doing : in words.
     left_s : of the gap; 0 while nothing runs.
-    at_home, disarmed : of the robot and of the tool's driver, as far as is known.
+    at_home, disarmed : of the robot and of the tool's driver, as far as is known; disarmed is one
+        of which nothing is under way either.
     last : how the last cycle ended; None before any.
     thermal_pending, tool_pending : newest candidates that wait for a decision; 0: none.
     fault_code, fault : NONE and empty without one.
@@ -50,3 +55,37 @@ class Status:
     fault: str
     closed: str = ""
     trouble: str = ""
+
+
+def status_of(
+    state: State,
+    running: CycleResult | None,
+    memory: Memory,
+    hands: Hands,
+    decider: Decider,
+    now_s: float,
+) -> Status:
+    """All of it, at a time; ``running``: the cycle that runs, as far as it has come."""
+    last = next(reversed(memory.cycles.values()), None)
+    named = last.cycle_id if last is not None else ""
+    thermal, tool, trouble = 0, 0, ""
+    try:
+        newest = [decider.newest(kind) for kind in (THERMAL, TOOL)]
+        thermal, tool = (found.id if found else 0 for found in newest)
+    except RobocalError as error:
+        trouble = str(error)
+    return Status(
+        state=state,
+        cycle_id=named if running is None else running.cycle_id,
+        doing=hands.doing,
+        left_s=0.0 if running is None else max(hands.gap.left_s(now_s), 0.0),
+        at_home=not hands.robot.beside_home(),
+        disarmed=not hands.tool.doubted,
+        last=last,
+        thermal_pending=thermal,
+        tool_pending=tool,
+        fault_code=memory.fault_code,
+        fault=memory.fault,
+        closed=hands.gap.closed(now_s),
+        trouble=trouble,
+    )
