@@ -11,7 +11,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
-from bench.closed_loop.faults import POWER, RIGHT, SWEEP, Trial, named_size, smallest_with_power
+from bench.closed_loop.faults import (
+    POWER,
+    RIGHT,
+    SWEEP,
+    WELL,
+    Trial,
+    named_size,
+    smallest_with_power,
+)
 from bench.closed_loop.plant import equipped
 from bench.closed_loop.shift import ROBOT
 from bench.tables import Goal, Table
@@ -33,22 +41,22 @@ SEEN_BY_CHECK: tuple[Fault, ...] = (
     "frozen_encoder",
 )
 SEEN_BY_CYCLE: tuple[Fault, ...] = ("sensor_knocked", "sphere_knocked", "moved_by_hand")
-CLEAN = 1  # cycles before the one with a fault
 SETTLES_S = 0.5
 SEEDS = range(41, 51)
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check said of a fault."""
+    """What a check said of a fault; ``before``: what it said without it, where it was asked."""
 
     trial: Trial
     code: Code
+    before: Code = Code.NONE
 
     @property
     def right(self) -> bool:
-        """Whether it is the code of this fault."""
-        return self.code is RIGHT[self.trial.fault]
+        """Whether it is the code of this fault, and none was told before it."""
+        return self.code is RIGHT[self.trial.fault] and self.before in WELL
 
 
 def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterator[Checked]:
@@ -67,11 +75,10 @@ def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterat
                 plant.home_from_station(suite)
         for fault in SEEN_BY_CYCLE:
             for size in sizes.get(fault, (0.0,)):
-                for number in range(CLEAN):
-                    plant.measure_drift(suite, f"before {fault} {size}: {number}")
+                before = plant.measure_drift(suite, f"before {fault} {size}")
                 cell.set_fault(fault, size)
                 said = plant.measure_drift(suite, f"{fault} {size}")
-                yield Checked(Trial(fault, size, seed), said.status)
+                yield Checked(Trial(fault, size, seed), said.status, before.status)
                 cell.set_fault("none")
 
 
@@ -84,7 +91,8 @@ def power_table(found: Sequence[Checked]) -> Table:
         ("fault", "right code", "size: right of all", "smallest with 90 %", "told below it",
          "at the usual size, %", "goal"),
         "Simulated: the commissioned cell, the fault, one quick check of the tool; for what was "
-        "knocked or moved a thermal cycle without and one with it. The smallest size from which "
+        "knocked or moved a thermal cycle without and one with it; right is only who says nothing "
+        "in the first. The smallest size from which "
         "on the right code comes in 90 % of the cells or more. Of an encoder: its joint.",
     )  # fmt: skip
     for fault in dict.fromkeys(one.trial.fault for one in found):

@@ -152,10 +152,12 @@ def incident_hours(plan: ShiftPlan) -> dict[int, str]:
 def within_at_worst(record: ShiftRecord, at_s: float) -> float:
     """Share of directions below 0.1 mm in an incident's hour, had it come right after a gap.
 
-    All passes between the two gaps are then as the last of them really was.
+    All passes between the two gaps are then as the last of them really was; one that was refused
+    has no direction below it.
     """
+    begun = [one.cycle for one in record.passes if one.time_s - PASS_S - REST_S <= at_s]
+    hit = max(begun, default=0)
+    last = [one.error for one in record.passes if one.cycle == hit][-1:]
     hour = [one for one in record.passes if one.time_s // HOUR_S == at_s // HOUR_S]
-    hit = max(one.cycle for one in hour if one.time_s - PASS_S - REST_S <= at_s)
-    last = [one.error for one in hour if one.cycle == hit][-1]
-    errors = [last if one.cycle == hit else one.error for one in hour]
-    return Figures.of(np.array([error for error in errors if error is not None])).within
+    errors = [last[0] if one.cycle == hit else one.error for one in hour]
+    return float(np.mean([0.0 if e is None else Figures.of(e).within for e in errors]))

@@ -14,7 +14,7 @@ from bench.closed_loop.judging import (
     refused,
     within_at_worst,
 )
-from bench.closed_loop.plant import PASS_S, REST_S
+from bench.closed_loop.plant import PASS_S, REST_S, GapReport
 from bench.closed_loop.shift import (
     GOLDEN,
     HOUR_S,
@@ -173,3 +173,32 @@ def test_an_hour_in_which_all_is_refused_misses_its_goal():
     plan = replace(PLAN, hours=2.0)
     nothing = shift(lambda t, cycle: None if t > HOUR_S else GOOD, plan)
     assert not tables.hours_table([(nothing, shift(lambda t, cycle: GOOD, plan))]).met
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_an_hour_with_an_incident_in_which_all_is_refused_misses_its_goal(first):
+    struck_hour = MIDWORK.incidents[0].at_s // HOUR_S
+    nothing = shift(lambda t, cycle: None if t // HOUR_S == struck_hour else GOOD, MIDWORK)
+    records = [nothing, shift(lambda t, cycle: GOOD, MIDWORK)]
+    for record in records:
+        record.gaps.append(GapReport())
+    if first:
+        records.reverse()
+    table = tables.shift_table([(record, record) for record in records])
+    named = {row[0]: row[2] for row in table.rows}
+    assert not named["least share below 0.1 mm, hour with collision, %"].met
+    assert named["least share below 0.1 mm, hours without an incident, %"].met
+
+
+def test_at_worst_a_refused_pass_before_an_incident_is_outside():
+    refused_before = shift(
+        lambda t, cycle: None if cycle == 5 and t > STRUCK_S else BENT if cycle == 5 else GOOD
+    )
+    passes = refused_before.passes
+    of_hit = sum(one.cycle == 5 for one in passes)
+    assert within_at_worst(refused_before, STRUCK_S) == pytest.approx(1.0 - of_hit / len(passes))
+
+
+def test_at_worst_an_incident_before_the_first_pass_is_told():
+    assert within_at_worst(always(GOOD), 1.0) == 1.0
+    assert within_at_worst(always(None), 1.0) == 0.0

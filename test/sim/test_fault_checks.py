@@ -1,5 +1,7 @@
 """The table of the fault checks can miss its goals; it says what was told of smaller faults."""
 
+from dataclasses import replace
+
 import pytest
 
 from bench.closed_loop.checks import SEEN_BY_CHECK, SEEN_BY_CYCLE, Checked, power_table
@@ -47,6 +49,12 @@ def test_a_fault_that_is_told_in_fewer_than_nine_of_ten_cells_misses_it(fault, m
 
 def test_another_code_is_not_the_right_one():
     assert not power_table(found("wrong_tool", lambda size, cell: Code.LIMIT_EXCEEDED)).met
+
+
+@pytest.mark.parametrize("fault", SEEN_BY_CYCLE)
+def test_who_always_tells_the_fault_misses_its_goal(fault):
+    always = [replace(one, before=one.code) for one in found(fault, lambda s, cell: RIGHT[fault])]
+    assert not power_table(always).met
 
 
 def test_what_is_told_of_smaller_faults_is_said():
