@@ -14,7 +14,7 @@ from robocal_ros.core.errors import ConflictError, LimitError
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance import requests as asked
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
-from robocal_ros.sessions.maintenance.disarming import Disarming
+from robocal_ros.sessions.maintenance.disarming import SENT, Disarming
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
@@ -217,12 +217,13 @@ class Hands:
         Raises
         ------
         FaultError
-            When it does not come to rest.
+            When it does not come to rest, or is not handed over.
         """
         until_s = self.now_s + self.config.times.rest_s
         while (q := self.robot.resting(span_s)) is None or self.tool.armed:
             if self.now_s >= until_s:
-                words = "the robot does not come to rest, or its joint states are missing"
+                moves = "the robot does not come to rest, or its joint states are missing"
+                words = moves if q is None else f"the robot rests, but {SENT}"
                 raise FaultError(Code.CONFLICT, words)
             yield
         return q
