@@ -363,6 +363,18 @@ def test_a_confirmation_at_home_does_not_hand_over_what_a_dead_tool_node_left(ce
     cell.session.acknowledge("me")
 
 
+def test_a_robot_that_rests_but_is_not_handed_over_is_told_so(history):
+    """The stop in the dead tool node's place is due after the time that a rest may take."""
+    cell = opened(history, config=config_of(times=replace(TIMES, rest_s=0.3)))
+    cell.run("c1", LONG_S)
+    while not cell.tool.measuring or cell.now_s < cell.moved_s + 0.5:
+        cell.step()
+    cell.tool_dies()
+    cell.tool = ToolNode()
+    cell.session.cancel("by the PLC")
+    assert "the robot rests, but what the tool node sent may" in cell.finish().message
+
+
 @pytest.mark.parametrize("silent_s", [0.6, 3.0])
 def test_a_deaf_tool_node_is_stopped_once_joint_states_are_back(cell, silent_s):
     """Not before: nobody knows where to stop from. One that stands by then is not pushed."""

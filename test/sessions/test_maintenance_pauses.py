@@ -9,9 +9,11 @@ from maintenance_cell import (
     LAG_S,
     LATE_S,
     LONG_S,
+    SILENT,
     STALE_S,
     TICK_S,
     Cell,
+    ToolNode,
     bent,
     config_of,
     kinds,
@@ -25,7 +27,10 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.gap import DRAIN_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
+from robocal_ros.sessions.maintenance.conductor import UNSAVED_S
+from robocal_ros.sessions.maintenance.hands import DEAF_S
 from robocal_ros.sessions.maintenance.requests import Stop
+from robocal_ros.sessions.tool_driving import SETTLED_S
 
 PAUSES_S = (0.3, 0.6, 3.0)
 FRESH_WITHIN_S = DRAIN_S + STALE_S  # after a pause
@@ -139,6 +144,39 @@ def test_a_stop_does_not_wait_for_the_disk(cell):
         cell.step()
     cell.pass_time(1.0)
     assert cell.moved_s <= closed_s + BEAT_S + SHORTEST_STOP_S + LAG_S + 2.0 * TICK_S
+    cell.restart()
+    assert "gap_open is false" in cell.session.status(cell.now_s).fault
+
+
+@pytest.mark.parametrize("pause_s", PAUSES_S)
+@pytest.mark.parametrize("how", ["deaf", "new"])
+def test_nor_does_the_stop_of_what_a_tool_node_left(cell, pause_s, how):
+    """One that hangs, or one that was started anew and knows nothing of the motion in hand."""
+    cell.run("c1", LONG_S)
+    while not cell.tool.measuring:
+        cell.step()
+    cell.pass_time(0.6)
+    assert cell.moved_s == cell.now_s
+    if how == "deaf":
+        cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    else:
+        cell.tool = ToolNode()
+    cell.shelf.takes = lambda: cell.pause(pause_s)
+    cell.is_open, closed_s = False, cell.now_s
+    waits_s = DEAF_S if how == "deaf" else DRIVING.late_s + SHORTEST_STOP_S + SETTLED_S
+    cell.pass_time(6.0)
+    assert kinds(cell).count("Stop") == 1
+    assert cell.moved_s <= closed_s + BEAT_S + waits_s + SHORTEST_STOP_S + LAG_S + 4.0 * TICK_S
+    cell.restart()
+    assert "gap_open is false" in cell.session.status(cell.now_s).fault
+
+
+def test_a_fault_is_written_though_nobody_says_whether_the_robot_rests(cell):
+    cell.run("c1", LONG_S)
+    while not cell.tool.measuring:
+        cell.step()
+    cell.silent, cell.is_open = True, False
+    cell.pass_time(BEAT_S + UNSAVED_S + 0.1)
     cell.restart()
     assert "gap_open is false" in cell.session.status(cell.now_s).fault
 

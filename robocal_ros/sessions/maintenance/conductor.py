@@ -12,6 +12,7 @@ from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.run import Run
 
 ENDED, FAULT = "maintenance_ended", "fault"
+UNSAVED_S = 2.0  # a fault is written by then, whatever the robot may be doing
 Tell = Callable[[str, dict[str, object], Code, str], None]
 
 
@@ -33,7 +34,7 @@ class Conductor:
         self.run: Run | None = None
         self.broken: tuple[Code, str] | None = None
         self._script: Script[None] | None = None
-        self._unsaved = False
+        self._unsaved, self._save_by_s = False, 0.0
 
     def begin(self, run: Run) -> None:
         """A run begins at the next tick; nothing moves before the tool's driver is disarmed."""
@@ -43,9 +44,9 @@ class Conductor:
 
     def tick(self, wall_ns: int) -> None:
         """Look after gap and robot, then go on."""
-        if self._unsaved:
-            self._save()
         run, hands = self.run, self._hands
+        if self._unsaved and (not hands.stopping or hands.now_s >= self._save_by_s):
+            self._save()
         hands.look_after_tool()
         if run is None:
             hands.keep_disarming()
@@ -89,8 +90,10 @@ class Conductor:
         self.run, hands.doing = None, "fault"
         self._tell(FAULT, {}, code, reason)
         self._note(run, code, reason, fault=reason)
-        # A stop does not wait for the disk: without this write too the next start finds a fault.
-        self._unsaved = bool(hands.out) and not at_once
+        # A stop, one that is yet to come too, does not wait for the disk: without this write too
+        # the next start finds a fault.
+        self._unsaved = bool(hands.out or hands.stopping) and not at_once
+        self._save_by_s = hands.now_s + UNSAVED_S
         if not self._unsaved:
             self._save()
 

@@ -20,7 +20,7 @@ from robocal_ros.sessions.maintenance.requests import Answer
 
 AGAIN_S = 0.5
 GONE_S = 5.0
-SENT = "what the tool node sent may still be driven: wait until the robot rests"
+SENT = "what the tool node sent may still be driven"
 
 
 class Disarming:
@@ -91,4 +91,4 @@ class Disarming:
             words = "the tool node has not confirmed that it is disarmed"
             raise ConflictError(f"{words}; {self.words()}")
         if self.armed:
-            raise ConflictError(SENT)
+            raise ConflictError(f"{SENT}: wait until the robot rests")

@@ -12,19 +12,11 @@ from numpy.typing import NDArray
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, LimitError
 from robocal_ros.sessions.gap import Gap
+from robocal_ros.sessions.maintenance import requests as asked
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
-from robocal_ros.sessions.maintenance.disarming import Disarming
+from robocal_ros.sessions.maintenance.disarming import SENT, Disarming
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
-from robocal_ros.sessions.maintenance.requests import (
-    Answer,
-    Arm,
-    CancelMeasure,
-    Disarm,
-    Measure,
-    Move,
-    Request,
-    Stop,
-)
+from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
 from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
 
@@ -143,13 +135,13 @@ class Hands:
         self.doubt()
         self.tool.armed, self._deaf_s = True, np.inf
         self.robot.place = STATION
-        answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", Arm)
+        answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", asked.Arm)
         self.tool.armed = not answer.absent
         return answer
 
     def disengage(self) -> None:
         """Break its run off and disarm it, at once; again and again until it is confirmed."""
-        self.request(CancelMeasure)
+        self.request(asked.CancelMeasure)
         self._ask_disarm()
 
     def look_after_tool(self) -> None:
@@ -171,6 +163,11 @@ class Hands:
                 self._stop_measured()
         if tool.gone(self.now_s) and not robot.beside_home():
             tool.engaged &= not rests
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the stop of what the tool's driver moves may still be this node's to send."""
+        return self.tool.armed and (not self.tool.engaged or self._deaf_s < np.inf)
 
     def keep_disarming(self) -> None:
         """Ask again where nobody confirmed."""
@@ -194,7 +191,7 @@ class Hands:
             yield
 
     def _ask_disarm(self) -> None:
-        self.tool.asked(self.request(Disarm), self.now_s)
+        self.tool.asked(self.request(asked.Disarm), self.now_s)
 
     def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[Answer]:
         """Let the armed driver measure, for a limited time; a longer run is broken off.
@@ -204,7 +201,7 @@ class Hands:
         SilentError
             When it did not end in time, and not after it was broken off either.
         """
-        number = self._measuring = self.expect(Measure, mode, cycle_id)
+        number = self._measuring = self.expect(asked.Measure, mode, cycle_id)
         until_s = self.now_s + limit_s
         while self._waiting[number] is None and self.now_s < until_s:
             yield
@@ -220,12 +217,13 @@ class Hands:
         Raises
         ------
         FaultError
-            When it does not come to rest.
+            When it does not come to rest, or is not handed over.
         """
         until_s = self.now_s + self.config.times.rest_s
         while (q := self.robot.resting(span_s)) is None or self.tool.armed:
             if self.now_s >= until_s:
-                words = "the robot does not come to rest, or its joint states are missing"
+                moves = "the robot does not come to rest, or its joint states are missing"
+                words = moves if q is None else f"the robot rests, but {SENT}"
                 raise FaultError(Code.CONFLICT, words)
             yield
         return q
@@ -244,7 +242,7 @@ class Hands:
         self.robot.require_at(route.plan.q[0])
         self.robot.require_taught(q)
         self.robot.start(route, self.now_s)
-        self.request(Move, route.plan, worst_s)
+        self.request(asked.Move, route.plan, worst_s)
         while not self.robot.arrived(self.now_s):
             yield
 
@@ -255,7 +253,7 @@ class Hands:
         that a stop from them steps back. ``at_once``: nobody will be there to see it deaf.
         """
         if (plan := self.robot.stop(self.now_s)) is not None:
-            self.request(Stop, plan)
+            self.request(asked.Stop, plan)
         elif self.tool.armed and at_once:
             self._stop_measured()
         elif self.tool.engaged and self.tool.armed:
@@ -264,7 +262,7 @@ class Hands:
     def _stop_measured(self) -> None:
         if (plan := self.robot.stop_measured(self.now_s)) is not None:
             self._deaf_s, self._told_s, self._measuring = np.inf, self.robot.newest_s, 0
-            self.request(Stop, plan)
+            self.request(asked.Stop, plan)
 
     def go_home(self) -> Script[None]:
         """Bring the robot home, from wherever this run may have left it.
