@@ -57,7 +57,7 @@ def decide(
     chosen = head.calibration_id or 0
     what = f"calibration {chosen}" if chosen else BEFORE_ANY.get(kind, "nothing")
     message = f"revision {head.revision}: {what} in force"
-    return Outcome(command, Code.ACCEPT, message, None, chosen)
+    return Outcome(command, Code.ACCEPT, message, None, chosen, head.revision)
 
 
 def require_thermal(history: History, entry: Entry) -> None:

@@ -32,7 +32,7 @@ from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError, StorageError
-from robocal_ros.core.proposals import THERMAL, TOOL
+from robocal_ros.core.proposals import THERMAL, TOOL, Action
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
 from robocal_ros.sessions.gap import STALL_S
@@ -531,6 +531,7 @@ def until_verified(cell: Cell) -> None:
     """Until the accepted tool is checked."""
     while not (cell.history.head(TOOL).revision and cell.tool.measuring):
         cell.step()
+        assert cell.now_s < cell.ends_s
 
 
 def test_an_accepted_tool_that_fails_its_check_is_taken_back(history):
@@ -591,6 +592,96 @@ def test_what_a_person_chose_meanwhile_is_not_taken_back(history):
     assert history.head(TOOL).calibration_id == first
     assert result.accepted == ()
     assert "taken back" not in result.message
+
+
+def test_what_a_person_chose_while_the_history_was_held_is_not_taken_back(history):
+    """Between two tries."""
+    cell = automatic(history)
+    first = proposed(history)
+    decide(cell, ACCEPT, first)
+    decide(cell, ACCEPT, proposed(history))
+    measured_in_full(cell)
+    while not (history.head(TOOL).revision == 3 and cell.tool.measuring):
+        cell.step()
+        assert cell.now_s < cell.ends_s
+    with held_by_another(history):
+        until_back_home(cell)
+        cell.pass_time(HELD_S / 4.0)
+        assert cell.state is State.RUNNING
+    history.rollback(first, kind=TOOL, by="a person", reason="", wall_ns=0)
+    result = cell.finish()
+    assert history.head(TOOL).calibration_id == first
+    assert (result.code, result.accepted) == (Code.ACCEPT, ())
+    assert "is no longer in force" in result.message
+    assert level(cell) is AccuracyLevel.DEGRADED
+
+
+def fails_once_after(monkeypatch, owner: Any, name: str) -> None:
+    """The change is made; what is read or written next fails."""
+    real, made = getattr(owner, name), []
+
+    def once(*args, **kwargs):
+        result = real(*args, **kwargs)
+        if not made:
+            made.append(name)
+            raise StorageError("disk I/O error")
+        return result
+
+    monkeypatch.setattr(owner, name, once)
+
+
+@pytest.mark.parametrize("owner", [CalibrationHistory, Decider])
+def test_an_acceptance_whose_answer_was_lost_is_made_once(history, monkeypatch, owner):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    fails_once_after(monkeypatch, owner, {Decider: "decide"}.get(owner, "accept"))
+    until_verified(cell)
+    cell.check = passed()
+    result = cell.finish()
+    assert (result.accepted, result.tool_answer) == ((number,), "pass")
+    assert [d.calibration_id for d in history.decisions()] == [number]
+
+
+@pytest.mark.parametrize("owner", [CalibrationHistory, Decider])
+def test_a_rollback_whose_answer_was_lost_is_made_once(history, monkeypatch, owner):
+    cell = automatic(history)
+    first = proposed(history)
+    decide(cell, ACCEPT, first)
+    measured_in_full(cell)
+    fails_once_after(monkeypatch, owner, {Decider: "roll_back"}.get(owner, "rollback"))
+    result = cell.finish()
+    assert (result.code, result.accepted) == (Code.ACCEPT, ())
+    assert history.head(TOOL).calibration_id == first
+    assert [d.action for d in history.decisions()] == [
+        Action.ACCEPT,
+        Action.ACCEPT,
+        Action.ROLLBACK,
+    ]
+
+
+@pytest.mark.parametrize("name", [ACCEPT, REJECT, ROLLBACK])
+def test_a_decision_that_was_made_is_told_though_nothing_can_be_read_after_it(
+    cell, monkeypatch, name
+):
+    number = proposed(cell.history)
+    if name == ROLLBACK:
+        decide(cell, ACCEPT, number)
+    real = getattr(CalibrationHistory, name)
+
+    def unreadable(*args, **kwargs):
+        raise StorageError("disk I/O error")
+
+    def last(*args, **kwargs):
+        result = real(*args, **kwargs)
+        monkeypatch.setattr(CalibrationHistory, "head", unreadable)
+        return result
+
+    monkeypatch.setattr(CalibrationHistory, name, last)
+    if name == ROLLBACK:
+        answer = cell.session.decide_only(ROLLBACK, "a person", cell.wall_ns)
+    else:
+        answer = cell.session.decide(name, number, "a person", "", cell.wall_ns)
+    assert (answer.done, answer.revision) == (True, {ACCEPT: 1, REJECT: 0, ROLLBACK: 2}[name])
 
 
 @pytest.mark.parametrize("where", [(CalibrationHistory, "rollback"), (Decider, "roll_back")])

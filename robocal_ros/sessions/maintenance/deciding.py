@@ -1,6 +1,7 @@
 """Decisions about thermal models and tools, and what may be accepted without a person."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,11 @@ class Decider:
         """Whether it is this one."""
         return self.head(kind).calibration_id == calibration_id
 
+    def accepted_here(self, calibration_id: int) -> bool:
+        """Whether it is in force since it was accepted without a person."""
+        entry = self._history.get(calibration_id)
+        return entry.state is State.IN_FORCE and entry.decisions[-1].by == BY
+
     def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
         """Carry out a decision about one calibration; one that was made before is its answer again.
 
@@ -101,10 +107,10 @@ class Decider:
             require_thermal(self._history, entry)
         return self._carried_out(command, entry.kind, head.revision, wall_ns)
 
-    def roll_back(self, kind: str, by: str, why: str, wall_ns: int) -> Outcome:
-        """Return to what was in force before."""
+    def roll_back(self, kind: str, revision: int, by: str, why: str, wall_ns: int) -> Outcome:
+        """Return to what was in force before ``revision``; CONFLICT where that is not any more."""
         command = Command(ROLLBACK, {"previous": True, "by": by, "reason": why})
-        return self._carried_out(command, kind, self.revision(kind), wall_ns)
+        return self._carried_out(command, kind, revision, wall_ns)
 
     def only_pending(self) -> Entry:
         """The newest candidate, where they are of one kind.
@@ -164,20 +170,14 @@ class Decider:
         since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
         again = self.head(last.kind).calibration_id == last.calibration_id  # by a rollback to it
         if again or not any(d.action is Action.ROLLBACK for d in since):
-            return self.roll_back(last.kind, by, "", wall_ns)
+            return self.roll_back(last.kind, self.revision(last.kind), by, "", wall_ns)
         command = Command(ROLLBACK, {"previous": True, "by": by})
         return _nothing_to_do(command, f"calibration {last.calibration_id} is taken back already")
 
     def _carried_out(self, command: Command, kind: str, revision: int, wall_ns: int) -> Outcome:
+        """Nothing is read after it: a decision that was made must not look like one that failed."""
         outcome = decide(self._history, command, revision, wall_ns, kind)
-        return Outcome(
-            outcome.command,
-            outcome.status,
-            outcome.message,
-            None,
-            outcome.calibration_id,
-            self.revision(kind),
-        )
+        return replace(outcome, revision=outcome.revision or revision)
 
     # ---- without a person -----------------------------------------------------------------------
 

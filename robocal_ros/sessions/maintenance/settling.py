@@ -48,7 +48,8 @@ def settled(
     """
 
     def act() -> Outcome:
-        if why := decider.withheld(calibration_id) or unsure():
+        mine = decider.accepted_here(calibration_id)  # by a try whose answer was lost
+        if not mine and (why := decider.withheld(calibration_id) or unsure()):
             return withholding(kind, calibration_id, why)
         return decider.decide(ACCEPT, calibration_id, BY, WITHIN, wall_ns)
 

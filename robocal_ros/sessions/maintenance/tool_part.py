@@ -7,7 +7,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import ToolError
-from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.events import ROLLBACK, Command, Outcome
 from robocal_ros.sessions.maintenance.config import Times
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
 from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
@@ -175,8 +175,14 @@ class ToolPart:
             yield from self._take_back(outcome)
 
     def _take_back(self, outcome: ToolOutcome) -> Script[None]:
+        number = outcome.candidate_id
+
         def act() -> Outcome:
-            return self._decider.roll_back(TOOL, BY, "its check failed", self.wall_ns)
+            if not self._decider.in_force(TOOL, number):  # a try before did it, or somebody else
+                words = "the accepted tool failed its check and is no longer in force"
+                return Outcome(Command(ROLLBACK, {}), Code.ACCEPT, words, repeated=True)
+            why = "its check failed"
+            return self._decider.roll_back(TOOL, self._checked, BY, why, self.wall_ns)
 
         try:
             back = yield from patiently(self._hands, act)
@@ -185,10 +191,12 @@ class ToolPart:
         except RobocalError as error:
             why = str(error)
         if why:
-            number = outcome.candidate_id
             outcome.fault = f"tool {number} failed its check and could not be taken back: {why}"
             return
         outcome.accepted = False
+        if back.repeated:
+            outcome.told = back.message
+            return
         outcome.told = "the accepted tool failed its check and was taken back: look at it"
         self._memory.note_tool(revision=self._decider.revision(TOOL), words=outcome.told)
 
