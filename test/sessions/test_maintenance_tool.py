@@ -31,7 +31,7 @@ from maintenance_cell import (
 from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import StaleError, StorageError
+from robocal_ros.core.errors import ConflictError, StaleError, StorageError
 from robocal_ros.core.proposals import THERMAL, TOOL, Action
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD
@@ -732,3 +732,28 @@ def test_a_rejection_is_told_where_the_next_one_fails(cell, monkeypatch):
     assert answer.status is Code.STORAGE_FAILED
     assert recorded.message in answer.message
     assert "the history is held" in answer.message
+
+
+def test_many_that_wait_are_rejected_ten_at_a_time(cell):
+    for kelvin in range(1, 26):
+        thermal_proposed(cell.history, float(kelvin))
+    answers = [cell.session.decide_only(REJECT, "a person", cell.wall_ns) for _ in range(4)]
+    assert [a.message.count("rejected") for a in answers] == [10, 10, 5, 0]
+    assert [a.message.endswith("more wait: call again") for a in answers] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert all(a.done for a in answers)
+    assert cell.history.pending(THERMAL) == ()
+
+
+def test_an_acceptance_without_an_id_is_repeated_for_a_minute(cell):
+    number = thermal_proposed(cell.history, 10.0)
+    assert cell.session.decide_only(ACCEPT, "a person", cell.wall_ns).calibration_id == number
+    again = cell.session.decide_only(ACCEPT, "a person", cell.wall_ns + 59 * 10**9)
+    assert (again.status, again.calibration_id) == (Code.ACCEPT, number)
+    for late_s in (61, -1):  # after a clock that was set back it is nobody's either
+        with pytest.raises(ConflictError, match="one candidate must wait"):
+            cell.session.decide_only(ACCEPT, "a person", cell.wall_ns + late_s * 10**9)

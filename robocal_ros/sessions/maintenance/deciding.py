@@ -22,6 +22,8 @@ from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
 SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser
+MOST_AT_ONCE = 10  # of a kind: each takes milliseconds, in which nobody watches the robot
+REPEAT_NS = 60 * 1_000_000_000  # a call without an id is repeated within
 DONE = {  # what a repeated decision finds
     ACCEPT: State.IN_FORCE,
     REJECT: State.REJECTED,
@@ -35,9 +37,9 @@ class Decider:
     def __init__(self, nominal: SerialArm, history: History, config: MaintenanceConfig) -> None:
         self._nominal, self._history, self._config = nominal, history, config
 
-    def pending(self, kind: str) -> list[Entry]:
-        """Candidates that can be accepted now, newest first."""
-        found = self._history.pending(kind)
+    def _waiting(self, kind: str) -> list[Entry]:
+        """Candidates that can be accepted now, newest first, one more than is decided at once."""
+        found = self._history.pending(kind, MOST_AT_ONCE + 1)
         return [entry for entry in found if not self._outdated(entry)]
 
     def newest(self, kind: str) -> Entry | None:
@@ -129,8 +131,9 @@ class Decider:
     def decide_only(self, name: str, by: str, wall_ns: int) -> Iterator[Outcome]:
         """A decision without an id; each outcome as soon as it is made.
 
-        Accept: the one candidate that waits. Reject: all that wait. Rollback: take the last
-        acceptance back. Each may come twice: nothing more is done.
+        Accept: the one candidate that waits. Reject: what waits, the newest first, ten of a kind
+        in a call. Rollback: take the last acceptance back. Each may come twice: nothing more is
+        done.
 
         Raises
         ------
@@ -141,9 +144,10 @@ class Decider:
             yield self._take_back(by, wall_ns)
             return
         if name == ACCEPT:
-            yield self.decide(name, self._meant(by), by, "", wall_ns)
+            yield self.decide(name, self._meant(by, wall_ns), by, "", wall_ns)
             return
-        waiting = [entry.id for kind in KINDS for entry in self.pending(kind)]
+        found = [self._waiting(kind) for kind in KINDS]
+        waiting = [entry.id for entries in found for entry in entries[:MOST_AT_ONCE]]
         if not waiting:
             yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
         for number in waiting:
@@ -152,13 +156,21 @@ class Decider:
             except RobocalError as error:  # those before it stay rejected, and are told
                 command = Command(name, {"id": number, "by": by, "reason": ""})
                 yield Outcome(command, error.code, str(error))
+        if any(len(entries) > MOST_AT_ONCE for entries in found):
+            yield _nothing_to_do(Command(name, {"by": by}), "more wait: call again")
 
-    def _meant(self, by: str) -> int:
+    def _meant(self, by: str, wall_ns: int) -> int:
         """The candidate to accept; where none waits, what the same caller accepted just before."""
-        waits = any(self.pending(kind) for kind in KINDS)
+        waits = any(self.newest(kind) for kind in KINDS)
         made = [] if waits else [d for d in self._history.decisions() if d.kind in KINDS]
-        if made and made[-1].action is Action.ACCEPT and made[-1].by == by:
-            return made[-1].calibration_id or 0
+        last = made[-1] if made else None
+        if (
+            last
+            and last.action is Action.ACCEPT
+            and last.by == by
+            and 0 <= wall_ns - last.wall_ns <= REPEAT_NS
+        ):
+            return last.calibration_id or 0
         return self.only_pending().id
 
     def _take_back(self, by: str, wall_ns: int) -> Outcome:
