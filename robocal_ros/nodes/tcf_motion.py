@@ -177,6 +177,8 @@ class TcfMotion:
 
     def _send(self, plan: JointPlan) -> None:
         self._output.publish(trajectory_message(plan, self._names))
+        if self.driver is not None:
+            self.driver.sent(self._steady.now_s())
 
     def _armed(self) -> str:
         words = f"armed: begin the measurement within {self._config.armed_s:g} s"

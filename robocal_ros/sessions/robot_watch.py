@@ -53,6 +53,10 @@ class RobotWatch:
         """A plan was sent."""
         self._plan, self._cell, self._sent_s = plan, cell, now_s
 
+    def sent(self, now_s: float) -> None:
+        """The plan went out now: making it may have taken long."""
+        self._sent_s = now_s
+
     def slept(self, for_s: float) -> None:
         """The host was suspended for so long, and the plan with it: its controller is there too."""
         self._sent_s += for_s

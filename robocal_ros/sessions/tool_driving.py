@@ -131,6 +131,10 @@ class ToolDriver:
         self._robot.reading(stamp_s, q, now_s)
         self.tick(now_s)
 
+    def sent(self, now_s: float) -> None:
+        """A plan was published: its time begins now, not when it began to be made."""
+        self._robot.sent(now_s)
+
     def slept(self, for_s: float) -> None:
         """The host was suspended; call it before anything else with a time of afterwards."""
         self._robot.slept(for_s)

@@ -232,7 +232,9 @@ def test_mallows_best_subset_is_the_best_of_all(history):
         for chosen in combinations(range(11), size):
             X = np.linalg.lstsq(part.rows[:, chosen], part.displacement.T, rcond=None)[0]
             rss[chosen] = np.sum((part.displacement.T - part.rows[:, chosen] @ X) ** 2)
-        assert found.names == tuple(part.names[c] for c in min(rss, key=lambda c: rss[c]))
+        # entangled ones can be the same to the last bits: then either is the best
+        named = {tuple(part.names[c] for c in chosen): value for chosen, value in rss.items()}
+        assert named[found.names] <= min(rss.values()) * (1.0 + 1e-9)
 
 
 def test_mallows_cp_of_an_unbiased_subset_is_its_size(history):

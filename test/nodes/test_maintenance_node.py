@@ -149,7 +149,7 @@ def test_a_driver_that_would_not_stop_at_the_gaps_end_measures_nothing(
     assert (result.tool_code, result.left) == (Code.CONFLICT, ["tool measurement (quick)"])
     assert "tcf_node: gap_open is not listened to: gap_stale_s is 0; set it to 0.5" in ended.message
     assert cell.sent == []
-    assert cell.statuses[-1].disarmed
+    graph.spin_until(lambda: cell.statuses[-1].disarmed, "the tool node is disarmed")
 
 
 def test_the_tool_node_stops_at_the_gaps_end_without_this_node(graph: Any, tmp_path: Path) -> None:
