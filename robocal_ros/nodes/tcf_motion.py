@@ -175,10 +175,9 @@ class TcfMotion:
         self._node.get_logger().warning(f"arm {request.data}: {response.message}")
         return response
 
-    def _send(self, plan: JointPlan) -> None:
+    def _send(self, plan: JointPlan) -> float:
         self._output.publish(trajectory_message(plan, self._names))
-        if self.driver is not None:
-            self.driver.sent(self._steady.now_s())
+        return self._steady.now_s()
 
     def _armed(self) -> str:
         words = f"armed: begin the measurement within {self._config.armed_s:g} s"

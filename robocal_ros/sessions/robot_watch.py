@@ -54,7 +54,7 @@ class RobotWatch:
         self._plan, self._cell, self._sent_s = plan, cell, now_s
 
     def sent(self, now_s: float) -> None:
-        """The plan went out now: making it may have taken long."""
+        """When the plan really was sent."""
         self._sent_s = now_s
 
     def slept(self, for_s: float) -> None:

@@ -54,7 +54,7 @@ class ToolDriver:
 
     Parameters
     ----------
-    send : publishes a plan.
+    send : publishes a plan; returns when, where that is not the time of the call.
     ask : gives a command to the session.
     closed : why nothing may move at a time, empty: it may; asked before anything begins.
 
@@ -69,7 +69,7 @@ class ToolDriver:
         self,
         session: ToolSession,
         config: DrivingConfig,
-        send: Callable[[JointPlan], None],
+        send: Callable[[JointPlan], float | None],
         ask: Callable[[Command], object],
         closed: Callable[[float], str] = lambda now_s: "",
     ) -> None:
@@ -130,10 +130,6 @@ class ToolDriver:
         """Take joints (n,), in the arm's order, as they arrive; ``stamp_s`` on their own clock."""
         self._robot.reading(stamp_s, q, now_s)
         self.tick(now_s)
-
-    def sent(self, now_s: float) -> None:
-        """A plan was published: its time begins now, not when it began to be made."""
-        self._robot.sent(now_s)
 
     def slept(self, for_s: float) -> None:
         """The host was suspended; call it before anything else with a time of afterwards."""
@@ -223,7 +219,9 @@ class ToolDriver:
         self._beams.clear()
         self.phase = phase
         self._robot.follow(plan, cell, now_s)
-        self._send(plan)
+        sent_s = self._send(plan)  # making the plan may have taken long
+        if sent_s is not None:
+            self._robot.sent(sent_s)
 
     def _made_cell(self) -> MotionCell:
         config, run = self._config, self._session.run
