@@ -132,6 +132,7 @@ class Cell:
     check: Answer = field(default_factory=lambda: passed())
     full: Callable[["Cell"], Answer] = field(default=lambda cell: same_tool())
     drift: Drift | None = None  # told by the thermal node
+    planning_s: float = 0.0  # to make and send the next motion
 
     def __post_init__(self) -> None:
         self.now_s = 10.0
@@ -259,7 +260,12 @@ class Cell:
             self._require_fit(request)
             self._require_taught(request.plan)
         match request:
-            case ask.Move() | ask.Stop():
+            case ask.Move():
+                self.pause(self.planning_s)
+                self.planning_s = 0.0
+                self.coming.append((self.now_s + LAG_S, request.plan))
+                self.session.sent(self.now_s)
+            case ask.Stop():
                 self.coming.append((self.now_s + LAG_S, request.plan))
             case ask.Arm() | ask.Disarm() if not self.tool.there:
                 gone = Answer(Code.CONFLICT, "not there: start its node", absent=True)

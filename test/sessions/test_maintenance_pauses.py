@@ -50,6 +50,13 @@ def test_a_write_that_takes_its_time_breaks_no_cycle_off(cell, pause_s):
     assert result.tool_answer == "pass"
 
 
+def test_a_motion_begins_when_it_is_sent_not_when_it_was_planned(cell):
+    cell.planning_s = 2.0 * DRIVING.late_s
+    assert cell.run("c1", LONG_S) is Code.ACCEPT
+    result = cell.finish()
+    assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
+
+
 @pytest.mark.parametrize("pause_s", PAUSES_S)
 def test_nor_does_one_between_two_measurements(history, pause_s):
     """Check, full measurement and acceptance are each kept before the tool node is armed again."""

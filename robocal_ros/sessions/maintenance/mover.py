@@ -128,6 +128,10 @@ class Mover:
         self._route = route
         self._watch.follow(route.plan, self._ways.cell, now_s)
 
+    def sent(self, now_s: float) -> None:
+        """When the route really was sent: it may have taken a while to plan."""
+        self._watch.sent(now_s)
+
     def arrived(self, now_s: float) -> bool:
         """Whether the route is over, with the robot at its end."""
         if self._route is None or not self._watch.at_end(now_s):

@@ -86,6 +86,10 @@ class MaintenanceSession:
         """The host was suspended; call it before anything else with a time of afterwards."""
         self._hands.robot.slept(for_s)
 
+    def sent(self, now_s: float) -> None:
+        """The motion that `tick` gave has gone out; its time begins then, not when it was planned."""
+        self._hands.robot.sent(now_s)
+
     def measured(self, stamp_s: float) -> None:
         """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
         self._hands.measured.append(stamp_s)
