@@ -32,20 +32,20 @@ help:  ## this list
 demo: setup  ## a simulated shift through the live nodes, with a report in out/
 	$(ROS) python bags/demo.py
 
-# Node tests mostly wait; what the others compute fills their pauses, and gives way at once.
-# They go one after the other, for each has a cell of up to six processes; the others by two workers.
+# Node tests mostly wait; what the others compute fills their pauses, and gives way at once. Those
+# with a live cell of up to six processes are one group, on one worker, one after the other.
 # What failed is shown last. A live test that other work starved is run again, twice at the most, and
 # counted as a rerun.
-SPREAD := --dist worksteal -p no:cacheprovider
+SPREAD := -n 2 -p no:cacheprovider --dist
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
-	$(GIVES_WAY) $(ROS) python -m pytest -n 2 $(SPREAD) --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
+	$(GIVES_WAY) $(ROS) python -m pytest $(SPREAD) worksteal --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
 	trap 'kill $$others 2>/dev/null || true' EXIT
 	nodes=0
 	computing=0
-	$(ROS) python -m pytest -n 1 $(SPREAD) --reruns 2 test/nodes 2>&1 | tee out/test_nodes.txt || nodes=$$?
+	$(ROS) python -m pytest $(SPREAD) loadgroup --reruns 2 test/nodes 2>&1 | tee out/test_nodes.txt || nodes=$$?
 	wait $$others || computing=$$?
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt

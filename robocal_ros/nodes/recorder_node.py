@@ -209,4 +209,4 @@ class RecorderNode(HouseNode):
 
 def main() -> None:
     """Run the node."""
-    run(RecorderNode)
+    run(RecorderNode, events=True)

@@ -13,6 +13,8 @@ from domains import free_domain
 
 from robocal_ros.core.codes import Code
 
+pytestmark = pytest.mark.xdist_group("cell")
+
 ROOT = Path(__file__).parent.parent.parent
 LONGEST_S = 240.0
 WITHIN_MM = 0.3  # what docs/cell.md calls recovered

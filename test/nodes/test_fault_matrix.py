@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from maintenance_live import HOME_DEG, LiveCell
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -20,6 +21,8 @@ from std_srvs.srv import SetBool, Trigger
 from bench.closed_loop.faults import RIGHT
 from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import Fault
+
+pytestmark = pytest.mark.xdist_group("cell")
 
 GAP_S = 60.0
 AHEAD_S = 2.0  # until stamps have passed those of a clock that was ahead

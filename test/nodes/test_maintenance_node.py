@@ -4,58 +4,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from maintenance_live import LiveCell
-from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import AccuracyState, MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 
+pytestmark = pytest.mark.xdist_group("cell")
+
 GAP_S = 150.0
-BEND_MM = "[1.5, -0.8, 0.4]"
-
-
-def test_one_call_keeps_a_cell_accurate(graph: Any, tmp_path: Path) -> None:
-    cell = LiveCell(graph, tmp_path, tool_bend_mm=BEND_MM)
-    cell.state(AccuracyState.EXPIRED)
-    cell.capture_reference()
-    first = cell.run("c1", GAP_S)
-    assert first.success, first.message
-    result = first.result
-    assert result.complete, first.message
-    # In seconds nothing has drifted: the model in force stays, whatever the noise says.
-    stays = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
-    assert result.thermal_code in stays, first.message
-    assert (result.thermal_id > 0, result.tool_code) == (True, Code.ACCEPT), first.message
-    assert result.tool_answer == MeasureTool.Result.RECALIBRATE
-    assert cell.at_home()
-    assert cell.stands(1.0)
-    assert {f.feedback.state.state for f in cell.feedback} == {MaintenanceStatus.RUNNING}
-    cell.state(AccuracyState.DEGRADED)
-    # Nothing was accepted without a person; now the PLC accepts by the id.
-    status = graph.call(GetMaintenance, "/maintenance_node/status", cycle_id="c1")
-    assert status.state.thermal_pending == 0
-    assert status.state.tool_pending == result.tool_id
-    assert status.result == result
-    refused = graph.call(Decide, "/maintenance_node/accept", id=result.thermal_id, by="plc")
-    assert (refused.success, refused.status) == (False, result.thermal_code)
-    for _ in range(2):
-        answer = graph.call(Decide, "/maintenance_node/accept", id=result.tool_id, by="plc")
-        assert (answer.success, answer.revision) == (True, 1), answer.message
-    count = len(cell.sent)
-    repeated = cell.run("c1", GAP_S)
-    assert repeated == first
-    assert len(cell.sent) == count
-    second = cell.run("c2", GAP_S)  # verifies the tool that was accepted
-    assert second.success, second.message
-    assert second.result.tool_answer == MeasureTool.Result.PASS, second.message
-    said = cell.state(AccuracyState.OK)
-    assert 0.0 < said.predicted_error_mm < said.bound_mm <= said.tolerance_mm
-    recorded = [e.command for e in cell.events]
-    assert [n for n in recorded if n != "maintenance_ended"] == [
-        "run_maintenance", "withhold", "accept", "accept", "run_maintenance",
-    ]  # fmt: skip
 
 
 def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Path) -> None:
