@@ -110,6 +110,7 @@ class MaintenanceNode(HouseNode):
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
             self._carry_out(self._session.give_up(ENDS, self._steady.now_s()))
+            self._session.close()
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
             self._outputs.accuracy(gone, self._config.tolerance_m, self.now_ns())

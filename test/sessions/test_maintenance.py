@@ -415,8 +415,14 @@ def test_a_tool_node_that_hears_is_left_to_stop_by_itself(cell, how):
 
 def test_a_node_that_ends_stops_what_the_tool_node_moves_at_once(cell):
     until_moving(cell, "tool")
+    before = cell.shelf.document
     asked = cell.session.give_up("the node ends", cell.now_s)
     assert [type(request).__name__ for request in asked] == ["Stop", "CancelMeasure", "Disarm"]
+    assert cell.shelf.document == before  # a stop does not wait for the disk
+    cell.session.close()
+    cell.restart()
+    assert cell.state is State.FAULT
+    assert "the node ends" in cell.session.status(cell.now_s).fault
 
 
 @pytest.mark.parametrize("service", ["thermal", "arm", "measure", "sensor"])

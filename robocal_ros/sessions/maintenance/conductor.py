@@ -92,7 +92,7 @@ class Conductor:
         self._note(run, code, reason, fault=reason)
         # A stop, one that is yet to come too, does not wait for the disk: without this write too
         # the next start finds a fault.
-        self._unsaved = bool(hands.out or hands.stopping) and not at_once
+        self._unsaved = bool(hands.out or hands.stopping)
         self._save_by_s = hands.now_s + UNSAVED_S
         if not self._unsaved:
             self._save()
@@ -144,6 +144,11 @@ class Conductor:
         result = run.ended(code, message)
         self._tell(ENDED, result.document(), code, message)
         self._memory.end(result, code if fault else Code.NONE, fault)
+
+    def keep(self) -> None:
+        """Write what waited for a stop."""
+        if self._unsaved:
+            self._save()
 
     def _save(self) -> None:
         self._unsaved, memory = False, self._memory

@@ -218,10 +218,17 @@ class MaintenanceSession:
         return hands.handed_out()
 
     def give_up(self, reason: str, now_s: float) -> list[Request]:
-        """The driver goes: stop and disarm, to be carried out at once; a fault unless at home."""
+        """The driver goes: stop and disarm, to be carried out at once; a fault unless at home.
+
+        Then call `close`.
+        """
         self._hands.now_s = now_s
         self._conductor.give_up(reason, at_once=True)
         return self._hands.handed_out()
+
+    def close(self) -> None:
+        """Write what waited until the robot was told to stop."""
+        self._conductor.keep()
 
     # ---- what is said ---------------------------------------------------------------------------
 
