@@ -32,25 +32,25 @@ help:  ## this list
 demo: setup  ## a simulated shift through the live nodes, with a report in out/
 	$(ROS) python bags/demo.py
 
-# Node tests mostly wait; what the others compute fills their pauses, and gives way at once. Those
-# with a live cell of up to six processes are one group, on one worker, one after the other.
+# Live cells of up to six processes come first, one after the other; then the other node tests, two at
+# a time. Both mostly wait: what all others compute fills their pauses, and gives way at once.
 # What failed is shown last. A live test that other work starved is run again, twice at the most, and
 # counted as a rerun.
-SPREAD := -n 2 -p no:cacheprovider --dist
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
+PYTEST := $(ROS) python -m pytest -p no:cacheprovider
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
-	$(GIVES_WAY) $(ROS) python -m pytest $(SPREAD) worksteal --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
+	$(GIVES_WAY) $(PYTEST) -n 2 --dist worksteal --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
 	trap 'kill $$others 2>/dev/null || true' EXIT
-	nodes=0
-	computing=0
-	$(ROS) python -m pytest $(SPREAD) loadgroup --reruns 2 test/nodes 2>&1 | tee out/test_nodes.txt || nodes=$$?
-	wait $$others || computing=$$?
+	failed=0
+	$(PYTEST) --reruns 2 -m cell test/nodes 2>&1 | tee out/test_cells.txt || failed=1
+	$(PYTEST) --reruns 2 -m "not cell" -n 2 --dist worksteal test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
+	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
-	[[ $$nodes -eq 0 ]] || sed -n '/short test summary/,$$p' out/test_nodes.txt
-	exit $$((nodes | computing))
+	[[ $$failed -eq 0 ]] || sed -n '/short test summary/,$$p' out/test_cells.txt out/test_nodes.txt
+	exit $$failed
 
 bench: setup $(VENV)-bench/.stamp  ## accuracy on real measurements, speed beside other libraries
 	$(ROS) $(VENV)-bench/bin/python -m bench

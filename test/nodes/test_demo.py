@@ -13,7 +13,7 @@ from domains import free_domain
 
 from robocal_ros.core.codes import Code
 
-pytestmark = pytest.mark.xdist_group("cell")
+pytestmark = pytest.mark.cell
 
 ROOT = Path(__file__).parent.parent.parent
 LONGEST_S = 240.0

@@ -22,7 +22,7 @@ from bench.closed_loop.faults import RIGHT
 from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import Fault
 
-pytestmark = pytest.mark.xdist_group("cell")
+pytestmark = pytest.mark.cell
 
 GAP_S = 60.0
 AHEAD_S = 2.0  # until stamps have passed those of a clock that was ahead

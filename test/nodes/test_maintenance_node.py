@@ -12,7 +12,7 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 
-pytestmark = pytest.mark.xdist_group("cell")
+pytestmark = pytest.mark.cell
 
 GAP_S = 150.0
 

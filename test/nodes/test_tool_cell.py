@@ -24,7 +24,7 @@ from robocal_ros.core.motion.limits import MotionLimits
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.nodes import qos
 
-pytestmark = pytest.mark.xdist_group("cell")
+pytestmark = pytest.mark.cell
 
 RUN_S = 60.0
 BUSY = {"motion_silence_s": 0.5}  # the machine of the tests has other work: readings come late
