@@ -120,11 +120,6 @@ def _told(gap: GapReport) -> list[tuple[str, Code]]:
     return [(name, code) for name, code in told if code not in WELL]
 
 
-def usual(seed: int) -> list[Trial]:
-    """Each fault once, at its usual size."""
-    return [Trial(fault, 0.0, seed) for fault in FAULTS if fault != "none"]
-
-
 def sweep(seeds: Sequence[int]) -> list[Trial]:
     """Each fault at all of its sizes."""
     return [

@@ -17,7 +17,6 @@ from bench.closed_loop.faults import (
     report_of,
     smallest_with_power,
     sweep,
-    usual,
 )
 from bench.closed_loop.judging import (
     gaps_to_recover,
@@ -31,6 +30,7 @@ from bench.closed_loop.judging import (
 from bench.closed_loop.shift import MIDWORK, ShiftPlan, ShiftRecord, run_shift
 from bench.tables import Goal, Table
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.sim.cell_faults import SIZES
 
 WITHIN = 0.95  # of the directions below 0.1 mm, in every hour after the first
 RECOVERED_GAPS = 2
@@ -55,7 +55,7 @@ class Amount:
     trials: Sequence[Trial]
 
 
-SHORT = Amount(golden=(1, 2), quiet=range(21, 25), trials=usual(3))
+SHORT = Amount(golden=(1, 2), quiet=range(21, 25), trials=sweep((3,)))
 LONG = Amount(
     golden=range(1, 13),
     quiet=range(21, 33),
@@ -190,7 +190,7 @@ def faults_table(reports: Sequence[Report]) -> Table:
     )  # fmt: skip
     for one in reports:
         right = RIGHT.get(one.trial.fault)
-        needs = right is not None and not one.trial.size
+        needs = right is not None and one.trial.size in (0.0, *SIZES.get(one.trial.fault, ())[:1])
         table.add(
             one.trial.fault, named_size(one.trial), one.trial.seed, one.who or "nobody",
             one.code.name if one.who else "", right.name if right else "", one.gaps,
