@@ -113,7 +113,8 @@ def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
         )
     near = page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page
     console.print(f"\n{near}", soft_wrap=True)
-    took = f"{seconds:.0f} s (goal {GOAL_S:.0f} s)"
+    missed = " MISSED" if seconds > GOAL_S else ""
+    took = f"{seconds:.0f} s (goal {GOAL_S:.0f} s{missed})"
     console.print(f"[dim]{took}, six nodes as processes over DDS[/dim]")
     if opened and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         webbrowser.open(page.as_uri())

@@ -3,7 +3,6 @@
 The truth is a P-R-P arm of plain elementary motions, and a sensor that casts rays.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -38,7 +37,6 @@ class Runs:
     best: Array
     classic: Array
     covariance: Array
-    run_ms: float
 
     def errors(self, poses: Array) -> Array:
         """(n, 6) in the sensor frame, m and rad."""
@@ -72,21 +70,15 @@ def repeat(cell: TrackerCell, runs: int) -> Runs:
     """Whole calibrations, each with its own noise."""
     best, classic, covariance = [], [], []
     noise = cell.sizes.noise
-    took = 0.0
     for seed in range(runs):
         rng = np.random.default_rng([54, seed])
         data, target = cell.measure(rng), cell.told(rng)
-        start = time.perf_counter()
         first = solve_classic(data, target, noise)
         _, estimate = solve_best(data, target, noise, first)
-        took += time.perf_counter() - start
         classic.append(first.T_flange_sensor)
         best.append(estimate.state.T_flange_sensor)
         covariance.append(estimate.covariance[SENSOR, SENSOR])
-    return Runs(
-        cell.T_flange_sensor, np.array(best), np.array(classic), np.array(covariance),
-        1e3 * took / runs,
-    )  # fmt: skip
+    return Runs(cell.T_flange_sensor, np.array(best), np.array(classic), np.array(covariance))
 
 
 @cache
@@ -152,7 +144,6 @@ def bound_table() -> Table:
     away = abs(runs.chi2() - 1.0)
     limit = 4.0 * float(np.sqrt(2.0 / (6.0 * RUNS)))
     table.add("chi-square of 6", runs.chi2(), 1.0, Goal(away, limit), None)
-    table.add("both methods, ms", runs.run_ms, None, None, None)
     return table
 
 

@@ -12,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 from bench.closed_loop.faults import (
+    ENUMERATED,
     POWER,
     RIGHT,
     SWEEP,
@@ -38,6 +39,12 @@ SEEN_BY_CHECK: tuple[Fault, ...] = (
     "clock_jump",
     "lost_messages",
     "swapped_cables",
+    "beam_x_dead",
+    "beam_y_dead",
+    "chatter",
+    "lost_edge",
+    "double_edge",
+    "wrong_station",
     "frozen_encoder",
 )
 SEEN_BY_CYCLE: tuple[Fault, ...] = ("sensor_knocked", "sphere_knocked", "moved_by_hand")
@@ -104,17 +111,25 @@ def power_table(found: Sequence[Checked]) -> Table:
             f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}".lstrip(": ")
             for cells in by_size.values()
         )
-        smallest = smallest_with_power((one.trial.size, one.right) for one in own)
+        counted = fault in ENUMERATED
+        by_right = ((0.0 if counted else one.trial.size, one.right) for one in own)
+        smallest = smallest_with_power(by_right)
         told = [c.code.name for c in own if smallest is None or c.trial.size < smallest]
         below = ", ".join(f"{name} {count}" for name, count in Counter(told).most_common())
-        usual = [c.right for c in by_size.get(SIZES.get(fault, (0.0,))[0], own)]
+        at_usual = own if counted else by_size.get(SIZES.get(fault, (0.0,))[0], own)
+        usual = [c.right for c in at_usual]
         share = 100.0 * sum(usual) / len(usual)
         table.add(
             fault, RIGHT[fault].name, words,
-            "none" if smallest is None else named_size(Trial(fault, smallest, 0)), below,
-            share, Goal(share, 100.0 * POWER, at_least=True),
+            _smallest(fault, smallest), below, share, Goal(share, 100.0 * POWER, at_least=True),
         )  # fmt: skip
     return table
+
+
+def _smallest(fault: Fault, size: float | None) -> str:
+    if size is None:
+        return "none"
+    return "" if fault in ENUMERATED else named_size(Trial(fault, size, 0))
 
 
 def _all_checked(seed: int) -> list[Checked]:

@@ -1,6 +1,6 @@
 """What each fault costs, who reports it, and from which size on. Simulated."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from bench.closed_loop.judging import Harm, harm
@@ -11,6 +11,8 @@ from robocal_ros.sim.cell_faults import FAULTS, SIZES, Fault
 
 EVERY_S = 160.0  # a gap, then one pass of the programme
 CLEAN, AFTER = 1, 2  # gaps before and after the fault
+LONG_AFTER = 12  # of a knock that nobody sees: what is learned from it may add up
+WARM_S = 1800.0  # of work before those, so that there is a drift to be learned
 POWER = 0.9
 WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 RIGHT: Mapping[Fault, Code] = {
@@ -55,6 +57,17 @@ SWEEP: Mapping[Fault, tuple[float, ...]] = {
 """Sizes in the faults' own units; a fault that is not here is tried at its usual one."""
 
 
+UNSEEN: Mapping[Fault, tuple[float, ...]] = {
+    "sensor_knocked": (0.05, 0.1),
+    "sphere_knocked": (0.05, 0.1),
+    "moved_by_hand": (0.05, 0.1),
+}
+"""Knocks at which a thermal cycle may go on."""
+
+ENUMERATED: Collection[Fault] = ("frozen_encoder",)
+"""Faults whose size is a number of something: none is the smallest."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """A fault of a size in the cell of a seed; 0: the usual size, or none."""
@@ -62,15 +75,26 @@ class Trial:
     fault: Fault
     size: float
     seed: int
+    gaps: int = AFTER
 
     @property
     def plan(self) -> ShiftPlan:
-        """A short shift with the fault in its middle."""
+        """A short shift with the fault after its first gap."""
         return ShiftPlan(
-            hours=(CLEAN + AFTER) * EVERY_S / 3600.0,
+            hours=(CLEAN + self.gaps) * EVERY_S / 3600.0,
+            work_s=WARM_S if self.gaps > AFTER else 0.0,
             every_s=EVERY_S,
             incidents=(Incident(CLEAN * EVERY_S, self.fault, self.size),),
+            # Exchanged temperatures matter to nobody else.
+            prior="learned" if self.fault == "swapped_temperatures" else "default",
         )
+
+    @property
+    def must_be_told(self) -> bool:
+        """Whether the right code is wanted in every cell: a usual size, or one of a count."""
+        usual = (0.0, *SIZES.get(self.fault, ())[:1])
+        told = self.size in usual or self.fault in ENUMERATED
+        return told and self.fault in RIGHT and self.gaps == AFTER
 
 
 @dataclass(frozen=True)
@@ -100,7 +124,7 @@ class Report:
 
 def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Report:
     """Read the records of a trial."""
-    who, code, gaps = "", Code.NONE, AFTER + 1.0
+    who, code, gaps = "", Code.NONE, trial.gaps + 1.0
     for number, gap in enumerate(with_suite.gaps[CLEAN:], start=1):
         for name, found in _told(gap):
             if not who:
@@ -108,7 +132,7 @@ def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Re
             if found is RIGHT.get(trial.fault):
                 gaps = min(gaps, float(number))
     over_s = max(gap.over_s for gap in with_suite.gaps)
-    return Report(trial, who, code, gaps, harm(with_suite, without), over_s)
+    return Report(trial, who, code, gaps, harm(with_suite, without, after=CLEAN), over_s)
 
 
 def _told(gap: GapReport) -> list[tuple[str, Code]]:
@@ -118,6 +142,16 @@ def _told(gap: GapReport) -> list[tuple[str, Code]]:
     told = [("thermal", result.thermal_code), ("tool", result.tool_code)]
     told += [("maintenance", gap.fault_code), ("maintenance", result.code)]
     return [(name, code) for name, code in told if code not in WELL]
+
+
+def unseen(seeds: Sequence[int]) -> list[Trial]:
+    """Small knocks of a warm cell that is kept up through many gaps."""
+    return [
+        Trial(fault, size, seed, LONG_AFTER)
+        for fault, sizes in UNSEEN.items()
+        for size in sizes
+        for seed in seeds
+    ]
 
 
 def sweep(seeds: Sequence[int]) -> list[Trial]:

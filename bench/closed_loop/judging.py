@@ -87,7 +87,7 @@ class Harm:
     Attributes
     ----------
     rms_m : over all working poses and passes; ``p99_m`` : their 99 % quantile.
-    cycle_m : rms of the worst cycle.
+    cycle_m : rms of the worst cycle of those that are asked for; not a number where none was made.
     refused : passes that only the shift without the suite produced. They are in no other figure;
         where they are all, these are not a number.
     """
@@ -98,8 +98,11 @@ class Harm:
     refused: int
 
 
-def harm(with_suite: ShiftRecord, without: ShiftRecord) -> Harm:
-    """Compare two shifts of one seed, pass by pass where both produced."""
+def harm(with_suite: ShiftRecord, without: ShiftRecord, after: int = -1) -> Harm:
+    """Compare two shifts of one seed, pass by pass where both produced.
+
+    ``after`` : the worst cycle is one of those after this one.
+    """
     both = [
         (a.cycle, a.error, b.error)
         for a, b in zip(with_suite.passes, without.passes, strict=True)
@@ -114,7 +117,10 @@ def harm(with_suite: ShiftRecord, without: ShiftRecord) -> Harm:
     return Harm(
         _rms(on) - _rms(off),
         float(np.quantile(on, 0.99) - np.quantile(off, 0.99)),
-        max(_rms(on[cycle == c]) - _rms(off[cycle == c]) for c in np.unique(cycle)),
+        max(
+            (_rms(on[cycle == c]) - _rms(off[cycle == c]) for c in np.unique(cycle) if c > after),
+            default=np.nan,
+        ),
         refused,
     )
 

@@ -243,6 +243,8 @@ class Plant:
             left_s = end_s - self.now_s
             result = maintenance.run(cycle_id, left_s, self.now_s, self.clock.now_ns)
             while result is not None and result.code is Code.NONE:
+                if self.now_s > end_s + WITHIN_S:
+                    raise RuntimeError(f"{cycle_id}: not over {WITHIN_S:g} s after the gap's end")
                 self.step()
                 result = maintenance.result(cycle_id)
         except RobocalError as error:

@@ -28,6 +28,7 @@ from robocal_ros.storage.robots import load_robot
 Array = NDArray[np.float64]
 
 HOUR_S = 3600.0
+BEGINS_H = 8.0  # o'clock
 ROBOT = "kr150_r3100"
 
 
@@ -50,7 +51,6 @@ class ShiftPlan:
     first_s, every_s, gap_s : a gap of this length begins then, and each so often.
     pauses : from and to, in which nothing is produced.
     incidents : in their order; one within a gap happens at its end.
-    begins_h : o'clock.
     prior : what drift to expect: the default, or as earlier shifts of this robot have taught.
     points : of a sphere's cloud; 0: centres alone.
     """
@@ -62,7 +62,6 @@ class ShiftPlan:
     gap_s: float = 90.0
     pauses: tuple[tuple[float, float], ...] = ()
     incidents: tuple[Incident, ...] = ()
-    begins_h: float = 8.0
     points: int = 2000
     prior: Prior = "default"
 
@@ -77,9 +76,9 @@ class ShiftPlan:
         return [self.first_s + i * self.every_s for i in range(self.cycles)]
 
 
-def at(hour: int, minute: int = 0, begins_h: float = 8.0) -> float:
+def at(hour: int, minute: int = 0) -> float:
     """Seconds since the shift's begin at a time of the day."""
-    return round((hour + minute / 60.0 - begins_h) * HOUR_S)
+    return round((hour + minute / 60.0 - BEGINS_H) * HOUR_S)
 
 
 GOLDEN = ShiftPlan(

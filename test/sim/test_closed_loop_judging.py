@@ -74,6 +74,13 @@ def test_the_worst_cycle_is_not_averaged_away():
     assert found.rms_m < found.cycle_m / 4.0
 
 
+def test_a_cycle_before_the_fault_is_not_its_worst():
+    one_bad = shift(lambda t, cycle: 3e-4 if cycle == 1 else GOOD)
+    assert harm(one_bad, always(GOOD), after=1).cycle_m == pytest.approx(0.0, abs=1e-12)
+    stood = shift(lambda t, cycle: GOOD if cycle == 1 else None)
+    assert np.isnan(harm(stood, always(GOOD), after=1).cycle_m)
+
+
 def test_refused_passes_are_counted():
     half = shift(lambda t, cycle: None if cycle % 2 else GOOD)
     found = harm(half, always(GOOD))

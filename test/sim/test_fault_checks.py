@@ -47,6 +47,18 @@ def test_a_fault_that_is_told_in_fewer_than_nine_of_ten_cells_misses_it(fault, m
     assert table.met is met
 
 
+def test_each_of_a_count_must_be_told():
+    table = power_table(
+        found(
+            "frozen_encoder",
+            lambda joint, cell: Code.ACCEPT if joint == 6 else RIGHT["frozen_encoder"],
+        )
+    )
+    assert not table.met
+    joints = [Trial("frozen_encoder", joint, 1) for joint in SWEEP["frozen_encoder"]]
+    assert all(one.must_be_told for one in joints)
+
+
 def test_another_code_is_not_the_right_one():
     assert not power_table(found("wrong_tool", lambda size, cell: Code.LIMIT_EXCEEDED)).met
 
