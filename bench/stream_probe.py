@@ -129,7 +129,8 @@ class Subject:
         self.name, self.node = name, node
         words = [*map(str, command), "--ros-args", "-r", f"__ns:=/{name}"]
         given = ("-p", f"serial:={SERIAL}")
-        with (folder / f"{name}.log").open("w") as log:
+        self.log = folder / f"{name}.log"
+        with self.log.open("w") as log:
             self.process = subprocess.Popen(
                 [*words, *given],
                 env=os.environ | {"ROBOCAL_STATE": str(folder)},
