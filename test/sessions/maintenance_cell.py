@@ -424,3 +424,23 @@ def same_tool() -> Answer:
 
 def wrong_tool() -> Answer:
     return Answer(Code.WRONG_TOOL, "5 mm too thick: another tool is mounted")
+
+
+def over(cell: Cell, *, fault: bool = False) -> None:
+    """The robot stands and is disarmed; at home where there is no fault."""
+    cell.pass_time(1.5)
+    assert not cell.tool.armed
+    assert cell.now_s - cell.moved_s > 1.0
+    assert (cell.state is State.FAULT) == fault
+    assert fault or cell.at_home()
+
+
+def until_moving(cell: Cell, which: str) -> None:
+    cell.run("c1", LONG_S)
+    if which == "tool":
+        while not cell.tool.measuring:
+            cell.step()
+        cell.pass_time(1.0)
+    else:
+        while cell.motion.at([cell.now_s])[1].max() < 0.1:
+            cell.step()

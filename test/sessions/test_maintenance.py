@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from maintenance_cell import (
-    ARM,
-    BEAT_S,
     CELL,
-    DRIVING,
     HOME,
     LONG_S,
     POSES,
@@ -19,15 +16,16 @@ from maintenance_cell import (
     TICK_S,
     TIMES,
     Cell,
-    ToolNode,
     bent,
     config_of,
     kinds,
     opened,
+    over,
+    until_moving,
 )
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, LimitError, StorageError
+from robocal_ros.core.errors import InputError, StorageError
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
@@ -35,10 +33,7 @@ from robocal_ros.sessions.events import LEAVE
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.hands import DEAF_S
 from robocal_ros.sessions.maintenance.mover import Mover
-from robocal_ros.sessions.robot_watch import VELOCITY_S
-from robocal_ros.sessions.tool_driving import SETTLED_S
 from robocal_ros.sim.joint_motion import JointMotion
 
 SMALL = ToolError(1e-4, 1.5e-4)
@@ -47,15 +42,6 @@ SMALL = ToolError(1e-4, 1.5e-4)
 @pytest.fixture
 def cell(history) -> Cell:
     return opened(history)
-
-
-def over(cell: Cell, *, fault: bool = False) -> None:
-    """The robot stands and is disarmed; at home where there is no fault."""
-    cell.pass_time(1.5)
-    assert not cell.tool.armed
-    assert cell.now_s - cell.moved_s > 1.0
-    assert (cell.state is State.FAULT) == fault
-    assert fault or cell.at_home()
 
 
 def test_a_long_gap_takes_everything_in_its_order(cell):
@@ -142,17 +128,6 @@ def test_a_full_measurement_that_did_not_fit_comes_next(cell):
     assert [r.mode for r in cell.log if isinstance(r, ask.Measure)] == ["full"]
 
 
-def until_moving(cell: Cell, which: str) -> None:
-    cell.run("c1", LONG_S)
-    if which == "tool":
-        while not cell.tool.measuring:
-            cell.step()
-        cell.pass_time(1.0)
-    else:
-        while cell.motion.at([cell.now_s])[1].max() < 0.1:
-            cell.step()
-
-
 @pytest.mark.parametrize("which", ["thermal", "tool"])
 @pytest.mark.parametrize("how", ["closed", "stale"])
 def test_a_gap_that_closes_stops_everything_at_once(cell, which, how):
@@ -209,222 +184,6 @@ def test_after_a_fault_the_ways_begin_at_home_again(cell):
     over(cell)
 
 
-def test_a_tool_node_that_never_confirms_is_a_fault(cell):
-    cell.services["disarm"] = SILENT
-    cell.run("c1", LONG_S)
-    result = cell.finish()
-    assert "does not confirm" in result.message
-    with pytest.raises(ConflictError, match="not confirmed"):
-        cell.session.acknowledge("me")
-    cell.services["disarm"] = "ok"
-    cell.pass_time(1.0)
-    cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
-
-
-GONE_S = 6.0  # the tool node is looked for as long
-
-
-def test_a_tool_node_that_was_never_started_keeps_nothing_but_its_part(history):
-    cell = Cell(history)
-    cell.tool_dies()
-    cell.open_gap()
-    with pytest.raises(ConflictError, match="not there: start it"):  # it may yet be found
-        cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns)
-    cell.pass_time(GONE_S)
-    cell.run("c1", LONG_S)
-    result = cell.finish()
-    assert (result.code, result.thermal_code) == (Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN)
-    assert (result.tool_code, result.left) == (Code.CONFLICT, ("tool measurement (quick)",))
-    assert "tool: the tool node is not there: start it" in result.message
-    assert not {"Arm", "Measure"} & set(kinds(cell))
-    over(cell)
-    cell.tool = ToolNode()
-    cell.run("c2", LONG_S)
-    assert cell.finish().tool_answer == "pass"
-    over(cell)
-
-
-def test_a_tool_node_that_died_at_home_is_a_fault_that_can_be_acknowledged(cell):
-    cell.run("c1", LONG_S)
-    cell.finish()
-    cell.tool_dies()
-    count = kinds(cell).count("Move")
-    cell.run("c2", LONG_S)
-    assert "not there: start it" in cell.finish().message
-    assert kinds(cell).count("Move") == count
-    with pytest.raises(ConflictError, match=r"not confirmed .* not there"):
-        cell.session.acknowledge("me")
-    cell.pass_time(GONE_S)
-    cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
-
-
-def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
-    """One that is there must confirm, the same or a new one, and the robot must rest."""
-    until_moving(cell, "tool")
-    cell.tool_dies()
-    cell.is_open = False
-    over(cell, fault=True)
-    cell.motion = JointMotion(HOME)  # brought home by hand
-    cell.pass_time(2.0 * GONE_S)
-    with pytest.raises(ConflictError, match="not confirmed"):
-        cell.session.acknowledge("me")
-    cell.tool = ToolNode()
-    cell.pass_time(1.0)
-    cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
-
-
-def test_a_tool_node_is_let_go_only_while_the_robot_stands_at_home(history):
-    cell = Cell(history)
-    cell.tool_dies()
-    cell.motion = JointMotion(POSES[0])
-    cell.pass_time(2.0 * GONE_S)
-    assert not cell.session.status(cell.now_s).disarmed
-    cell.motion = JointMotion(HOME)
-    cell.pass_time(1.0)
-    assert cell.session.status(cell.now_s).disarmed
-
-
-def test_a_tool_node_that_hangs_is_not_let_go(history):
-    """It is there, or was found meanwhile, and may be armed by an operator."""
-    cell = Cell(history)
-    cell.tool_dies()
-    cell.pass_time(0.5 * GONE_S)
-    cell.tool, cell.services["disarm"] = ToolNode(armed=True), SILENT
-    cell.pass_time(2.0 * GONE_S)
-    assert not cell.session.status(cell.now_s).disarmed
-    cell.tool_dies()
-    cell.pass_time(0.5 * GONE_S)  # absent anew: not for long
-    assert not cell.session.status(cell.now_s).disarmed
-    cell.pass_time(GONE_S)
-    assert cell.session.status(cell.now_s).disarmed
-
-
-@pytest.mark.parametrize("how", ["closed", "cancelled"])
-def test_a_deaf_tool_node_is_stopped_by_what_armed_it(cell, how):
-    """It hangs, and the robot moves on by the plan that the controller has."""
-    until_moving(cell, "tool")
-    cell.services |= {"disarm": SILENT, "cancel": SILENT}
-    assert cell.moved_s == cell.now_s
-    since_s = cell.now_s
-    if how == "closed":
-        cell.is_open = False
-    else:
-        cell.session.cancel("by the PLC")
-    cell.pass_time(3.0)
-    assert cell.moved_s <= since_s + 0.2 + DEAF_S + SHORTEST_STOP_S + 0.1
-    assert cell.state is State.FAULT
-    assert "Stop" in kinds(cell)
-    with pytest.raises(ConflictError, match="not confirmed"):
-        cell.session.acknowledge("me")
-
-
-@pytest.mark.parametrize(
-    ("how", "hears_s"), [("closed", BEAT_S), ("silent", STALE_S), ("cancelled", 0.0)]
-)
-def test_what_a_dead_tool_node_left_is_stopped_whoever_confirms(cell, how, hears_s):
-    """Started anew it confirms at once, but knows nothing of the plan that the controller has."""
-    until_moving(cell, "tool")
-    cell.tool_dies()
-    cell.tool = ToolNode()
-    if how == "cancelled":
-        cell.session.cancel("by the PLC")
-    else:
-        cell.is_open, cell.beating = how == "silent", how != "silent"
-    believed_s = DRIVING.late_s + SHORTEST_STOP_S + SETTLED_S
-    cell.pass_time(hears_s + believed_s + SHORTEST_STOP_S + 0.1)
-    assert cell.moved_s < cell.now_s - TICK_S
-    cell.finish()
-    over(cell, fault=how != "cancelled")
-    assert kinds(cell).count("Stop") == 1
-
-
-def test_a_confirmation_at_home_does_not_hand_over_what_a_dead_tool_node_left(cell):
-    """The way down begins with a rest of 0.3 s."""
-    cell.run("c1", LONG_S)
-    while not cell.tool.measuring:
-        cell.step()
-    cell.tool_dies()
-    cell.tool = ToolNode()
-    cell.session.cancel("by the PLC")
-    cell.pass_time(0.1)  # it has confirmed
-    status = cell.session.status(cell.now_s)
-    assert (status.at_home, status.disarmed) == (True, False)
-    cell.session.doubt_gap("two publish gap_open")
-    cell.step()
-    with pytest.raises(ConflictError, match="may still be driven"):
-        cell.session.acknowledge("me")
-    over(cell, fault=True)
-    assert kinds(cell)[-1] == "Stop"
-    assert cell.at_home()
-    assert cell.session.status(cell.now_s).disarmed
-    cell.session.acknowledge("me")
-
-
-def test_a_robot_that_rests_but_is_not_handed_over_is_told_so(history):
-    """The stop in the dead tool node's place is due after the time that a rest may take."""
-    cell = opened(history, config=config_of(times=replace(TIMES, rest_s=0.3)))
-    cell.run("c1", LONG_S)
-    while not cell.tool.measuring or cell.now_s < cell.moved_s + 0.5:
-        cell.step()
-    cell.tool_dies()
-    cell.tool = ToolNode()
-    cell.session.cancel("by the PLC")
-    assert "the robot rests, but what the tool node sent may" in cell.finish().message
-
-
-@pytest.mark.parametrize("silent_s", [0.6, 3.0])
-def test_a_deaf_tool_node_is_stopped_once_joint_states_are_back(cell, silent_s):
-    """Not before: nobody knows where to stop from. One that stands by then is not pushed."""
-    until_moving(cell, "tool")
-    cell.services |= {"disarm": SILENT, "cancel": SILENT}
-    cell.silent = True
-    cell.is_open = False
-    cell.pass_time(silent_s)
-    assert "Stop" not in kinds(cell)
-    moving = cell.moved_s == cell.now_s
-    assert moving == (silent_s < 1.0)
-    cell.silent, heard_s, q = False, cell.now_s, cell.q
-    cell.pass_time(1.5)
-    assert kinds(cell).count("Stop") == 1
-    if moving:
-        assert cell.moved_s <= heard_s + VELOCITY_S + SHORTEST_STOP_S + 0.1
-    else:
-        np.testing.assert_allclose(cell.q, q, atol=1e-6)
-
-
-@pytest.mark.parametrize("how", ["closed", "cancelled"])
-def test_a_tool_node_that_hears_is_left_to_stop_by_itself(cell, how):
-    """Two stops at once would pull the robot to and fro; nor is one left for the next run."""
-    until_moving(cell, "tool")
-    if how == "closed":
-        cell.is_open = False
-        cell.pass_time(3.0)
-        cell.motion = JointMotion(HOME)  # brought home by hand
-        cell.open_gap()
-        cell.session.acknowledge("me")
-    else:
-        cell.session.cancel("by the PLC")
-        cell.finish()
-    cell.run("c2", LONG_S)
-    assert cell.finish().complete
-    assert "Stop" not in kinds(cell)
-
-
-def test_a_node_that_ends_stops_what_the_tool_node_moves_at_once(cell):
-    until_moving(cell, "tool")
-    before = cell.shelf.document
-    asked = cell.session.give_up("the node ends", cell.now_s)
-    assert [type(request).__name__ for request in asked] == ["Stop", "CancelMeasure", "Disarm"]
-    assert cell.shelf.document == before  # a stop does not wait for the disk
-    cell.session.close()
-    cell.restart()
-    assert cell.state is State.FAULT
-    assert "the node ends" in cell.session.status(cell.now_s).fault
-
-
 @pytest.mark.parametrize("service", ["thermal", "arm", "measure", "sensor"])
 @pytest.mark.parametrize("how", [REFUSED, SILENT])
 def test_nodes_that_fail_leave_the_robot_at_home(cell, service, how):
@@ -447,130 +206,6 @@ def test_a_defect_is_a_fault_and_no_cycle_is_left_without_a_code(cell, monkeypat
     over(cell, fault=True)
 
 
-def test_silent_joint_states_stop_the_robot(cell):
-    until_moving(cell, "thermal")
-    cell.silent = True
-    cell.pass_time(1.0)
-    cell.silent = False
-    over(cell, fault=True)
-    assert "joint states are silent" in cell.session.status(cell.now_s).fault
-
-
-def test_a_robot_off_its_plan_is_stopped(cell):
-    until_moving(cell, "thermal")
-    cell.offset[1] = np.radians(2.0)
-    cell.pass_time(1.0)
-    over(cell, fault=True)
-    assert "away from its plan" in cell.session.status(cell.now_s).fault
-
-
-def until_measuring(cell: Cell, pose: int) -> None:
-    cell.run("c1", LONG_S)
-    while not cell.session.status(cell.now_s).doing.startswith(f"measuring pose {pose}"):
-        cell.step()
-
-
-def pushed(cell: Cell, joint: int = 1, by_deg: float = 25.0) -> None:
-    """Somebody else has moved the robot; it rests."""
-    q = cell.q.copy()
-    q[joint] += np.radians(by_deg)
-    cell.motion = JointMotion(q)
-
-
-@pytest.mark.parametrize("by_deg", [3.0, 25.0])
-def test_a_robot_pushed_while_it_measures_is_not_driven(cell, by_deg):
-    until_measuring(cell, 2)
-    pushed(cell, by_deg=by_deg)
-    moves = kinds(cell).count("Move")
-    cell.pass_time(3.0)
-    assert kinds(cell).count("Move") == moves
-    over(cell, fault=True)
-    joint = ARM.joint_names[1]
-    words = f"not where it came to rest: {joint} is {by_deg:.2f} deg off"
-    assert words in cell.session.status(cell.now_s).fault
-
-
-def test_a_robot_pushed_while_a_run_is_broken_off_is_not_driven_home(cell):
-    until_measuring(cell, 2)
-    cell.session.cancel("by the PLC")
-    pushed(cell)
-    moves = kinds(cell).count("Move")
-    cell.pass_time(3.0)
-    assert kinds(cell).count("Move") == moves
-    over(cell, fault=True)
-    assert "robot is not on its taught way: " in cell.session.status(cell.now_s).fault
-
-
-def test_silent_joint_states_while_the_robot_measures_are_a_fault(cell):
-    until_measuring(cell, 2)
-    cell.silent = True
-    cell.services["sensor"] = SILENT
-    cell.pass_time(0.3)
-    assert cell.state is State.FAULT
-    assert "stands away from home" in cell.session.status(cell.now_s).fault
-
-
-def test_a_robot_that_is_not_at_home_is_not_moved(cell):
-    cell.offset[2] = np.radians(5.3)
-    cell.pass_time(0.5)
-    with pytest.raises(LimitError, match=f"not at home: {ARM.joint_names[2]} is 5.30 deg off"):
-        cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns)
-    assert cell.state is State.FAULT
-    cell.offset[2] = 0.0
-    cell.pass_time(0.5)
-    assert cell.run("c1", LONG_S) is Code.CONFLICT  # until it is acknowledged
-    cell.session.acknowledge("me")
-    assert cell.run("c1", LONG_S) is Code.ACCEPT
-    assert cell.log == []
-
-
-def test_a_fault_away_from_home_is_not_acknowledged(cell):
-    until_moving(cell, "tool")
-    cell.is_open = False
-    over(cell, fault=True)
-    fault = cell.session.status(cell.now_s).fault
-    with pytest.raises(LimitError, match=r"not at home: .* is .* deg off .*bring it home"):
-        cell.session.acknowledge("me")
-    cell.silent = True
-    cell.pass_time(0.5)
-    with pytest.raises(LimitError, match="joint states are missing"):
-        cell.session.acknowledge("me")
-    assert cell.session.status(cell.now_s).fault == fault
-    cell.silent, cell.motion = False, JointMotion(HOME)
-    cell.pass_time(0.5)
-    cell.session.acknowledge("me")
-    assert cell.state is State.IDLE
-
-
-def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):
-    cell.offset[2] = np.radians(5.3)
-    cell.pass_time(0.5)
-    assert cell.run("c1", LONG_S) is Code.LIMIT_EXCEEDED
-    cell.offset[2] = 0.0
-    cell.pass_time(0.5)
-    before = cell.session.status(cell.now_s)
-
-    def full(document):
-        raise StorageError("disk full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cell.shelf, "save", full)
-        with pytest.raises(StorageError):
-            cell.session.acknowledge("me")
-    after = cell.session.status(cell.now_s)
-    assert (after.state, after.fault) == (State.FAULT, before.fault)
-    assert after.fault_code is Code.LIMIT_EXCEEDED
-    assert cell.run("c1", LONG_S) is Code.CONFLICT
-
-
-def test_a_reading_that_is_older_does_not_count(cell):
-    cell.motion = JointMotion(POSES[0])
-    cell.pass_time(0.5)
-    cell.session.reading(cell.now_s - 0.3, HOME, cell.now_s)
-    assert not cell.session.status(cell.now_s).at_home
-    assert cell.run("c1", LONG_S) is Code.LIMIT_EXCEEDED
-
-
 def test_nothing_runs_twice_not_after_a_restart_either(cell):
     cell.run("c1", LONG_S)
     first = cell.finish()
@@ -581,85 +216,6 @@ def test_nothing_runs_twice_not_after_a_restart_either(cell):
     assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
     cell.pass_time(1.0)
     assert kinds(cell)[count:] == ["Disarm"]  # of the start
-
-
-def test_a_restart_in_the_middle_of_a_run_is_a_fault(cell):
-    until_moving(cell, "thermal")
-    cell.restart()
-    status = cell.session.status(cell.now_s)
-    assert status.state is State.FAULT
-    assert "see where the robot is" in status.fault
-    assert status.last.code is Code.CONFLICT
-    cell.restart()
-    assert cell.state is State.FAULT
-
-
-def test_after_a_restart_the_tool_node_is_disarmed_before_anything_else(cell):
-    until_moving(cell, "tool")
-    cell.restart()
-    assert not cell.session.status(cell.now_s).disarmed
-    with pytest.raises(ConflictError, match="not confirmed"):
-        cell.session.acknowledge("me")
-    cell.pass_time(0.5)
-    assert cell.session.status(cell.now_s).disarmed
-    assert not cell.tool.armed
-
-
-def test_a_disarm_that_is_not_confirmed_outlives_a_restart(cell):
-    until_moving(cell, "tool")
-    cell.services |= {"disarm": SILENT, "cancel": SILENT}
-    cell.is_open = False
-    cell.pass_time(1.0)
-    assert cell.state is State.FAULT
-    cell.restart()
-    cell.pass_time(0.3)
-    assert not cell.session.status(cell.now_s).disarmed
-    with pytest.raises(ConflictError, match="not confirmed"):
-        cell.session.acknowledge("me")
-    cell.services.clear()
-    cell.pass_time(1.0)
-    assert cell.session.status(cell.now_s).disarmed
-    assert not cell.tool.armed
-
-
-def test_an_idle_cell_that_restarts_does_not_begin_before_a_disarm(cell):
-    cell.tool.armed = True  # by an operator
-    cell.services["disarm"] = SILENT
-    cell.restart()
-    cell.pass_time(0.3)
-    assert cell.run("c1", LONG_S) is Code.CONFLICT
-    cell.services.clear()
-    cell.pass_time(1.0)
-    assert cell.run("c1", LONG_S) is Code.ACCEPT
-    assert cell.finish().complete
-
-
-def test_what_an_operator_armed_is_disarmed_before_anything_moves(cell):
-    cell.tool.armed = True
-    cell.run("c1", LONG_S)
-    assert cell.finish().complete
-    assert kinds(cell)[:3] == ["Disarm", "BeginCycle", "Move"]
-    over(cell)
-
-
-def test_a_cycle_moves_nothing_before_the_disarm_is_confirmed(cell):
-    cell.tool.armed = True
-    cell.services["disarm"] = SILENT
-    cell.run("c1", LONG_S)
-    result = cell.finish()
-    assert "does not confirm" in result.message
-    assert not {"Move", "BeginCycle", "Arm"} & set(kinds(cell))
-    assert cell.state is State.FAULT
-
-
-def test_a_tool_node_that_turns_deaf_at_the_station_is_a_fault(cell):
-    until_moving(cell, "tool")
-    cell.services["disarm"] = SILENT
-    count = kinds(cell).count("Move")
-    assert "does not confirm" in cell.finish().message
-    assert kinds(cell).count("Move") == count
-    with pytest.raises(ConflictError, match="not confirmed"):
-        cell.session.acknowledge("me")
 
 
 def test_calls_that_make_no_sense_are_refused(cell):
