@@ -1,0 +1,62 @@
+"""What tests of tools and of their acceptance ask of a cell."""
+
+from typing import Any
+
+from maintenance_cell import (
+    KNOWN,
+    LONG_S,
+    Cell,
+    bent,
+    config_of,
+    new_tool,
+    opened,
+    proposed,
+    thermal_proposed,
+)
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.sessions.maintenance import AcceptBounds
+from robocal_ros.sessions.maintenance import requests as ask
+from robocal_ros.sessions.maintenance.requests import Answer
+
+
+def level(cell: Cell, later_ns: int = 0) -> AccuracyLevel:
+    """With a drift of which all is known."""
+    cell.session.drift(KNOWN, cell.now_s)
+    return cell.session.accuracy(cell.now_s, cell.wall_ns + later_ns).level
+
+
+def modes(cell: Cell) -> list[str]:
+    return [request.mode for request in cell.log if isinstance(request, ask.Measure)]
+
+
+def decide(cell: Cell, name: str, calibration_id: int) -> None:
+    assert cell.session.decide(name, calibration_id, "a person", "", cell.wall_ns).done
+
+
+def until_measuring(cell: Cell, mode: str) -> None:
+    cell.run("c1", LONG_S)
+    while not (cell.tool.measuring and cell.mode == mode):
+        cell.step()
+
+
+def automatic(history, **changes) -> Cell:
+    """A cell that may accept without a person, whose tool is found bent."""
+    config = config_of(bounds=AcceptBounds(automatic=True), **changes)
+    return opened(history, config=config, check=bent(), drift=KNOWN)
+
+
+def measured_in_full(cell: Cell, **given: Any) -> int:
+    """Until the full measurement is about to give a candidate."""
+    until_measuring(cell, "full")
+    number = proposed(cell.history, **given)
+    cell.full = lambda cell: new_tool(number)
+    return number
+
+
+def thermal_candidate(cell: Cell) -> int:
+    """What the thermal node answers from now on."""
+    number = thermal_proposed(cell.history, 10.0)
+    cell.thermal = Answer(Code.ACCEPT, "warm", number)
+    return number

@@ -1,0 +1,193 @@
+"""What may come into force without a person."""
+
+import sqlite3
+import time
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from maintenance_cell import (
+    CELL,
+    KNOWN,
+    LONG_S,
+    POSES,
+    REFUSED,
+    SILENT,
+    Cell,
+    bent,
+    config_of,
+    opened,
+    passed,
+    proposed,
+    thermal_proposed,
+)
+from maintenance_tools import (
+    automatic,
+    measured_in_full,
+    modes,
+    thermal_candidate,
+)
+from tool_driver import TAUGHT
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import StaleError
+from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.sessions.events import ACCEPT, WITHHOLD
+from robocal_ros.sessions.gap import STALL_S
+from robocal_ros.sessions.maintenance import AcceptBounds
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.tool_config import rows_of
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+UNSOUND = (AccuracyLevel.FAULT, None)  # None: silent
+BESIDE = np.eye(4) + 1e-5 * np.eye(4, k=3)  # a hundredth of a millimetre
+
+
+@pytest.fixture
+def cell(history) -> Cell:
+    return opened(history)
+
+
+@pytest.mark.parametrize("how", [REFUSED, SILENT])
+def test_a_tool_without_a_thermal_result_waits(history, how):
+    cell = automatic(history)
+    cell.services["thermal"] = how
+    number = measured_in_full(cell)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    (withheld,) = (outcome for name, outcome in cell.events if name == WITHHOLD)
+    assert withheld.command.arguments == {"id": number, "kind": TOOL}
+    assert withheld.message in result.message
+    assert result.accepted == ()
+    assert cell.history.head(TOOL).revision == 0
+
+
+@pytest.mark.parametrize("poses", [POSES, POSES[:0]])
+@pytest.mark.parametrize("code", [Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT])
+def test_a_tool_with_a_known_drift_is_accepted(history, poses, code):
+    """No other model explains this cycle better than the one in force."""
+    cell = automatic(history, poses=poses)
+    cell.thermal = Answer(code, "warm")
+    number = measured_in_full(cell)
+    while not cell.history.head(TOOL).revision:
+        cell.step()
+    cell.check = passed()
+    assert cell.finish().accepted == (number,)
+
+
+@pytest.mark.parametrize("said", [AccuracyLevel.DEGRADED, AccuracyLevel.EXPIRED, *UNSOUND])
+def test_a_thermal_model_waits_while_the_drift_is_a_fault(history, said):
+    """What is EXPIRED is just what a measurement mends."""
+    cell = automatic(history)
+    cell.check = passed()
+    cell.drift = said and replace(KNOWN, level=said)
+    number = thermal_candidate(cell)
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert result.accepted == (() if said in UNSOUND else (number,)), result.message
+    assert (f"thermal candidate {number} waits" in result.message) == (said in UNSOUND)
+
+
+@pytest.mark.parametrize("said", [AccuracyLevel.EXPIRED, *UNSOUND])
+def test_a_tool_waits_while_the_drift_is_not_known(history, said):
+    cell = automatic(history)
+    cell.drift = said and replace(KNOWN, level=said)
+    number = measured_in_full(cell)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert ("silent" if said is None else said.name) in result.message
+    assert result.accepted == ()
+
+
+@pytest.mark.parametrize(
+    "bounds", [{"tool_m": np.nan}, {"tool_rad": np.nan}, {"tool_m": 0.9e-3}, {"thermal_m": np.nan}]
+)
+def test_a_bound_that_is_no_number_lets_nothing_pass(history, bounds):
+    cell = opened(
+        history,
+        config=config_of(bounds=AcceptBounds(automatic=True, **bounds)),
+        check=bent(),
+        drift=KNOWN,
+    )
+    thermal = thermal_candidate(cell)
+    number = measured_in_full(cell, thermal_revision=int("thermal_m" not in bounds))
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert result.accepted == (() if "thermal_m" in bounds else (thermal,))
+
+
+@pytest.mark.parametrize(
+    ("other", "what"),
+    [
+        ({"taught": rows_of(BESIDE @ TAUGHT)}, "'taught' tool"),
+        ({"points_m": rows_of(CELL.laser.points + np.full(3, 1e-5))}, "'laser'"),
+    ],
+)
+def test_bounds_hold_only_against_what_both_nodes_were_given(history, other, what):
+    cell = automatic(history)
+    number = measured_in_full(cell, **other)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert f"another {what} than this node's: give both nodes the same" in result.message
+    assert result.accepted == ()
+
+
+def test_a_tool_of_another_thermal_revision_is_stale(cell):
+    cell.check = bent()
+    number = measured_in_full(cell, thermal_revision=3)
+    cell.finish()
+    with pytest.raises(StaleError, match="thermal revision 3, in force is 0: measure it again"):
+        cell.session.decide(ACCEPT, number, "a person", "", cell.wall_ns)
+    assert cell.session.status(cell.now_s).tool_pending == 0
+    cell.log.clear()
+    cell.run("c2", LONG_S)  # it waits for nobody
+    cell.finish()
+    assert modes(cell) == ["full"]
+
+
+def copied(history: CalibrationHistory, calibration_id: int, count: int) -> None:
+    """So many more of a calibration, as other nodes would propose them."""
+    columns = (
+        "kind, model_hash, based_on, cycle_id, stamp_ns, created_ns, software, method, code, reason"
+    )
+    with closing(sqlite3.connect(history.path)) as raw, raw:
+        raw.execute(
+            "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < ?) "
+            f"INSERT INTO calibrations ({columns}) "
+            f"SELECT {columns} FROM calibrations, n WHERE id = ?",
+            (count, calibration_id),
+        )
+        raw.execute(
+            "INSERT INTO payloads SELECT c.id, p.name, p.data, p.sha256 FROM calibrations c, "
+            "payloads p WHERE p.calibration_id = ? AND c.id NOT IN "
+            "(SELECT calibration_id FROM payloads)",
+            (calibration_id,),
+        )
+
+
+def test_a_status_is_no_pause_however_many_candidates_wait(cell):
+    """It is asked for five times a second by the process that looks after the robot."""
+    history = cell.history
+    copied(history, proposed(history), 9_998)
+    outdated = proposed(history, thermal_revision=3)
+    copied(history, outdated, 10_000)
+    copied(history, thermal_proposed(history, 1.0), 9_999)
+    took_s = []
+    for _ in range(5):
+        begin_s = time.perf_counter()
+        status = cell.session.status(cell.now_s)
+        took_s.append(time.perf_counter() - begin_s)
+    assert (status.thermal_pending, status.tool_pending) == (30_000, 0)
+    assert min(took_s) < 0.1 * STALL_S
+    number = proposed(history)
+    assert cell.session.status(cell.now_s).tool_pending == number
+
+
+def test_a_tool_of_another_thermal_revision_is_not_accepted_without_a_person(history):
+    cell = automatic(history)
+    number = measured_in_full(cell, thermal_revision=3)
+    result = cell.finish()
+    assert f"tool candidate {number} waits for a decision: tool {number} was" in result.message
+    assert result.accepted == ()
