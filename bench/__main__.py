@@ -57,7 +57,6 @@ TOGETHER = (
     "hand_eye_tracker",
 )
 
-
 Made = tuple[Sequence[Table] | None, float]
 
 
@@ -134,8 +133,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         show(made)
         tables += made
+        made_by = about(took_s)
         for folder in (OUT, KEPT) if given.keep and made else (OUT,):
-            _write(folder, name, made, about(took_s))
+            _write(folder, name, made, made_by)
     missed += [table.title for table in tables if not table.met]
     for title in missed:
         print(f"goal missed: {title}", file=sys.stderr)

@@ -12,13 +12,13 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
 from bench.closed_loop.faults import (
-    ENUMERATED,
     POWER,
     RIGHT,
     SWEEP,
     WELL,
     Trial,
     named_size,
+    named_smallest,
     smallest_with_power,
 )
 from bench.closed_loop.plant import equipped
@@ -27,7 +27,7 @@ from bench.tables import Goal, Table
 from robocal_ros.core.codes import Code
 from robocal_ros.sessions.tool_results import QUICK
 from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_faults import SIZES, Fault
+from robocal_ros.sim.cell_faults import Fault
 from robocal_ros.sim.kr150_cell import kr150_cell
 from robocal_ros.storage.robots import load_robot
 
@@ -111,25 +111,17 @@ def power_table(found: Sequence[Checked]) -> Table:
             f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}".lstrip(": ")
             for cells in by_size.values()
         )
-        counted = fault in ENUMERATED
-        by_right = ((0.0 if counted else one.trial.size, one.right) for one in own)
-        smallest = smallest_with_power(by_right)
-        told = [c.code.name for c in own if smallest is None or c.trial.size < smallest]
+        smallest = smallest_with_power((one.trial.amount, one.right) for one in own)
+        told = [c.code.name for c in own if smallest is None or c.trial.amount < smallest]
         below = ", ".join(f"{name} {count}" for name, count in Counter(told).most_common())
-        at_usual = own if counted else by_size.get(SIZES.get(fault, (0.0,))[0], own)
-        usual = [c.right for c in at_usual]
-        share = 100.0 * sum(usual) / len(usual)
+        wanted = [cells for cells in by_size.values() if cells[0].trial.must_be_told]
+        share = 100.0 * min(sum(c.right for c in cells) / len(cells) for cells in wanted)
         table.add(
             fault, RIGHT[fault].name, words,
-            _smallest(fault, smallest), below, share, Goal(share, 100.0 * POWER, at_least=True),
+            named_smallest(fault, smallest), below,
+            share, Goal(share, 100.0 * POWER, at_least=True),
         )  # fmt: skip
     return table
-
-
-def _smallest(fault: Fault, size: float | None) -> str:
-    if size is None:
-        return "none"
-    return "" if fault in ENUMERATED else named_size(Trial(fault, size, 0))
 
 
 def _all_checked(seed: int) -> list[Checked]:

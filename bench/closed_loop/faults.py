@@ -90,6 +90,11 @@ class Trial:
         )
 
     @property
+    def amount(self) -> float:
+        """Its size, by which trials are put in order; 0 where that is a number of something."""
+        return 0.0 if self.fault in ENUMERATED else self.size
+
+    @property
     def must_be_told(self) -> bool:
         """Whether the right code is wanted in every cell: a usual size, or one of a count."""
         usual = (0.0, *SIZES.get(self.fault, ())[:1])
@@ -179,6 +184,13 @@ def smallest_with_power(found: Iterable[tuple[float, bool]]) -> float | None:
             break
         smallest = size
     return smallest
+
+
+def named_smallest(fault: Fault, amount: float | None) -> str:
+    """What `smallest_with_power` found, in words."""
+    if amount is None:
+        return "none"
+    return "" if fault in ENUMERATED else named_size(Trial(fault, amount, 0))
 
 
 def named_size(trial: Trial) -> str:

@@ -15,6 +15,7 @@ from bench.closed_loop.faults import (
     Report,
     Trial,
     named_size,
+    named_smallest,
     report_of,
     smallest_with_power,
     sweep,
@@ -217,11 +218,11 @@ def detection_table(reports: Sequence[Report]) -> Table:
     swept = [one for one in reports if one.trial.gaps == AFTER]
     for fault in dict.fromkeys(one.trial.fault for one in swept):
         own = [one for one in swept if one.trial.fault == fault]
-        size = smallest_with_power((one.trial.size, one.in_time) for one in own)
-        at_it = [one for one in own if one.trial.size == size]
+        amount = smallest_with_power((one.trial.amount, one.in_time) for one in own)
+        at_it = [one for one in own if one.trial.amount == amount]
         codes = ", ".join(sorted({one.code.name for one in at_it}))
         tried = ", ".join(dict.fromkeys(named_size(one.trial) for one in own))
-        table.add(fault, tried, named_size(at_it[0].trial) if at_it else "none", codes)
+        table.add(fault, tried, named_smallest(fault, amount), codes)
     return table
 
 

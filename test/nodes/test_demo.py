@@ -22,9 +22,12 @@ BENT_MM = 2.0
 NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what it was measured with
 
 
-def played(out: Path) -> "subprocess.CompletedProcess[str]":
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> tuple[str, dict, Path]:
+    """What the demo printed, what it told of its story, and its folder."""
+    out = tmp_path_factory.mktemp("demo")
     with free_domain() as domain:
-        return subprocess.run(
+        done = subprocess.run(
             [sys.executable, str(ROOT / "bags" / "demo.py"), "--out", str(out), "--no-open"],
             env=os.environ | {"ROS_DOMAIN_ID": str(domain), "COLUMNS": "120"},
             capture_output=True,
@@ -32,13 +35,6 @@ def played(out: Path) -> "subprocess.CompletedProcess[str]":
             timeout=LONGEST_S,
             check=False,
         )
-
-
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory) -> tuple[str, dict, Path]:
-    """What the demo printed, what it told of its story, and its folder."""
-    out = tmp_path_factory.mktemp("demo")
-    done = played(out)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout, json.loads((out / "story.json").read_text()), out
 

@@ -51,7 +51,9 @@ def test_each_of_a_count_must_be_told():
     table = power_table(
         found(
             "frozen_encoder",
-            lambda joint, cell: Code.ACCEPT if joint == 6 else RIGHT["frozen_encoder"],
+            lambda joint, cell: (
+                Code.ACCEPT if (joint, cell % 2) == (6, 1) else RIGHT["frozen_encoder"]
+            ),
         )
     )
     assert not table.met
