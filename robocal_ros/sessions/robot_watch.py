@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.cell import MotionCell
-from robocal_ros.core.motion.measuring import START_NEAR_M, START_NEAR_RAD
+from robocal_ros.core.motion.measuring import start_near
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.sessions.silence import Silence
 
@@ -93,8 +93,7 @@ class RobotWatch:
         """Whether the plan has ended, with the robot where it ends."""
         if self._plan is None or not self._readings:
             return True
-        near = np.where(self._arm.prismatic, START_NEAR_M, START_NEAR_RAD)
-        there = np.all(np.abs(self._plan.q[-1] - self._readings[-1][1]) < near)
+        there = np.all(np.abs(self._plan.q[-1] - self._readings[-1][1]) < start_near(self._arm))
         return self.overdue_s(now_s) >= 0.0 and bool(there)
 
     def resting(self, span_s: float) -> Array | None:

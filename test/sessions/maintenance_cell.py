@@ -132,6 +132,7 @@ class Cell:
     check: Answer = field(default_factory=lambda: passed())
     full: Callable[["Cell"], Answer] = field(default=lambda cell: same_tool())
     drift: Drift | None = None  # told by the thermal node
+    silent: bool = False  # joint states
     planning_s: float = 0.0  # to make and send the next motion
 
     def __post_init__(self) -> None:
@@ -143,7 +144,7 @@ class Cell:
         self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
         self.beats_every_s = BEAT_S
         self.waiting: tuple[float, bool] | None = None  # a beat, and when it is delivered
-        self.silent, self.offset = False, np.zeros(ARM.n)
+        self.offset = np.zeros(ARM.n)
         self.log: list[ask.Request] = []
         self.events: list[tuple[str, Any]] = []
         self.begun: list[str] = []

@@ -1,5 +1,7 @@
 """A robot that is silent, off its plan, pushed, or not at home; faults and their ends."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from maintenance_cell import (
@@ -16,8 +18,9 @@ from maintenance_cell import (
 )
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import LimitError, StorageError
+from robocal_ros.core.errors import StorageError
 from robocal_ros.sessions.maintenance import State
+from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sim.joint_motion import JointMotion
 
 
@@ -32,13 +35,25 @@ def until_measuring(cell: Cell, pose: int) -> None:
         cell.step()
 
 
-def test_silent_joint_states_stop_the_robot(cell):
-    until_moving(cell, "thermal")
+@pytest.mark.parametrize("which", ["thermal", "tool"])
+def test_silent_joint_states_stop_the_robot(cell, which):
+    until_moving(cell, which)
     cell.silent = True
-    cell.pass_time(1.0)
+    while cell.state is not State.FAULT:
+        cell.step()
     cell.silent = False
     over(cell, fault=True)
-    assert "joint states are silent" in cell.session.status(cell.now_s).fault
+    status = cell.session.status(cell.now_s)
+    assert status.fault_code is Code.TOO_FEW_SAMPLES
+    assert "joint states are silent" in status.fault
+
+
+def test_a_robot_that_was_never_heard_is_not_moved(history):
+    cell = Cell(history, silent=True)
+    cell.open_gap()
+    assert cell.run("c1", LONG_S) is Code.TOO_FEW_SAMPLES
+    over(cell, fault=True)
+    assert "joint states are missing" in cell.session.status(cell.now_s).fault
 
 
 def test_a_robot_off_its_plan_is_stopped(cell):
@@ -47,6 +62,12 @@ def test_a_robot_off_its_plan_is_stopped(cell):
     cell.pass_time(1.0)
     over(cell, fault=True)
     assert "away from its plan" in cell.session.status(cell.now_s).fault
+
+
+def refused(ask: Callable[[], object], words: str) -> Code:
+    with pytest.raises(FaultError, match=words) as caught:
+        ask()
+    return caught.value.code
 
 
 def pushed(cell: Cell, joint: int = 1, by_deg: float = 25.0) -> None:
@@ -92,8 +113,9 @@ def test_silent_joint_states_while_the_robot_measures_are_a_fault(cell):
 def test_a_robot_that_is_not_at_home_is_not_moved(cell):
     cell.offset[2] = np.radians(5.3)
     cell.pass_time(0.5)
-    with pytest.raises(LimitError, match=f"not at home: {ARM.joint_names[2]} is 5.30 deg off"):
-        cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns)
+    words = f"not at home: {ARM.joint_names[2]} is 5.30 deg off"
+    code = refused(lambda: cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns), words)
+    assert code is Code.LIMIT_EXCEEDED
     assert cell.state is State.FAULT
     cell.offset[2] = 0.0
     cell.pass_time(0.5)
@@ -108,17 +130,41 @@ def test_a_fault_away_from_home_is_not_acknowledged(cell):
     cell.is_open = False
     over(cell, fault=True)
     fault = cell.session.status(cell.now_s).fault
-    with pytest.raises(LimitError, match=r"not at home: .* is .* deg off .*bring it home"):
-        cell.session.acknowledge("me")
+    words = r"not at home: .* is .* deg off .*bring it home"
+    assert refused(lambda: cell.session.acknowledge("me"), words) is Code.LIMIT_EXCEEDED
     cell.silent = True
     cell.pass_time(0.5)
-    with pytest.raises(LimitError, match="joint states are missing"):
-        cell.session.acknowledge("me")
+    words = r"joint states are silent for 0.5. s.*bring it home"
+    assert refused(lambda: cell.session.acknowledge("me"), words) is Code.TOO_FEW_SAMPLES
     assert cell.session.status(cell.now_s).fault == fault
     cell.silent, cell.motion = False, JointMotion(HOME)
     cell.pass_time(0.5)
     cell.session.acknowledge("me")
     assert cell.state is State.IDLE
+
+
+def test_a_tool_run_that_ends_beside_home_is_brought_to_it(cell):
+    """Within what counts as home, but not where the programme was taught to begin."""
+    cell.run("c1", LONG_S)
+    while not cell.tool.measuring or np.max(np.abs(cell.q - HOME)) < np.radians(0.1):
+        cell.step()
+    cell.session.cancel("by the PLC")
+    cell.pass_time(0.2)
+    assert cell.at_home()
+    cell.finish()
+    over(cell)
+    assert np.max(np.abs(cell.q - HOME)) < np.radians(0.02)
+
+
+def test_a_robot_that_never_left_is_not_moved(cell):
+    """A programme may stop a little beside the taught home."""
+    cell.motion = JointMotion(HOME + np.radians(0.1))
+    cell.services["thermal"] = SILENT
+    cell.run("c1", LONG_S)
+    cell.finish()
+    asked = kinds(cell)
+    assert asked.index("BeginCycle") < asked.index("Arm")
+    assert "Move" not in asked[: asked.index("Arm")]
 
 
 def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import LimitError
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion import tip_path
 from robocal_ros.core.motion.cell import ROUNDING, MotionCell
 from robocal_ros.core.motion.limits import MotionLimits
@@ -18,6 +19,11 @@ Array = NDArray[np.float64]
 START_NEAR_RAD = float(np.radians(0.02))
 START_NEAR_M = 5e-5  # prismatic
 SHORTEST_WAY_M = 1e-6  # a shorter part of an approach is left out
+
+
+def start_near(arm: SerialArm) -> Array:
+    """How far (n,) from where a motion begins each joint may stand, rad (m)."""
+    return np.where(arm.prismatic, START_NEAR_M, START_NEAR_RAD)
 
 
 def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:
@@ -197,7 +203,7 @@ def _require_start(cell: MotionCell, step: PlannedStep, q: Array) -> None:
     goal = start_pose(step, cell.limits)
     turn = frames.log_rotation(goal[:3, :3] @ T[:3, :3].T)
     shift = np.linalg.pinv(arm.jacobian(q)) @ np.concatenate([goal[:3, 3] - T[:3, 3], turn])
-    near = np.where(arm.prismatic, START_NEAR_M, START_NEAR_RAD)
+    near = start_near(arm)
     joint = int(np.argmax(np.abs(shift) / near))
     if abs(shift[joint]) > near[joint]:
         unit, scale = ("mm", 1e3) if arm.prismatic[joint] else ("deg", 180.0 / np.pi)

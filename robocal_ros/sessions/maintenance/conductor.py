@@ -114,9 +114,12 @@ class Conductor:
         yield from run.script()
 
     def _script_ended(self, run: Run) -> None:
-        if away := self._hands.robot.beside_home():
-            self.fault(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
-        elif self._hands.tool.doubted:
+        try:
+            self._hands.robot.require_home()
+        except FaultError as error:
+            self.fault(error.code, str(error))
+            return
+        if self._hands.tool.doubted:
             self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)

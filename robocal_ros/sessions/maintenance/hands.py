@@ -217,12 +217,13 @@ class Hands:
         Raises
         ------
         FaultError
-            When it does not come to rest, or is not handed over.
+            When joint states are silent, it does not come to rest, or is not handed over.
         """
         until_s = self.now_s + self.config.times.rest_s
         while (q := self.robot.resting(span_s)) is None or self.tool.armed:
             if self.now_s >= until_s:
-                moves = "the robot does not come to rest, or its joint states are missing"
+                self.robot.require_heard("so that nobody knows whether the robot rests")
+                moves = "the robot does not come to rest"
                 words = moves if q is None else f"the robot rests, but {SENT}"
                 raise FaultError(Code.CONFLICT, words)
             yield
@@ -236,6 +237,7 @@ class Hands:
         FaultError
             When the robot does not rest where the route begins, on a taught way.
         """
+        self.robot.require_heard("where the way of the robot begins")
         q = self.robot.resting(SETTLED_S)
         if q is None:
             raise FaultError(Code.CONFLICT, "the robot does not rest where its way begins")
@@ -265,20 +267,24 @@ class Hands:
             self.request(asked.Stop, plan)
 
     def go_home(self) -> Script[None]:
-        """Bring the robot home, from wherever this run may have left it.
+        """Bring the robot home, from wherever this run may have left it; one that never left stays.
 
         Raises
         ------
         FaultError
             When there is no way, or it does not fit any more.
         """
-        if not self.robot.beside_home():
-            self.robot.place = (HOME, HOME)
-            return
+        robot = self.robot
+        if not robot.beside_home():
+            if robot.place == (HOME, HOME):
+                return
+            robot.place = (HOME, HOME)
         self.doing = "on its way home"
         q = yield from self.stand()
+        if robot.exactly_home(q):
+            return
         try:
-            route = self.ways.home(self.robot.place, q)
+            route = self.ways.home(robot.place, q)
         except LimitError as error:
             raise FaultError(error.code, f"no way home: {error}") from error
         duration_s, left_s = route.plan.duration_s, self.gap.left_s(self.now_s)

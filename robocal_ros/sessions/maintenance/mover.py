@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.motion.measuring import start_near
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import stop, stop_time
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
@@ -70,9 +71,30 @@ class Mover:
     def beside_home(self) -> str:
         """Which joint is how far from home, in words; empty when the robot is there."""
         if self._q is None or self.silent:
-            return "joint states are missing"
+            return self._missing()
         away = np.abs(self._q - self._config.home)
         return self._off(away, np.broadcast_to(self._config.home_near, away.shape))
+
+    def _missing(self) -> str:
+        silent_s = self._watch.silent_s
+        words = "missing" if np.isinf(silent_s) else f"silent for {silent_s:.2f} s"
+        return f"joint states are {words}"
+
+    def exactly_home(self, q: Array) -> bool:
+        """Whether joints (n,) are as near to home as the end of a motion comes."""
+        return bool(np.all(np.abs(q - self._config.home) < start_near(self._arm)))
+
+    def require_heard(self, when: str) -> Array:
+        """The joints (n,); FaultError where they are silent, with words for ``when`` that was."""
+        if self._q is None or self.silent:
+            raise FaultError(Code.TOO_FEW_SAMPLES, f"{self._missing()} {when}")
+        return self._q
+
+    def require_home(self) -> None:
+        """Raise FaultError where the robot is not at home, or nobody knows where it is."""
+        self.require_heard("so that nobody knows whether the robot is at home")
+        if away := self.beside_home():
+            raise FaultError(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
 
     def _off(self, away: Array, near: Array) -> str:
         """Which joint is off the furthest, in words; empty where all are near enough."""
@@ -97,10 +119,7 @@ class Mover:
         FaultError
             When joint states are silent, or it is not there any more.
         """
-        if self.silent or self._q is None:
-            words = f"joint states are silent for {self._watch.silent_s:.2f} s"
-            raise FaultError(Code.TOO_FEW_SAMPLES, f"{words} while the robot stands away from home")
-        away = np.abs(self._q - q)
+        away = np.abs(self.require_heard("while the robot stands away from home") - q)
         self._require_near(away, self._allowed(), "where it came to rest")
 
     def require_taught(self, q: Array) -> None:
@@ -150,9 +169,7 @@ class Mover:
         """
         if self._route is None:
             return
-        if self.silent:
-            words = f"joint states are silent for {self._watch.silent_s:.2f} s"
-            raise FaultError(Code.TOO_FEW_SAMPLES, f"{words} while the robot moves")
+        self.require_heard("while the robot moves")
         tip_m, joint_rad = self._watch.away()
         if not self._kept(tip_m, joint_rad):
             driving = self._config.driving

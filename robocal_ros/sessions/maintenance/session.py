@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, LimitError
+from robocal_ros.core.errors import ConflictError, InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Command, Outcome
@@ -24,6 +24,7 @@ from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import CycleResult, Keeper, Memory
+from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status, status_of
@@ -36,6 +37,7 @@ Array = NDArray[np.float64]
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
 MOST_ID = 100  # characters of a cycle's name
+BRING_HOME = "bring it home, then acknowledge"
 
 
 class MaintenanceSession:
@@ -112,7 +114,8 @@ class MaintenanceSession:
         ------
         RobocalError
             When it cannot begin: CONFLICT in a fault, while another one runs, or while the gap is
-            not open; LIMIT_EXCEEDED, and a fault, where the robot is not at home; STORAGE_FAILED.
+            not open; LIMIT_EXCEEDED, and a fault, where the robot is not at home, and
+            TOO_FEW_SAMPLES where joint states are silent; STORAGE_FAILED.
         """
         if not 0 < len(cycle_id) <= MOST_ID:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
@@ -128,10 +131,11 @@ class MaintenanceSession:
         if why := hands.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
         hands.gap.begin(gap_s, now_s)
-        if away := hands.robot.beside_home():
-            words = f"robot is not at home: {away}"
-            self._conductor.fault(Code.LIMIT_EXCEEDED, words)
-            raise LimitError(f"{words}: bring it home, then acknowledge")
+        try:
+            hands.robot.require_home()
+        except FaultError as error:
+            self._conductor.fault(error.code, str(error))
+            raise FaultError(error.code, f"{error}: {BRING_HOME}") from error
         hands.robot.place = (HOME, HOME)
         memory.begin(cycle_id)
         run = Run(
@@ -192,16 +196,19 @@ class MaintenanceSession:
         ConflictError
             While the tool node has not confirmed that it is disarmed, and is not gone, or what
             it sent may still be driven.
-        LimitError
-            While the robot is not at home.
+        FaultError
+            LIMIT_EXCEEDED while the robot is not at home, TOO_FEW_SAMPLES while joint states are
+            silent.
         StorageError
             When it cannot be kept; the fault stays.
         """
         if not self._memory.fault:
             return "there is no fault"
         self._hands.tool.require_disarmed()
-        if away := self._hands.robot.beside_home():
-            raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
+        try:
+            self._hands.robot.require_home()
+        except FaultError as error:
+            raise FaultError(error.code, f"{error}: {BRING_HOME}") from error
         words = f"acknowledged: {self._memory.fault}"
         self._memory.clear_fault()
         self._hands.doing = ""
