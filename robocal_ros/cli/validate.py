@@ -23,6 +23,7 @@ from robocal_ros.cli.output import (
     refusal,
     tell,
 )
+from robocal_ros.cli.warm_workers import warm_up
 from robocal_ros.core.codes import Code
 from robocal_ros.storage.files import write_text
 
@@ -63,13 +64,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
+    workers = min(args.jobs or len(os.sched_getaffinity(0)), len(args.bags))
+    if workers > 1 and args.scheduler is None:
+        warm_up()
     from robocal_ros.cli.validating_many import validated
     from robocal_ros.report.validation import summary_rows
     from robocal_ros.report.validation_page import page
 
     args.report.mkdir(parents=True, exist_ok=True)
     jobs = _jobs(args.bags, args.robot)
-    workers = args.jobs or len(os.sched_getaffinity(0))
     results: dict[int, Document] = {}
     figures: dict[str, Sequence[Sequence[Drawn]]] = {}
     with _progress(len(jobs)) as shown:

@@ -8,6 +8,7 @@ from typing import Any
 
 from robocal_ros.cli.output import crash
 from robocal_ros.cli.validating import Job, Validated, validate_bag
+from robocal_ros.cli.warm_workers import METHOD
 from robocal_ros.core.errors import InputError
 
 Numbered = tuple[int, Validated]
@@ -18,7 +19,7 @@ def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Itera
 
     Parameters
     ----------
-    workers : processes on this machine; with one, or one bag, all is done in this process.
+    workers : processes on this machine (see `warm_up`); with one all is done in this process.
     scheduler : address of a running cluster, which is used instead; it must see the bags by the
         same paths, and have this software.
 
@@ -27,10 +28,10 @@ def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Itera
     InputError
         When Dask is not there, or the cluster does not answer.
     """
-    if scheduler is None and min(workers, len(jobs)) <= 1:
+    if scheduler is None and workers <= 1:
         yield from ((number, _alone(job)) for number, job in enumerate(jobs))
         return
-    with _client(min(workers, len(jobs)), scheduler) as client:
+    with _client(workers, scheduler) as client:
         yield from _gathered(client, jobs)
 
 
@@ -62,6 +63,7 @@ def _lost(job: Job, error: BaseException) -> Validated:
 @contextmanager
 def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     try:
+        import dask.config
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise InputError(
@@ -77,12 +79,15 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             yield client
         return
     # One thread each, for linear algebra too (Dask sets it): the same bits as in one process.
-    cluster = LocalCluster(
-        n_workers=workers,
-        threads_per_worker=1,
-        memory_limit=0,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.ERROR,
-    )
-    with cluster, Client(cluster) as client:
+    with (
+        dask.config.set({"distributed.worker.multiprocessing-method": METHOD}),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            memory_limit=0,
+            dashboard_address=None,
+            silence_logs=logging.ERROR,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
         yield client

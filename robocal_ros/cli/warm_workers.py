@@ -1,0 +1,16 @@
+"""Worker processes that have read their code before there is work for them."""
+
+from multiprocessing import forkserver
+
+METHOD = "forkserver"
+_CODE = ["distributed.nanny", "distributed.worker", "robocal_ros.cli.validating"]
+
+
+def warm_up() -> None:
+    """Let the server of worker processes read the code, beside what this process does meanwhile.
+
+    Workers are its forks, from a process of one thread: they begin at once, where each would
+    otherwise import everything anew.
+    """
+    forkserver.set_forkserver_preload(_CODE)
+    forkserver.ensure_running()
