@@ -164,18 +164,11 @@ class Recorder:
         suite = self.plant.suite
         if suite is None:
             return
-        found = suite.accuracy()
-        error = found.error
         message = {
             "header": {"stamp": ros_time(self.plant.clock.now_ns), "frame_id": "base"},
             "robot": suite.thermal.nominal.name,
             "serial": setting.SERIAL,
-            "state": int(found.level),
-            "predicted_error_mm": -1.0 if error is None else error.rms_m * 1e3,
-            "bound_mm": -1.0 if error is None else error.bound_m * 1e3,
-            "tolerance_mm": setting.TOLERANCE_M * 1e3,
-            "due_in_s": found.due_in_s,
-            "reason": found.reason,
+            **suite.accuracy().document(setting.TOLERANCE_M),
         }
         self._write(ACCURACY, "robocal_msgs/msg/AccuracyState", message, self.plant.clock.now_ns)
 

@@ -21,7 +21,6 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics.parameters import COLUMNS
 from robocal_ros.core.proposals import Entry
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
@@ -139,26 +138,9 @@ def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header)
 def accuracy_message(
     found: Accuracy, tolerance_m: float, *, robot: str, serial: str, stamp: Header
 ) -> AccuracyState:
-    """How accurate the robot is believed to be; -1 where the error is not known.
-
-    A figure that is not finite makes it a FAULT: the line must not go on with what it read before.
-    """
-    error = found.error
-    rms_mm, bound_mm = (-1.0, -1.0) if error is None else (error.rms_m * 1e3, error.bound_m * 1e3)
-    if not all(map(math.isfinite, (rms_mm, bound_mm, found.due_in_s))):
-        words = "a figure of the accuracy is not finite, please report it"
-        found, rms_mm, bound_mm = Accuracy(AccuracyLevel.FAULT, words), -1.0, -1.0
-    return AccuracyState(
-        header=stamp,
-        robot=robot,
-        serial=serial,
-        state=int(found.level),
-        predicted_error_mm=rms_mm,
-        bound_mm=bound_mm,
-        tolerance_mm=tolerance_m * 1e3,
-        due_in_s=found.due_in_s,
-        reason=found.reason,
-    )
+    """How accurate the robot is believed to be, see `Accuracy.document`."""
+    told = found.document(tolerance_m)
+    return AccuracyState(header=stamp, robot=robot, serial=serial, **told)
 
 
 def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:

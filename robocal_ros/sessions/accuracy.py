@@ -1,6 +1,8 @@
 """How accurate the robot is believed to be now, for the line."""
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
@@ -26,6 +28,26 @@ class Accuracy:
     reason: str
     error: ToolError | None = None
     due_in_s: float = 0.0
+
+    def document(self, tolerance_m: float) -> dict[str, Any]:
+        """The fields of ``AccuracyState.msg``; -1 where the error is not known.
+
+        A figure that is not finite makes it a FAULT: the line must not go on with what it read
+        before.
+        """
+        error = self.error
+        told_mm = (-1.0, -1.0) if error is None else (error.rms_m * 1e3, error.bound_m * 1e3)
+        if not all(map(math.isfinite, (*told_mm, self.due_in_s))):
+            words = "a figure of the accuracy is not finite, please report it"
+            return Accuracy(AccuracyLevel.FAULT, words).document(tolerance_m)
+        return {
+            "state": int(self.level),
+            "predicted_error_mm": told_mm[0],
+            "bound_mm": told_mm[1],
+            "tolerance_mm": tolerance_m * 1e3,
+            "due_in_s": self.due_in_s,
+            "reason": self.reason,
+        }
 
 
 def accuracy_of(
