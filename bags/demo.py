@@ -13,14 +13,14 @@ import json
 import shutil
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from demo_cell import PARAMETERS, commission, wiring, write_settings
+from demo_cell import PARAMETERS, bend_tool, commission, wiring, write_settings
 from demo_graph import ROOT, CellController, DemoError
 from demo_output import Moment, Story, show, tell, validate
 from demo_plc import Judge, Plc
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 
 from robocal_ros.core.errors import RobocalError
 
@@ -56,27 +56,17 @@ class Demo:
 
     def _collide(self) -> None:
         self._judged("after gap 1: drift measured")
-        number, text = ParameterType.PARAMETER_DOUBLE, ParameterType.PARAMETER_STRING
-        size = ParameterValue(type=number, double_value=COLLISION_MM)
-        fault = ParameterValue(type=text, string_value="collision")
-        parameters = [
-            Parameter(name="fault_size", value=size),
-            Parameter(name="fault", value=fault),
-        ]
-        answer = self._controller.call(
-            SetParameters, "/cell_sim_node/set_parameters", parameters=parameters
-        )
-        if not all(result.successful for result in answer.results):
-            raise DemoError(f"no collision: {answer.results}")
+        bend_tool(self._controller, COLLISION_MM)
 
     def _judged(self, words: str) -> None:
-        without_mm, with_mm = self._judge.now()
-        moment = Moment(words, without_mm, with_mm, *self._plc.line())
+        found = self._judge.now()
+        moment = Moment(words, found.without_mm, found.with_mm, *self._plc.line())
         self.story.moments.append(moment)
 
 
-def play(folder: Path, recordings: Path) -> Story:
-    """Commission the cell, start its nodes, and let the story happen.
+@contextmanager
+def live_cell(folder: Path, recordings: Path) -> Iterator[tuple[CellController, Plc]]:
+    """Commission the cell and start its nodes; at the end the recording is complete.
 
     Raises
     ------
@@ -96,10 +86,8 @@ def play(folder: Path, recordings: Path) -> Story:
         plc = Plc(controller, tell)
         tell("waiting for six nodes, three hours of work later")
         plc.take_over()
-        demo = Demo(controller, plc)
-        demo.run()
+        yield controller, plc
         controller.end_nodes()  # completes the recording
-        return demo.story
     finally:
         if plc is not None:
             plc.close()
@@ -119,7 +107,10 @@ def main() -> int:
         shutil.rmtree(old, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        story = play(folder, recordings)
+        with live_cell(folder, recordings) as (controller, plc):
+            demo = Demo(controller, plc)
+            demo.run()
+        story = demo.story
         tell("the recorded bag, replayed and judged")
         document = json.dumps(story.document(), indent=1, allow_nan=False) + "\n"
         (folder / "story.json").write_text(document, encoding="utf-8")

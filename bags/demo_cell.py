@@ -12,7 +12,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from demo_graph import ROOT
+from demo_graph import ROOT, CellController, DemoError
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 
 sys.path.insert(0, str(ROOT))  # for the bench
 
@@ -96,6 +98,22 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
     }
     document = {f"/**/{name}": {"ros__parameters": given} for name, given in nodes.items()}
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")  # which is YAML too
+
+
+def bend_tool(controller: CellController, size_mm: float) -> None:
+    """Let a collision happen.
+
+    Raises
+    ------
+    DemoError
+        When the simulator refuses.
+    """
+    size = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=size_mm)
+    fault = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="collision")
+    parameters = [Parameter(name="fault_size", value=size), Parameter(name="fault", value=fault)]
+    answer = controller.call(SetParameters, "/cell_sim_node/set_parameters", parameters=parameters)
+    if not all(result.successful for result in answer.results):
+        raise DemoError(f"no collision: {answer.results}")
 
 
 def wiring() -> Mapping[str, Mapping[str, str]]:

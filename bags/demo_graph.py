@@ -59,6 +59,11 @@ class Executable:
                 stderr=subprocess.STDOUT,
             )
 
+    @property
+    def pid(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
     def check(self) -> None:
         """Raise when it has ended."""
         status = self._process.poll()
@@ -141,6 +146,11 @@ class CellController:
         answer = self.call(Trigger, name)
         if not answer.success:
             raise DemoError(f"{name}: {answer.message}")
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Each node's process."""
+        return {executable.name: executable.pid for executable in self._executables}
 
     def end_nodes(self) -> None:
         """End every process: all at once, then wait for each."""

@@ -167,21 +167,34 @@ class Plc:
         return self._controller.call(GetMaintenance, "/maintenance_node/status", cycle_id=name)
 
 
+@dataclass(frozen=True)
+class Judged:
+    """True rms errors of the tool at the visited working poses, mm; not a number: not commanded.
+
+    Attributes
+    ----------
+    without_mm, with_mm : as taught, without correction, and as commanded last.
+    within : λ(0.1 mm) as commanded: the share of coordinates within.
+    """
+
+    without_mm: float
+    with_mm: float
+    within: float
+
+
 class Judge:
-    """The simulator's truth: rms errors of the tool at the visited working poses, mm."""
+    """Listens to the simulator's truth."""
 
     def __init__(self, controller: CellController) -> None:
         self._controller = controller
         self._told: deque[String] = deque(maxlen=1)
         controller.listen(String, TRUTH, self._told, qos.LATCHED)
 
-    def now(self) -> tuple[float, float]:
-        """As taught, without correction, and as commanded last, at the same poses.
-
-        Before anything was commanded: as taught at all working poses, and not a number.
-        """
+    def now(self) -> Judged:
+        """As of now; before anything was commanded: as taught at all working poses."""
         self._told.clear()
         self._controller.wait(lambda: self._told, "the truth")
         truth = json.loads(self._told[-1].data)
         taught = truth.get("visited_tcp_error_rms_m", truth["tcp_error_rms_m"])
-        return 1e3 * taught, 1e3 * truth.get("commanded_tcp_error_rms_m", np.nan)
+        corrected = truth.get("commanded_tcp_error_rms_m", np.nan)
+        return Judged(1e3 * taught, 1e3 * corrected, truth.get("commanded_within_share", np.nan))

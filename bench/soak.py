@@ -41,10 +41,11 @@ class Amount:
     seeds: int
     live_s: float
     robots: int
+    shift_s: float
 
 
-LONG = Amount(2000, 80, 1000, 40, 3600.0, 6000)
-SHORT = Amount(300, 60, 50, 2, 120.0, 600)
+LONG = Amount(2000, 80, 1000, 40, 3600.0, 6000, 3600.0)
+SHORT = Amount(300, 60, 50, 2, 120.0, 600, 900.0)
 
 
 def _pytest(*words: str, **variables: str) -> bool:
@@ -168,6 +169,13 @@ def correction(seconds: float) -> Table:
     return soak(seconds)
 
 
+def shift(seconds: float) -> Table:
+    """A whole cell at real time, driven by a PLC."""
+    from bench.soak_shift import soak
+
+    return soak(seconds)
+
+
 def simulated(robots: int) -> Sequence[Table]:
     """The simulated truth of ``make bench``, with more robots and so with narrower bounds."""
     monte_carlo.RUNS = robots
@@ -189,8 +197,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     amount = SHORT if given.short else LONG
     start = time.monotonic()
     streams = (live(amount.live_s), correction(amount.live_s))
-    loop = closed_loop.tables(closed_loop.SHORT if given.short else closed_loop.LONG)
-    tables = [*streams, *simulated(amount.robots), *loop, endurance(amount)]
+    tables = [*streams, shift(amount.shift_s), *simulated(amount.robots)]
+    if not given.short:
+        tables += closed_loop.tables(closed_loop.LONG)
+    tables.append(endurance(amount))
     show(tables)
     facts = about(time.monotonic() - start) | {"cpus": str(os.cpu_count())}
     command = "make soak SOAK=--short" if given.short else "make soak"

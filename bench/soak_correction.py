@@ -4,7 +4,6 @@
 With ``--keep`` it writes docs/figures/soak_correction.md too.
 """
 
-import argparse
 import os
 import sys
 import tempfile
@@ -16,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from robocal_msgs.msg import KinematicModel
 
-from bench.__main__ import KEPT, about
+from bench.soaking import soak_main
 from bench.startup import EXECUTABLES
 from bench.stream_probe import STATES, TARGETS, Probe, Stream, Subject, drifted, offered
-from bench.tables import Goal, Table, show
+from bench.tables import Goal, Table
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.kinematics import SerialArm
@@ -27,7 +26,6 @@ from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
 
-HOUR_S = 3600.0
 RATE_HZ = 500
 CHANGE_S = 10.0  # between two models
 SETTLED_S = 4.0  # after this a model is in force: twice 0.3 deg at 0.5 deg/s, and stalls
@@ -75,7 +73,7 @@ class Watch:
             self.stale += bool(np.max(np.abs(shifts[1] - shift)) > EXACT_RAD)
 
 
-def soak(seconds: float = HOUR_S) -> Table:
+def soak(seconds: float) -> Table:
     """Stream, change models, and judge all that comes back."""
     arm = load_robot("kr150_r3100")
     probe = Probe()
@@ -144,19 +142,7 @@ def _judged(stream: Stream, watch: Watch, memory_mb: list[float], seconds: float
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """1 when a goal is missed."""
-    parser = argparse.ArgumentParser(prog="python -m bench.soak_correction", description=__doc__)
-    parser.add_argument("--seconds", type=float, default=HOUR_S, help="how long")
-    parser.add_argument("--keep", action="store_true", help="write docs/figures too")
-    given = parser.parse_args(arguments)
-    start = time.monotonic()
-    table = soak(given.seconds)
-    show([table])
-    if given.keep:
-        command = f"python -m bench.soak_correction --seconds {given.seconds:g} --keep"
-        facts = ", ".join(f"{name} {x}" for name, x in about(time.monotonic() - start).items())
-        text = f"Made by `{command}`: {facts}.\n\n{table.markdown()}"
-        (KEPT / "soak_correction.md").write_text(text)
-    return 0 if table.met else 1
+    return soak_main("soak_correction", soak, __doc__, arguments)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from robocal_msgs.srv import ListCalibrations
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
+from bench.processes import resident_mb
 from bench.startup import EXECUTABLES
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import model_document
@@ -34,7 +35,6 @@ LISTED = "~/list"
 DRIFT = 2e-5  # m and rad, of each parameter: about a tenth of a millimetre at the tool
 ASK_EVERY_S = 0.5
 PATIENCE_S = 20.0
-PAGE_KB = os.sysconf("SC_PAGE_SIZE") / 1024
 
 
 class LoadedGraph:
@@ -175,10 +175,7 @@ class LoadedGraph:
 
     def memory_mb(self) -> dict[str, float]:
         """Resident memory of each node."""
-        return {
-            name: int(Path(f"/proc/{process.pid}/statm").read_text().split()[1]) * PAGE_KB / 1024
-            for name, process in self._processes.items()
-        }
+        return {name: resident_mb(process.pid) for name, process in self._processes.items()}
 
     def close(self) -> None:
         """End everything."""

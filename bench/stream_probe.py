@@ -22,6 +22,7 @@ from robocal_msgs.msg import KinematicModel
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
+from bench.processes import resident_mb
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.kinematics import SerialArm
@@ -148,8 +149,7 @@ class Subject:
 
     def memory_mb(self) -> float:
         """Resident memory."""
-        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
-        return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+        return resident_mb(self.process.pid)
 
     def close(self) -> None:
         """End the process."""

@@ -1,0 +1,156 @@
+"""A live shift at real time: six nodes of a cell as processes over DDS, driven by a PLC's calls.
+
+``tools/with_ros python -m bench.soak_shift --seconds 600`` for a look; an hour is the default.
+With ``--keep`` it writes docs/figures/soak_shift.md too. The cell is the demo's, simulated.
+"""
+
+# the demo's modules stand beside its bag
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.processes import resident_mb
+from bench.soaking import soak_main
+from bench.tables import Goal, Table
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "bags"))
+
+from demo import COLLISION_MM, GAP_S, live_cell
+from demo_cell import bend_tool
+from demo_graph import CellController
+from demo_output import validate
+from demo_plc import Gap, Judge, Judged, Plc
+
+from robocal_ros.core.codes import Code
+
+EVERY_S = 300.0  # from the begin of a gap to the next one's
+WARM = 2  # gaps until caches are full
+MOST_GROWTH_MB = 10.0
+LEAST_WITHIN = 0.95  # of the coordinates of the error, within 0.1 mm
+RIGHT_AGAIN = 2  # gaps after a collision
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What a pass of the programme was worth; how many gaps lay before it."""
+
+    judged: Judged
+    gaps: int
+
+
+class LiveShift:
+    """Production and gaps by turns; at half time a collision bends the tool."""
+
+    def __init__(self, controller: CellController, plc: Plc) -> None:
+        self._controller, self._plc, self._judge = controller, plc, Judge(controller)
+        self.passes: list[Pass] = []
+        self.gaps: list[Gap] = []
+        self.memory_mb: list[dict[str, float]] = []
+        self.bent_after: int | None = None  # gaps before the collision
+
+    def run(self, seconds: float) -> None:
+        """All of it."""
+        begin_s = time.monotonic()
+        while (now_s := time.monotonic()) < begin_s + seconds:
+            self._work_until(now_s + EVERY_S, begin_s + 0.5 * seconds)
+            name = f"gap-{len(self.gaps) + 1}"
+            self.gaps.append(self._plc.gap(name, GAP_S))
+            pids = self._controller.pids
+            self.memory_mb.append({node: resident_mb(pid) for node, pid in pids.items()})
+        self._produce(bends=False)
+
+    def _work_until(self, end_s: float, bends_s: float) -> None:
+        while time.monotonic() < end_s:
+            self._produce(bends=self.bent_after is None and time.monotonic() >= bends_s)
+
+    def _produce(self, bends: bool) -> None:
+        if bends:
+            self.bent_after = len(self.gaps)
+        self._plc.produce(halfway=self._bend if bends else None)
+        self.passes.append(Pass(self._judge.now(), len(self.gaps)))
+
+    def _bend(self) -> None:
+        bend_tool(self._controller, COLLISION_MM)
+
+    def in_force(self) -> list[Pass]:
+        """Passes that must be right: after the first gap, and from two gaps after the collision."""
+        bent = np.inf if self.bent_after is None else self.bent_after
+        return [
+            one for one in self.passes if 1 <= one.gaps < bent or one.gaps >= bent + RIGHT_AGAIN
+        ]
+
+
+def soak(seconds: float) -> Table:
+    """Let the cell live, replay what was recorded, and judge both."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        recordings = folder / "recordings"
+        with live_cell(folder, recordings) as (controller, plc):
+            shift = LiveShift(controller, plc)
+            shift.run(seconds)
+        report = validate(recordings, folder / "report").with_suffix(".json")
+        return _judged(shift, json.loads(report.read_text()), seconds)
+
+
+def _judged(shift: LiveShift, report: dict[str, Any], seconds: float) -> Table:
+    table = Table(
+        "soak_shift",
+        f"A live shift of {seconds:.0f} s, a gap every {EVERY_S:g} s, a collision of "
+        f"{COLLISION_MM:g} mm at half time; simulated",
+        ("what", "value", "goal"),
+        "Errors: of the tool at the visited working poses, true, rms of a pass. Passes in force: "
+        f"after the first gap, those from the collision to the {RIGHT_AGAIN}nd gap after it left "
+        f"out. Memory: resident, from after gap {WARM} on. Load of the machine in the last minute: "
+        f"{os.getloadavg()[0]:.2f}; {os.cpu_count()} CPUs.",
+    )
+    _add_errors(table, shift)
+    _add_gaps(table, shift.gaps)
+    sessions = [session for bag in report["bags"] for session in bag["sessions"]]
+    differ = sum(bool(session["differs"]) or not session["as_recorded"] for session in sessions)
+    table.add("recorded sessions, replayed", len(sessions), None)
+    table.add("of them otherwise than live", differ, Goal(differ, 0))
+    first, last = shift.memory_mb[min(WARM, len(shift.memory_mb)) - 1], shift.memory_mb[-1]
+    for node, memory_mb in last.items():
+        grew = memory_mb - first[node]
+        table.add(f"memory of {node} grew, MB", grew, Goal(grew, MOST_GROWTH_MB))
+    return table
+
+
+def _add_errors(table: Table, shift: LiveShift) -> None:
+    judged = [one.judged for one in shift.in_force()]
+    table.add("passes of the programme", len(shift.passes), None)
+    table.add("of them in force", len(judged), None)
+    for what, values in (
+        ("as taught", [one.without_mm for one in judged]),
+        ("corrected", [one.with_mm for one in judged]),
+    ):
+        table.add(f"error {what}, median, mm", float(np.median(values)), None)
+        table.add(f"error {what}, worst pass, mm", float(np.max(values)), None)
+    within = float(np.mean([one.within for one in judged]))
+    table.add("λ(0.1 mm) of the passes in force", within, Goal(within, LEAST_WITHIN, at_least=True))
+
+
+def _add_gaps(table: Table, gaps: Sequence[Gap]) -> None:
+    used = max(gap.used_s / gap.length_s for gap in gaps)
+    others = sum(gap.result.code != Code.ACCEPT or not gap.result.complete for gap in gaps)
+    table.add("gaps", len(gaps), None)
+    table.add("longest use of a gap, of its length", used, Goal(used, 1.0))
+    table.add("gaps that left something over", others, Goal(others, 0))
+    table.add("came into force", sum(len(gap.result.accepted) for gap in gaps), None)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """1 when a goal is missed."""
+    return soak_main("soak_shift", soak, __doc__, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
