@@ -145,6 +145,7 @@ class Cell:
         self.beats_every_s = BEAT_S
         self.waiting: tuple[float, bool] | None = None  # a beat, and when it is delivered
         self.offset = np.zeros(ARM.n)
+        self.clock_s = 0.0  # the joints' own clock, ahead of all others
         self.log: list[ask.Request] = []
         self.events: list[tuple[str, Any]] = []
         self.begun: list[str] = []
@@ -220,7 +221,7 @@ class Cell:
         self._controller_goes_on()
         self._tool_goes_on()
         if not self.silent:
-            self.session.reading(self.now_s, self.q + self.offset, self.now_s)
+            self.session.reading(self.now_s + self.clock_s, self.q + self.offset, self.now_s)
         if round(self.now_s / TICK_S) % 5 == 0 and self.services.get("sensor") != SILENT:
             self.session.measured(self.now_s)
         for item in [item for item in self.due if item[0] <= self.now_s]:

@@ -102,7 +102,7 @@ class Conductor:
         hands = self._hands
         if self.run is None:
             return
-        if hands.tool.doubted or hands.robot.moving or hands.robot.beside_home():
+        if hands.not_handed_over():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
@@ -114,12 +114,11 @@ class Conductor:
         yield from run.script()
 
     def _script_ended(self, run: Run) -> None:
-        try:
-            self._hands.robot.require_home()
-        except FaultError as error:
-            self.fault(error.code, str(error))
-            return
-        if self._hands.tool.doubted:
+        robot = self._hands.robot
+        if away := robot.beside_home():
+            code = Code.TOO_FEW_SAMPLES if robot.unheard else Code.LIMIT_EXCEEDED
+            self.fault(code, f"robot is not at home: {away}")
+        elif self._hands.tool.doubted:
             self.fault(Code.CONFLICT, "the tool node may still be armed")
         elif self.broken is not None:
             self._end(*self.broken)

@@ -39,6 +39,7 @@ class Hands:
     now_s : of the tick.
     out : requests that wait to be carried out.
     tool : whether the tool's driver may move the robot.
+    left_home : whether something may have moved the robot since the run began.
     measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
     doing : what goes on, in words.
     """
@@ -50,6 +51,7 @@ class Hands:
         self.now_s = 0.0
         self.out: list[Request] = []
         self.tool = Disarming()
+        self.left_home = False
         self.measured: list[float] = []
         self.doing = ""
         self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
@@ -67,6 +69,17 @@ class Hands:
     def may_wait(self) -> bool:
         """Whether nothing moves, and a heartbeat from after the own pause is yet to come."""
         return not (self.robot.moving or self.tool.armed) and self.gap.waits(self.now_s)
+
+    def begin(self, gap_s: float) -> None:
+        """A run begins, with the robot at home."""
+        self.gap.begin(gap_s, self.now_s)
+        self.robot.place, self.left_home = (HOME, HOME), False
+
+    def not_handed_over(self) -> bool:
+        """Whether the robot is not at rest at home with nobody who may move it."""
+        robot = self.robot
+        rests = robot.resting(STANDS_S) is not None and not robot.moving
+        return self.tool.doubted or not rests or bool(robot.beside_home())
 
     def handed_out(self) -> list[Request]:
         """The requests that wait; they are somebody else's now."""
@@ -133,7 +146,7 @@ class Hands:
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
         self.doubt()
-        self.tool.armed, self._deaf_s = True, np.inf
+        self.tool.armed, self._deaf_s, self.left_home = True, np.inf, True
         self.robot.place = STATION
         answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", asked.Arm)
         self.tool.armed = not answer.absent
@@ -152,6 +165,7 @@ class Hands:
         """
         tool, robot = self.tool, self.robot
         rests = robot.resting(STANDS_S) is not None
+        self._told_s = min(self._told_s, robot.newest_s)  # their clock may have begun anew
         since_s = robot.newest_s - self._told_s  # readings that are late do not count against it
         if tool.armed and tool.engaged:
             if self.now_s >= self._deaf_s:
@@ -244,6 +258,7 @@ class Hands:
         self.robot.require_at(route.plan.q[0])
         self.robot.require_taught(q)
         self.robot.start(route, self.now_s)
+        self.left_home = True
         self.request(asked.Move, route.plan, worst_s)
         while not self.robot.arrived(self.now_s):
             yield
@@ -276,9 +291,9 @@ class Hands:
         """
         robot = self.robot
         if not robot.beside_home():
-            if robot.place == (HOME, HOME):
-                return
             robot.place = (HOME, HOME)
+            if not self.left_home:
+                return
         self.doing = "on its way home"
         q = yield from self.stand()
         if robot.exactly_home(q):

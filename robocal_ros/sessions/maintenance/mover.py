@@ -71,14 +71,19 @@ class Mover:
     def beside_home(self) -> str:
         """Which joint is how far from home, in words; empty when the robot is there."""
         if self._q is None or self.silent:
-            return self._missing()
+            return self.unheard
         away = np.abs(self._q - self._config.home)
         return self._off(away, np.broadcast_to(self._config.home_near, away.shape))
 
-    def _missing(self) -> str:
+    @property
+    def unheard(self) -> str:
+        """Why nobody knows where the robot is, in words; empty where it is known."""
+        if not self.silent:
+            return ""
         silent_s = self._watch.silent_s
-        words = "missing" if np.isinf(silent_s) else f"silent for {silent_s:.2f} s"
-        return f"joint states are {words}"
+        return "joint states are " + (
+            "missing" if np.isinf(silent_s) else f"silent for {silent_s:.2f} s"
+        )
 
     def exactly_home(self, q: Array) -> bool:
         """Whether joints (n,) are as near to home as the end of a motion comes."""
@@ -87,14 +92,8 @@ class Mover:
     def require_heard(self, when: str) -> Array:
         """The joints (n,); FaultError where they are silent, with words for ``when`` that was."""
         if self._q is None or self.silent:
-            raise FaultError(Code.TOO_FEW_SAMPLES, f"{self._missing()} {when}")
+            raise FaultError(Code.TOO_FEW_SAMPLES, f"{self.unheard} {when}")
         return self._q
-
-    def require_home(self) -> None:
-        """Raise FaultError where the robot is not at home, or nobody knows where it is."""
-        self.require_heard("so that nobody knows whether the robot is at home")
-        if away := self.beside_home():
-            raise FaultError(Code.LIMIT_EXCEEDED, f"robot is not at home: {away}")
 
     def _off(self, away: Array, near: Array) -> str:
         """Which joint is off the furthest, in words; empty where all are near enough."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError
+from robocal_ros.core.errors import ConflictError, InputError, LimitError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.sessions.events import Command, Outcome
@@ -24,20 +24,18 @@ from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import CycleResult, Keeper, Memory
-from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status, status_of
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
 from robocal_ros.sessions.maintenance.tool_part import worst_s
-from robocal_ros.sessions.maintenance.ways import HOME, Ways
+from robocal_ros.sessions.maintenance.ways import Ways
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 Array = NDArray[np.float64]
 
 RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
 MOST_ID = 100  # characters of a cycle's name
-BRING_HOME = "bring it home, then acknowledge"
 
 
 class MaintenanceSession:
@@ -114,8 +112,8 @@ class MaintenanceSession:
         ------
         RobocalError
             When it cannot begin: CONFLICT in a fault, while another one runs, or while the gap is
-            not open; LIMIT_EXCEEDED, and a fault, where the robot is not at home, and
-            TOO_FEW_SAMPLES where joint states are silent; STORAGE_FAILED.
+            not open; TOO_FEW_SAMPLES while joint states are silent; LIMIT_EXCEEDED, and a fault,
+            where the robot is not at home; STORAGE_FAILED.
         """
         if not 0 < len(cycle_id) <= MOST_ID:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
@@ -130,13 +128,12 @@ class MaintenanceSession:
         hands.tool.require_disarmed()
         if why := hands.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
-        hands.gap.begin(gap_s, now_s)
+        hands.begin(gap_s)
         try:
-            hands.robot.require_home()
-        except FaultError as error:
+            self._require_home()
+        except LimitError as error:
             self._conductor.fault(error.code, str(error))
-            raise FaultError(error.code, f"{error}: {BRING_HOME}") from error
-        hands.robot.place = (HOME, HOME)
+            raise
         memory.begin(cycle_id)
         run = Run(
             cycle_id,
@@ -196,19 +193,17 @@ class MaintenanceSession:
         ConflictError
             While the tool node has not confirmed that it is disarmed, and is not gone, or what
             it sent may still be driven.
-        FaultError
-            LIMIT_EXCEEDED while the robot is not at home, TOO_FEW_SAMPLES while joint states are
-            silent.
+        TooFewSamplesError
+            While joint states are silent.
+        LimitError
+            While the robot is not at home.
         StorageError
             When it cannot be kept; the fault stays.
         """
         if not self._memory.fault:
             return "there is no fault"
         self._hands.tool.require_disarmed()
-        try:
-            self._hands.robot.require_home()
-        except FaultError as error:
-            raise FaultError(error.code, f"{error}: {BRING_HOME}") from error
+        self._require_home()
         words = f"acknowledged: {self._memory.fault}"
         self._memory.clear_fault()
         self._hands.doing = ""
@@ -276,6 +271,14 @@ class MaintenanceSession:
         tool, thermal_id = self._decider.head(TOOL), self._decider.thermal_id()
         drift = self._heard_drift(now_s)
         return accuracy_of(self.config, drift, self._memory, tool, thermal_id, wall_ns)
+
+    def _require_home(self) -> None:
+        robot = self._hands.robot
+        if robot.unheard:
+            raise TooFewSamplesError(f"{robot.unheard}: nobody knows whether the robot is at home")
+        if away := robot.beside_home():
+            words = f"robot is not at home: {away}: bring it home, then acknowledge"
+            raise LimitError(words)
 
     def _heard_drift(self, now_s: float) -> Drift | None:
         """None while the thermal part is silent."""
