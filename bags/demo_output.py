@@ -43,7 +43,8 @@ class Story:
 def _gap(gap: Gap) -> dict[str, object]:
     result = gap.result
     codes = {
-        name: Code(getattr(result, name)).name for name in ("code", "thermal_code", "tool_code")
+        name: Code(getattr(result, name)).name
+        for name in ("code", "thermal_code", "tool_found_code", "tool_code")
     }
     return {
         "gap": gap.name,
@@ -108,7 +109,8 @@ def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
         brought = ", ".join(map(str, result.accepted)) or "nothing"
         console.print(
             f"{gap.name}: {gap.used_s:.0f} of {gap.length_s:.0f} s; thermal "
-            f"{Code(result.thermal_code).name}, tool {Code(result.tool_code).name}; "
+            f"{Code(result.thermal_code).name}, tool found {Code(result.tool_found_code).name}, "
+            f"left {Code(result.tool_code).name}; "
             f"came into force: {brought}"
         )
     near = page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page

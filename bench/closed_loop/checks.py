@@ -73,10 +73,12 @@ def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterat
     with equipped(nominal, cell) as (plant, suite):
         plant.commission()
         for fault in SEEN_BY_CHECK:
+            before = plant.measure_tool(suite, QUICK, f"before {fault}")
+            plant.home_from_station(suite)
             for size in sizes.get(fault, (0.0,)):
                 cell.set_fault(fault, size)
                 said = plant.measure_tool(suite, QUICK, f"{fault} {size}")
-                yield Checked(Trial(fault, size, seed), said.status)
+                yield Checked(Trial(fault, size, seed), said.status, before.status)
                 cell.set_fault("none")
                 plant.listen(plant.now_s + SETTLES_S)
                 plant.home_from_station(suite)
@@ -98,9 +100,9 @@ def power_table(found: Sequence[Checked]) -> Table:
         ("fault", "right code", "size: right of all", "smallest with 90 %", "told below it",
          "at the usual size, %", "goal"),
         "Simulated: the commissioned cell, the fault, one quick check of the tool; for what was "
-        "knocked or moved a thermal cycle without and one with it; right is only who says nothing "
-        "in the first. The smallest size from which "
-        "on the right code comes in 90 % of the cells or more. Of an encoder: its joint.",
+        "knocked or moved a thermal cycle. A measurement without it comes before; right is only "
+        "who says nothing in that. The smallest size from which on the right code comes in 90 % of "
+        "the cells or more. Of an encoder: its joint.",
     )  # fmt: skip
     for fault in dict.fromkeys(one.trial.fault for one in found):
         own = [one for one in found if one.trial.fault == fault]

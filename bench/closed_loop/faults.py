@@ -14,6 +14,7 @@ CLEAN, AFTER = 1, 2  # gaps before and after the fault
 LONG_AFTER = 12  # of a knock that nobody sees: what is learned from it may add up
 WARM_S = 1800.0  # of work before those, so that there is a drift to be learned
 POWER = 0.9
+ALARM = "a false alarm before it"
 WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 RIGHT: Mapping[Fault, Code] = {
     "collision": Code.LIMIT_EXCEEDED,
@@ -40,6 +41,9 @@ RIGHT: Mapping[Fault, Code] = {
 where the drift was learned with them. Nor does a jump of the sensor's clock: the robot stands until
 the joint readings have passed a measurement's stamp, so it is taken at the same joints; one that is
 too large for that leaves poses unmeasured."""
+
+ONLY_BY: Mapping[Fault, str] = {"collision": "tool"}
+"""Who must give the right code, where it means something else of others."""
 
 SWEEP: Mapping[Fault, tuple[float, ...]] = {
     "collision": (0.1, 0.2, 0.3, 0.5, 2.0),
@@ -108,7 +112,8 @@ class Report:
 
     Attributes
     ----------
-    who, code : who reported it first, and how; empty and NONE where nobody did.
+    who, code : who reported it first, and how; empty and NONE where nobody did. `ALARM`: somebody
+        said something before there was a fault.
     gaps : after the fault until somebody gave the right code; one more than there were where
         nobody did.
     over_s : the longest overrun of a gap.
@@ -134,8 +139,12 @@ def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Re
         for name, found in _told(gap):
             if not who:
                 who, code = name, found
-            if found is RIGHT.get(trial.fault):
+            right = found is RIGHT.get(trial.fault) and name == ONLY_BY.get(trial.fault, name)
+            if right:
                 gaps = min(gaps, float(number))
+    for gap in with_suite.gaps[:CLEAN]:
+        for _, found in _told(gap):
+            who, code, gaps = ALARM, found, trial.gaps + 1.0
     over_s = max(gap.over_s for gap in with_suite.gaps)
     return Report(trial, who, code, gaps, harm(with_suite, without, after=CLEAN), over_s)
 
@@ -144,7 +153,8 @@ def _told(gap: GapReport) -> list[tuple[str, Code]]:
     result = gap.result
     if result is None:
         return [("run refused", gap.fault_code or Code.CONFLICT)]
-    told = [("thermal", result.thermal_code), ("tool", result.tool_code)]
+    told = [("thermal", result.thermal_code)]
+    told += [("tool", result.tool_found_code), ("tool", result.tool_code)]
     told += [("maintenance", gap.fault_code), ("maintenance", result.code)]
     return [(name, code) for name, code in told if code not in WELL]
 

@@ -202,7 +202,7 @@ def faults_table(reports: Sequence[Report]) -> Table:
             Goal(one.gaps, 1.0) if one.trial.must_be_told else None,
             "stood" if stood else MM * one.harm.cycle_m,
             None if stood else Goal(MM * one.harm.cycle_m, MM * FAULTY_RMS_M),
-            one.harm.refused, one.over_s,
+            one.harm.refused, Goal(one.over_s, 0.0),
         )  # fmt: skip
     return table
 

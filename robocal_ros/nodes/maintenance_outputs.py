@@ -28,6 +28,7 @@ def result_message(result: CycleResult | None) -> MaintenanceResult:
         left=list(result.left),
         thermal_code=int(result.thermal_code),
         thermal_id=result.thermal_id,
+        tool_found_code=int(result.tool_found_code),
         tool_code=int(result.tool_code),
         tool_id=result.tool_id,
         tool_answer=ANSWERS.get(result.tool_answer, 0),

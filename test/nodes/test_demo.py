@@ -61,6 +61,7 @@ def test_the_gaps_are_kept_and_used(demo):
         assert gap["used_s"] <= gap["length_s"]
         assert (gap["code"], gap["complete"]) == (Code.ACCEPT.name, True)
     assert first["thermal_code"] == Code.ACCEPT.name
+    assert (first["tool_found_code"], second["tool_found_code"]) == ("ACCEPT", "LIMIT_EXCEEDED")
     assert second["tool_code"] == Code.ACCEPT.name
     assert first["accepted"]
     assert second["accepted"]

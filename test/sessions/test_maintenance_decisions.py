@@ -13,6 +13,7 @@ from maintenance_cell import (
     LONG_S,
     POSES,
     Cell,
+    bent,
     kinds,
     opened,
     passed,
@@ -213,6 +214,19 @@ def test_an_acceptance_whose_answer_was_lost_is_made_once(history, monkeypatch, 
     result = cell.finish()
     assert (result.accepted, result.tool_answer) == ((number,), "pass")
     assert [d.calibration_id for d in history.decisions()] == [number]
+
+
+def test_a_bent_tool_that_the_same_gap_mends_is_told(history):
+    cell = automatic(history)
+    number = measured_in_full(cell)
+    until_verified(cell)
+    cell.check = passed()
+    result = cell.finish()
+    assert (result.accepted, result.complete) == ((number,), True)
+    assert (result.tool_found_code, result.tool_code) == (Code.LIMIT_EXCEEDED, Code.ACCEPT)
+    assert f"tool: {bent().message}; tool: {passed().message}" in result.message
+    cell.restart()
+    assert cell.session.result(result.cycle_id) == result
 
 
 @pytest.mark.parametrize("owner", [CalibrationHistory, Decider])

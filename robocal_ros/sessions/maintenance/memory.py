@@ -29,6 +29,7 @@ class CycleResult:
     code : ACCEPT when it ran as planned, with the robot at home; NONE while it runs.
     complete : nothing that was due is left for the next gap; ``left`` names what is.
     thermal_code, thermal_id : of the end of the thermal cycle; NONE where it did not end.
+    tool_found_code : of the first tool measurement: what it found, also where that was mended.
     tool_code, tool_id : of the last tool measurement, and its candidate.
     tool_answer : of the last quick check.
     accepted : calibrations that were accepted without a person.
@@ -45,6 +46,7 @@ class CycleResult:
     tool_id: int = 0
     tool_answer: str = ""
     accepted: tuple[int, ...] = ()
+    tool_found_code: Code = Code.NONE
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""
@@ -54,8 +56,8 @@ class CycleResult:
     def of_document(cls, document: Mapping[str, Any]) -> "CycleResult":
         """Read what `document` gave, also after JSON."""
         values = dict(document)
-        for name in ("code", "thermal_code", "tool_code"):
-            values[name] = Code(values[name])
+        for name in ("code", "thermal_code", "tool_code", "tool_found_code"):
+            values[name] = Code(values.get(name, Code.NONE))
         for name in ("left", "accepted"):
             values[name] = tuple(values[name])
         return cls(**values)

@@ -111,9 +111,8 @@ class Run:
         found = self._tool.outcome
         if found.left:
             self._left(found.left)
-        for words in (found.last.message if found.last else "", found.told):
-            if words:
-                self._tell(f"tool: {words}")
+        for words in found.words():
+            self._tell(f"tool: {words}")
         if found.fault:
             raise FaultError(Code.CONFLICT, found.fault)
 
@@ -122,6 +121,7 @@ class Run:
         found = self._tool.outcome
         self.result = replace(
             self.result,
+            tool_found_code=found.first.code if found.first else Code.NONE,
             tool_code=found.last.code if found.last else Code.NONE,
             tool_id=found.candidate_id,
             tool_answer=found.checked,

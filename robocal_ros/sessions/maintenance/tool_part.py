@@ -29,7 +29,7 @@ class ToolOutcome:
 
     Attributes
     ----------
-    last : of the last measurement; None before any.
+    first, last : of the first and the last measurement; None before any.
     checked : the last quick check's answer.
     candidate_id : of the full measurement; 0 without.
     accepted : whether it was accepted without a person, and stayed.
@@ -38,6 +38,7 @@ class ToolOutcome:
     left : what did not fit.
     """
 
+    first: Answer | None = None
     last: Answer | None = None
     checked: str = ""
     candidate_id: int = 0
@@ -45,6 +46,15 @@ class ToolOutcome:
     fault: str = ""
     told: str = ""
     left: str = ""
+
+    def came(self, answer: Answer) -> None:
+        """Of a measurement."""
+        self.first, self.last = self.first or answer, answer
+
+    def words(self) -> list[str]:
+        """What was found first, what came last, and what else there is to say; each once."""
+        answers = (self.first, self.last) if self.first is not self.last else (self.last,)
+        return [each for each in (*(a.message for a in answers if a), self.told) if each]
 
 
 def worst_s(times: Times, mode: str) -> float:
@@ -206,7 +216,7 @@ class ToolPart:
         yield  # what was kept just before may have taken its time: the gap is looked at again
         if hands.tool.absent:
             outcome.left = f"tool measurement ({mode})"
-            outcome.last = Answer(Code.CONFLICT, hands.tool.words(), absent=True)
+            outcome.came(Answer(Code.CONFLICT, hands.tool.words(), absent=True))
             return None
         if not hands.fits(worst_s(self._times, mode)):
             outcome.left = f"tool measurement ({mode})"
@@ -221,7 +231,7 @@ class ToolPart:
                 answer = yield from hands.measure(mode, cycle_id, limit_s)
         except SilentError as error:
             answer = Answer(Code.CONFLICT, str(error))
-        outcome.last = answer
+        outcome.came(answer)
         yield from hands.disarmed()
         yield from hands.stand(STANDS_S)
         yield from hands.go_home()
