@@ -1,6 +1,8 @@
 """Many bags beside each other: Dask runs `validate_bag`, jobs go out and results come back."""
 
 import logging
+import os
+import signal
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,6 +13,7 @@ from robocal_ros.cli.validating import Job, Validated, validate_bag
 from robocal_ros.cli.warm_workers import METHOD
 from robocal_ros.core.errors import InputError
 
+PATIENCE_S = 10  # with a cluster
 Numbered = tuple[int, Validated]
 
 
@@ -26,7 +29,7 @@ def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Itera
     Raises
     ------
     InputError
-        When Dask is not there, or the cluster does not answer.
+        When Dask is not there, or the cluster does not answer or has no worker.
     """
     if scheduler is None and workers <= 1:
         yield from ((number, _alone(job)) for number, job in enumerate(jobs))
@@ -36,14 +39,17 @@ def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Itera
 
 
 def _gathered(client: Any, jobs: Sequence[Job]) -> Iterator[Numbered]:
-    from distributed import as_completed
+    from distributed import CancelledError, as_completed
 
     # A bag is read once: two jobs are never the same one to Dask.
     number = {client.submit(validate_bag, job, pure=False): i for i, job in enumerate(jobs)}
     for future in as_completed(list(number)):
         i = number.pop(future)  # and with it, when it was read, its result in the cluster
-        error = future.exception()
-        yield i, future.result() if error is None else _lost(jobs[i], error)
+        try:
+            result = future.result()
+        except (Exception, CancelledError) as error:  # cancelled: the cluster is gone
+            result = _lost(jobs[i], error)
+        yield i, result
         future.release()
 
 
@@ -72,10 +78,15 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         ) from error
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=10)
+            client = Client(scheduler, timeout=PATIENCE_S)
         except (OSError, ValueError) as error:
             raise InputError(f"--scheduler {scheduler} does not answer: {error}") from error
         with client:
+            try:
+                client.wait_for_workers(1, timeout=PATIENCE_S)
+            except TimeoutError as error:
+                words = f"no worker within {PATIENCE_S} s: start some, dask worker {scheduler}"
+                raise InputError(f"--scheduler {scheduler} has {words}") from error
             yield client
         return
     # One thread each, for linear algebra too (Dask sets it): the same bits as in one process.
@@ -90,4 +101,9 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
         ) as cluster,
         Client(cluster) as client,
     ):
-        yield client
+        try:
+            yield client
+        except KeyboardInterrupt:
+            for worker in cluster.workers.values():  # the cluster would wait for their bags
+                os.kill(worker.pid, signal.SIGKILL)
+            raise

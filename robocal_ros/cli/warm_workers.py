@@ -1,5 +1,6 @@
 """Worker processes that have read their code before there is work for them."""
 
+import signal
 from multiprocessing import forkserver
 
 METHOD = "forkserver"
@@ -13,4 +14,9 @@ def warm_up() -> None:
     otherwise import everything anew.
     """
     forkserver.set_forkserver_preload(_CODE)
-    forkserver.ensure_running()
+    # Ctrl-C is for this process alone: it ends the others.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -4,7 +4,13 @@ import contextlib
 import csv
 import io
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
+import threading
+import time
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +32,7 @@ from recordings import (
     write_samples,
 )
 
+from robocal_ros.cli import validating_many
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validating import Job
 from robocal_ros.cli.validating_many import validated
@@ -37,6 +44,7 @@ from robocal_ros.storage.bag_writer import ros_time
 from robocal_ros.storage.bags import BagWriter, read_bag
 
 TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
+EXCERPT = ROOT / "bags/golden_excerpt.mcap"
 SPHERE = ROOT / "bags/hand_eye_sphere.mcap"
 CHECK = postures(true_arm(), 20, 77)
 
@@ -316,6 +324,55 @@ class TestInParallel:
         status, document, _, _ = validate(TOOL_RUNS, "--scheduler", "nonsense://nowhere:1")
         assert status == 2
         assert "--scheduler nonsense://nowhere:1" in document["error"]["message"]
+
+    def test_a_cluster_without_a_worker(self, validate, monkeypatch) -> None:
+        from distributed import LocalCluster
+
+        monkeypatch.setattr(validating_many, "PATIENCE_S", 1)
+        with LocalCluster(n_workers=0, dashboard_address=None, processes=False) as cluster:
+            status, document, _, _ = validate(TOOL_RUNS, "--scheduler", cluster.scheduler_address)
+        assert status == 2
+        assert "no worker within 1 s" in document["error"]["message"]
+
+    def test_bags_that_a_cluster_took_with_it_are_told(self, validate) -> None:
+        from distributed import LocalCluster
+
+        cluster = LocalCluster(n_workers=1, dashboard_address=None, threads_per_worker=1)
+        gone = threading.Thread(target=lambda: (until(cluster_works), cluster.close()))
+
+        def cluster_works() -> bool:
+            return any(task.state == "processing" for task in cluster.scheduler.tasks.values())
+
+        gone.start()
+        status, document, out, _ = validate(
+            *8 * [EXCERPT], "--scheduler", cluster.scheduler_address
+        )
+        gone.join()
+        assert status == 3
+        assert "8 of 8 bags could not be validated" in document["error"]["message"]
+        assert (out / "report.html").exists()
+
+    def test_ctrl_c_ends_all_at_once(self, tmp_path) -> None:
+        command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *8 * [str(EXCERPT)]]
+        process = subprocess.Popen(
+            [*command, "--jobs", "2", "--report", str(tmp_path / "report")],
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        until(lambda: any((tmp_path / "report").glob("*.png")))  # two of eight are ready
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        _, words = process.communicate(timeout=10.0)
+        assert process.returncode == 130
+        assert words.split("\n")[-2] == "robocal: interrupted"
+        assert "Traceback" not in words
+
+
+def until(condition, within_s: float = 60.0) -> None:
+    end_s = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)
 
 
 def test_the_page_and_its_tables(bags, validate) -> None:
