@@ -143,6 +143,7 @@ def stated_table(shifts: Mapping[str, Sequence[ShiftRecord]]) -> Table:
         "closed_loop_stated",
         "What accuracy_state tells the line, against the true errors",
         ("shifts", "how many", "errors below the stated 95 % bound, %", "goal",
+         "least of a shift, %",
          "mean stated bound, mm", "p95 of the errors, mm", "ratio", "goal ",
          *(f"{level.name}, % of passes" for level in AccuracyLevel)),
         "The 95 % bound at the end of each pass, beside the errors of its working poses: below it "
@@ -153,6 +154,7 @@ def stated_table(shifts: Mapping[str, Sequence[ShiftRecord]]) -> Table:
         share, ratio = 100.0 * found.below, found.bound_m / found.p95_m
         table.add(
             name, len(records), share, Goal(share, 100.0 * BELOW_BOUND, at_least=True),
+            100.0 * min(stated([record]).below for record in records),
             MM * found.bound_m, MM * found.p95_m, ratio, Goal(ratio, WIDEST),
             *(100.0 * found.levels[level] for level in AccuracyLevel),
         )  # fmt: skip
