@@ -13,19 +13,19 @@ import json
 import shutil
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from demo_cell import PARAMETERS, bend_tool, commission, wiring, write_settings
-from demo_graph import ROOT, CellController, DemoError
-from demo_output import Moment, Story, show, tell, validate
-from demo_plc import Judge, Plc
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 
+from demo_output import Moment, Story, show, tell
+
+from bench.live.cell import bend_tool
+from bench.live.graph import ROOT, CellController, LiveError
+from bench.live.plc import GAP_S, Judge, Plc
+from bench.live.running import live_cell, validate
 from robocal_ros.core.errors import RobocalError
 
 OUT = ROOT / "out"
-GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
 COLLISION_MM = 2.0
 
 
@@ -64,36 +64,6 @@ class Demo:
         self.story.moments.append(moment)
 
 
-@contextmanager
-def live_cell(folder: Path, recordings: Path) -> Iterator[tuple[CellController, Plc]]:
-    """Commission the cell and start its nodes; at the end the recording is complete.
-
-    Raises
-    ------
-    DemoError
-        When it cannot go on.
-    RobocalError
-        When the cell cannot be commissioned.
-    """
-    tell("commissioning the cold cell, in one process")
-    made = commission(folder)
-    controller, plc = CellController(), None
-    try:
-        files = PARAMETERS, folder / "demo.yaml"
-        write_settings(made, recordings, files[1])
-        for name, wires in wiring().items():
-            controller.start(folder, name, {}, wires, files)
-        plc = Plc(controller, tell)
-        tell("waiting for six nodes, three hours of work later")
-        plc.take_over()
-        yield controller, plc
-        controller.end_nodes()  # completes the recording
-    finally:
-        if plc is not None:
-            plc.close()
-        controller.close()
-
-
 def main() -> int:
     """Run the demo."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -107,7 +77,7 @@ def main() -> int:
         shutil.rmtree(old, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with live_cell(folder, recordings) as (controller, plc):
+        with live_cell(folder, recordings, tell) as (controller, plc):
             demo = Demo(controller, plc)
             demo.run()
         story = demo.story
@@ -115,7 +85,7 @@ def main() -> int:
         document = json.dumps(story.document(), indent=1, allow_nan=False) + "\n"
         (folder / "story.json").write_text(document, encoding="utf-8")
         page = validate(recordings, folder / "report")
-    except (DemoError, RobocalError) as error:
+    except (LiveError, RobocalError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
     show(story, page, time.monotonic() - begin_s, opened=not options.no_open)

@@ -1,18 +1,13 @@
 """What the demo leaves behind: the validated bag's page, and a summary on the terminal."""
 
 import os
-import subprocess
-import sys
 import webbrowser
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from demo_graph import ROOT, DemoError
-from demo_plc import Gap
-
+from bench.live.plc import Gap
 from robocal_ros.core.codes import Code
 
-VALIDATED_WITHIN_S = 120.0
 GOAL_S = 180.0  # of the whole demo
 
 
@@ -60,31 +55,6 @@ def _gap(gap: Gap) -> dict[str, object]:
 def tell(words: str) -> None:
     """Say what goes on."""
     print(f"  {words}", flush=True)
-
-
-def validate(recordings: Path, report: Path) -> Path:
-    """The page of ``robocal validate`` of what was recorded.
-
-    Raises
-    ------
-    DemoError
-        When there is no recording, or it cannot be validated.
-    """
-    bags = sorted(recordings.glob("robocal_*"))
-    if not bags:
-        raise DemoError(f"nothing was recorded in {recordings}")
-    command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *map(str, bags)]
-    done = subprocess.run(
-        [*command, "--report", str(report)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=VALIDATED_WITHIN_S,
-        check=False,
-    )
-    if done.returncode != 0:
-        raise DemoError(f"the recording cannot be validated:\n{done.stdout}{done.stderr}")
-    return report / "report.html"
 
 
 def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:

@@ -11,7 +11,6 @@ import sys
 from collections import deque
 from pathlib import Path
 
-from demo_graph import ROOT, CellController, DemoError
 from diagnostic_msgs.msg import DiagnosticArray
 from make_demo_shift import ROBOT
 from make_thermal_shift import BAG, PERIOD_S
@@ -19,6 +18,9 @@ from robocal_msgs.msg import AccuracyState, SessionEvent
 from robocal_msgs.srv import BeginCycle, CaptureReference, Decide, EndCycle
 from std_msgs.msg import String
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
+
+from bench.live.graph import ROOT, CellController, LiveError
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.thermal_outputs import EVENTS
@@ -75,7 +77,7 @@ class Player:
             controller.wait(lambda: self._done, "the end of a cycle")
             self._pause()
             if (name := self._done.popleft().data) != expected:
-                raise DemoError(f"the mark of {name} came, not that of {expected}")
+                raise LiveError(f"the mark of {name} came, not that of {expected}")
             if name == REFERENCE:
                 self._capture()
             else:
@@ -110,18 +112,18 @@ class Player:
     def _capture(self) -> None:
         answer = self._controller.call(CaptureReference, "/thermal_node/capture_reference")
         if not answer.success:
-            raise DemoError(f"no cold reference: {answer.message}")
+            raise LiveError(f"no cold reference: {answer.message}")
         print(answer.message)
 
     def _begin(self, name: str) -> None:
         answer = self._controller.call(BeginCycle, "/thermal_node/begin_cycle", cycle_id=name)
         if not answer.success:
-            raise DemoError(f"{name} cannot begin: {answer.message}")
+            raise LiveError(f"{name} cannot begin: {answer.message}")
 
     def _end(self, name: str) -> None:
         answer = self._controller.call(EndCycle, "/thermal_node/end_cycle", cycle_id=name)
         if not answer.candidate_id:
-            raise DemoError(f"{name}: {answer.message}")
+            raise LiveError(f"{name}: {answer.message}")
         print(f"{name}: {Code(answer.status).name} {answer.message}")
         if answer.status == Code.ACCEPT:
             who = {"by": "cell controller", "reason": "its verdict"}
@@ -158,7 +160,7 @@ def main() -> int:
         player.run()
         controller.wait(lambda: player.accuracy, "the accuracy")
         controller.wait(lambda: player.events[-1].command == "configure", "the last event")
-    except DemoError as error:
+    except LiveError as error:
         print(error, file=sys.stderr)
         return 1
     finally:

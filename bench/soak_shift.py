@@ -4,7 +4,6 @@
 With ``--keep`` it writes docs/figures/soak_shift.md too. The cell is the demo's, simulated.
 """
 
-# the demo's modules stand beside its bag
 import json
 import os
 import sys
@@ -17,20 +16,16 @@ from typing import Any
 
 import numpy as np
 
+from bench.live.cell import bend_tool
+from bench.live.graph import CellController
+from bench.live.plc import GAP_S, Gap, Judge, Judged, Plc
+from bench.live.running import live_cell, validate
 from bench.processes import resident_mb
 from bench.soaking import soak_main
 from bench.tables import Goal, Table
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "bags"))
-
-from demo import COLLISION_MM, GAP_S, live_cell
-from demo_cell import bend_tool
-from demo_graph import CellController
-from demo_output import validate
-from demo_plc import Gap, Judge, Judged, Plc
-
 from robocal_ros.core.codes import Code
 
+COLLISION_MM = 2.0
 EVERY_S = 300.0  # from the begin of a gap to the next one's
 WARM = 2  # gaps until caches are full
 MOST_GROWTH_MB = 10.0
@@ -93,7 +88,7 @@ def soak(seconds: float) -> Table:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recordings = folder / "recordings"
-        with live_cell(folder, recordings) as (controller, plc):
+        with live_cell(folder, recordings, print) as (controller, plc):
             shift = LiveShift(controller, plc)
             shift.run(seconds)
         report = validate(recordings, folder / "report").with_suffix(".json")

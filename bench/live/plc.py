@@ -1,4 +1,4 @@
-"""The demo's PLC bridge: heartbeat, programme, maintenance's services, and the correction's node
+"""The PLC's bridge: heartbeat, programme, maintenance's services, and the correction's node
 (/joint_correction_node/status and enable). Nothing else.
 
 What it knows of the cell it has from these and from ``accuracy_state``, as a PLC does. `Judge`
@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from demo_cell import PROGRAM, ROBOT, TRUTH
-from demo_graph import CellController, DemoError
 from rclpy.exceptions import InvalidHandle
 from robocal_msgs.msg import AccuracyState, CorrectionStatus, MaintenanceStatus
 from robocal_msgs.srv import GetMaintenance, RunMaintenanceCycle
@@ -24,6 +22,8 @@ from std_msgs.msg import Bool, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from bench.live.cell import PROGRAM, ROBOT, TRUTH
+from bench.live.graph import CellController, LiveError
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
 from robocal_ros.sim.kr150_cell import poses
@@ -31,6 +31,7 @@ from robocal_ros.sim.production import programme
 from robocal_ros.storage.robots import load_robot
 
 BEAT_S = 0.2
+GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
 START_S = 120.0  # of all nodes, on a machine with much else to do
 ASK_S = 0.2  # between two calls of ~/status
 LEAD = 4  # rests at home, a second each: after a gap the correction blends in from there
@@ -93,7 +94,7 @@ class Plc:
         controller.wait(lambda: self._program.get_subscription_count() > 0, "the programme's way")
         answer = controller.call(SetBool, "/joint_correction_node/enable", data=True)
         if not answer.success:
-            raise DemoError(f"the correction cannot be enabled: {answer.message}")
+            raise LiveError(f"the correction cannot be enabled: {answer.message}")
 
     def line(self) -> tuple[str, str]:
         """What the line reads now: state, and its words."""
@@ -122,7 +123,7 @@ class Plc:
         self._controller.wait(lambda: self._status("").state.at_home, "the robot at home")
         now = sum(self._correction[-1].refused)
         if now > refused:
-            raise DemoError(f"the correction refused the programme: {self._correction[-1]}")
+            raise LiveError(f"the correction refused the programme: {self._correction[-1]}")
 
     def _until(self, when_s: float) -> None:
         self._controller.wait(lambda: time.monotonic() >= when_s, "the programme", 120.0)
@@ -135,7 +136,7 @@ class Plc:
         try:
             answer = self._begin(name, begin_s + length_s)
             if not answer.success:
-                raise DemoError(f"{name} cannot begin: {Code(answer.status).name} {answer.message}")
+                raise LiveError(f"{name} cannot begin: {Code(answer.status).name} {answer.message}")
             said, result = "", None
             while result is None:
                 self._until(time.monotonic() + ASK_S)
@@ -144,7 +145,7 @@ class Plc:
                     said = told.state.doing
                     self._tell(f"{time.monotonic() - begin_s:5.1f} s  {said}")
                 if told.state.state == MaintenanceStatus.FAULT:
-                    raise DemoError(f"{name}: {told.state.fault}")
+                    raise LiveError(f"{name}: {told.state.fault}")
                 if told.result.code != Code.NONE and told.state.at_home:
                     result = told.result
             used_s = time.monotonic() - begin_s

@@ -1,4 +1,4 @@
-"""The demo's cell before its shift: commissioned while it was cold, in one process. Simulated.
+"""The cell before its shift: commissioned while it was cold, in one process. Simulated.
 
 What a person does once in a real cell is done by the sessions of the nodes on the simulated robot
 (`bench.closed_loop`): the sphere sensor is placed, the cold reference captured, the beams placed,
@@ -6,21 +6,18 @@ the healthy tool measured. It is left in a state folder, as the nodes would leav
 """
 
 import json
-import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from demo_graph import ROOT, CellController, DemoError
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
-
-sys.path.insert(0, str(ROOT))  # for the bench
 
 from bench.closed_loop import setting
 from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
+from bench.live.graph import ROOT, CellController, LiveError
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_samples import CellSamples
 from robocal_ros.sim.kr150_cell import kr150_cell
@@ -105,7 +102,7 @@ def bend_tool(controller: CellController, size_mm: float) -> None:
 
     Raises
     ------
-    DemoError
+    LiveError
         When the simulator refuses.
     """
     size = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=size_mm)
@@ -113,7 +110,7 @@ def bend_tool(controller: CellController, size_mm: float) -> None:
     parameters = [Parameter(name="fault_size", value=size), Parameter(name="fault", value=fault)]
     answer = controller.call(SetParameters, "/cell_sim_node/set_parameters", parameters=parameters)
     if not all(result.successful for result in answer.results):
-        raise DemoError(f"no collision: {answer.results}")
+        raise LiveError(f"no collision: {answer.results}")
 
 
 def wiring() -> Mapping[str, Mapping[str, str]]:

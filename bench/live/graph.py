@@ -22,13 +22,13 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.nodes import qos
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 PATIENCE_S = 30.0
 END_S = 5.0
 
 
-class DemoError(RuntimeError):
+class LiveError(RuntimeError):
     """The demo cannot go on; the message says why."""
 
 
@@ -46,7 +46,7 @@ class Executable:
         self.name, self.log = name, folder / f"{name}.log"
         program = EXECUTABLES / name
         if not program.exists():
-            raise DemoError(f"{program} is missing: run make setup")
+            raise LiveError(f"{program} is missing: run make setup")
         options = [("--params-file", str(file)) for file in files]
         options += [("-p", f"{key}:={value}") for key, value in parameters.items()]
         options += [("-r", f"{old}:={new}") for old, new in remap.items()]
@@ -68,7 +68,7 @@ class Executable:
         """Raise when it has ended."""
         status = self._process.poll()
         if status is not None:
-            raise DemoError(f"{self.name} ended with status {status}:\n{self.log.read_text()}")
+            raise LiveError(f"{self.name} ended with status {status}:\n{self.log.read_text()}")
 
     def ask_to_end(self) -> None:
         """As Ctrl-C does."""
@@ -128,7 +128,7 @@ class CellController:
                 executable.check()
             if time.monotonic() > deadline:
                 logs = "".join(f"\n--- {e.name}\n{e.log.read_text()}" for e in self._executables)
-                raise DemoError(f"waited {within_s:.0f} s for {what}{logs}")
+                raise LiveError(f"waited {within_s:.0f} s for {what}{logs}")
             self._executor.spin_once(timeout_sec=0.02)
 
     def call(self, kind: type, name: str, **fields: object) -> Any:
@@ -145,7 +145,7 @@ class CellController:
         """Call a Trigger that must succeed."""
         answer = self.call(Trigger, name)
         if not answer.success:
-            raise DemoError(f"{name}: {answer.message}")
+            raise LiveError(f"{name}: {answer.message}")
 
     @property
     def pids(self) -> dict[str, int]:

@@ -1,0 +1,1 @@
+"""A whole simulated cell alive: its nodes as processes over DDS, in real time, and its PLC."""
