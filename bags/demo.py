@@ -19,10 +19,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 
 from demo_output import Moment, Story, show, tell
 
-from bench.live.cell import bend_tool
-from bench.live.graph import ROOT, CellController, LiveError
+from bench.live.cell import set_fault
+from bench.live.graph import CellController, LiveError
 from bench.live.plc import GAP_S, Judge, Plc
 from bench.live.running import live_cell, validate
+from bench.startup import ROOT
 from robocal_ros.core.errors import RobocalError
 
 OUT = ROOT / "out"
@@ -56,7 +57,7 @@ class Demo:
 
     def _collide(self) -> None:
         self._judged("after gap 1: drift measured")
-        bend_tool(self._controller, COLLISION_MM)
+        set_fault(self._controller, "collision", COLLISION_MM)
 
     def _judged(self, words: str) -> None:
         found = self._judge.now()

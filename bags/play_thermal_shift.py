@@ -20,7 +20,8 @@ from std_msgs.msg import String
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 
-from bench.live.graph import ROOT, CellController, LiveError
+from bench.live.graph import CellController, LiveError
+from bench.startup import ROOT
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.thermal_outputs import EVENTS

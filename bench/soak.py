@@ -84,6 +84,8 @@ def endurance(amount: Amount) -> Table:
     matrix = "test/nodes/test_fault_matrix.py"
     add("the sixteen faults of a cell's tool side over DDS, each with its code", 1,
         lambda: not _pytest(matrix, ROBOCAL_FAULTS="all"))  # fmt: skip
+    add("sensor, sphere or robot knocked in a live cell, each told in the next gap", 1,
+        lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
     add("random work of several users on one history, 100 steps each", amount.history_runs,
         lambda: _history_runs(amount.history_runs))  # fmt: skip
     properties = ("-m", "hypothesis and not ros", "test/core", "test/storage", "test/sessions")

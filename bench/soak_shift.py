@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.live.cell import bend_tool
+from bench.live.cell import set_fault
 from bench.live.graph import CellController
 from bench.live.plc import GAP_S, Gap, Judge, Judged, Plc
 from bench.live.running import live_cell, validate
@@ -73,7 +73,7 @@ class LiveShift:
         self.passes.append(Pass(self._judge.now(), len(self.gaps)))
 
     def _bend(self) -> None:
-        bend_tool(self._controller, COLLISION_MM)
+        set_fault(self._controller, "collision", COLLISION_MM)
 
     def in_force(self) -> list[Pass]:
         """Passes that must be right: after the first gap, and from two gaps after the collision."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from bench.tables import Goal, Table
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 NODES = ("thermal_node", "joint_correction_node", "replay_node")
 PROMISED_S = 1.5

@@ -17,8 +17,10 @@ from rcl_interfaces.srv import SetParameters
 from bench.closed_loop import setting
 from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
-from bench.live.graph import ROOT, CellController, LiveError
+from bench.live.graph import CellController, LiveError
+from bench.startup import ROOT
 from robocal_ros.sim.cell import SimulatedCell
+from robocal_ros.sim.cell_faults import Fault
 from robocal_ros.sim.cell_samples import CellSamples
 from robocal_ros.sim.kr150_cell import kr150_cell
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -97,20 +99,20 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")  # which is YAML too
 
 
-def bend_tool(controller: CellController, size_mm: float) -> None:
-    """Let a collision happen.
+def set_fault(controller: CellController, fault: Fault, size: float = 0.0) -> None:
+    """Let something go wrong, see `SimulatedCell.set_fault`.
 
     Raises
     ------
     LiveError
         When the simulator refuses.
     """
-    size = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=size_mm)
-    fault = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="collision")
-    parameters = [Parameter(name="fault_size", value=size), Parameter(name="fault", value=fault)]
+    amount = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=size)
+    name = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=fault)
+    parameters = [Parameter(name="fault_size", value=amount), Parameter(name="fault", value=name)]
     answer = controller.call(SetParameters, "/cell_sim_node/set_parameters", parameters=parameters)
     if not all(result.successful for result in answer.results):
-        raise LiveError(f"no collision: {answer.results}")
+        raise LiveError(f"no {fault}: {answer.results}")
 
 
 def wiring() -> Mapping[str, Mapping[str, str]]:

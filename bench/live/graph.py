@@ -20,16 +20,15 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
+from bench.startup import EXECUTABLES
 from robocal_ros.nodes import qos
 
-ROOT = Path(__file__).resolve().parents[2]
-EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 PATIENCE_S = 30.0
 END_S = 5.0
 
 
 class LiveError(RuntimeError):
-    """The demo cannot go on; the message says why."""
+    """The cell cannot go on; the message says why."""
 
 
 class Executable:

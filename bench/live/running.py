@@ -7,8 +7,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from bench.live.cell import PARAMETERS, commission, wiring, write_settings
-from bench.live.graph import ROOT, CellController, LiveError
+from bench.live.graph import CellController, LiveError
 from bench.live.plc import Plc
+from bench.startup import ROOT
 
 VALIDATED_WITHIN_S = 120.0
 
