@@ -39,7 +39,7 @@ def validated(jobs: Sequence[Job], workers: int, scheduler: str | None) -> Itera
 
 
 def _gathered(client: Any, jobs: Sequence[Job]) -> Iterator[Numbered]:
-    from distributed import CancelledError, as_completed
+    from distributed import as_completed
 
     # A bag is read once: two jobs are never the same one to Dask.
     number = {client.submit(validate_bag, job, pure=False): i for i, job in enumerate(jobs)}
@@ -47,7 +47,7 @@ def _gathered(client: Any, jobs: Sequence[Job]) -> Iterator[Numbered]:
         i = number.pop(future)  # and with it, when it was read, its result in the cluster
         try:
             result = future.result()
-        except (Exception, CancelledError) as error:  # cancelled: the cluster is gone
+        except Exception as error:  # cancelled too: the cluster is gone
             result = _lost(jobs[i], error)
         yield i, result
         future.release()

@@ -71,7 +71,7 @@ class Hands:
         return not (self.robot.moving or self.tool.armed) and self.gap.waits(self.now_s)
 
     def begin(self, gap_s: float) -> None:
-        """A run begins, with the robot at home."""
+        """A run is to begin, with the robot at home."""
         self.gap.begin(gap_s, self.now_s)
         self.robot.place, self.left_home = (HOME, HOME), False
 

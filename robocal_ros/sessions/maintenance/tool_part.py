@@ -53,8 +53,9 @@ class ToolOutcome:
 
     def words(self) -> list[str]:
         """What was found first, what came last, and what else there is to say; each once."""
-        answers = (self.first, self.last) if self.first is not self.last else (self.last,)
-        return [each for each in (*(a.message for a in answers if a), self.told) if each]
+        said = [each.message for each in (self.first, self.last) if each] + [self.told]
+        said = list(dict.fromkeys(filter(None, said)))
+        return [words for words in said if not any(words in o for o in said if o is not words)]
 
 
 def worst_s(times: Times, mode: str) -> float:
