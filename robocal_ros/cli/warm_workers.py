@@ -4,7 +4,18 @@ import signal
 from multiprocessing import forkserver
 
 METHOD = "forkserver"
-_CODE = ["distributed.nanny", "distributed.worker", "robocal_ros.cli.validating"]
+_CODE = [
+    "distributed.nanny",
+    "distributed.worker",
+    "robocal_ros.cli.validating",
+    # what a bag needs in the course of things
+    "robocal_ros.core.kinematics.kernels",
+    "robocal_ros.core.mcap_records",
+    "robocal_ros.core.serialized_joints",
+    "matplotlib.backends.backend_agg",
+    "matplotlib.backends.backend_svg",
+    "scipy.special",
+]
 
 
 def warm_up() -> None:
