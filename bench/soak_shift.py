@@ -35,10 +35,11 @@ RIGHT_AGAIN = 2  # gaps after a collision
 
 @dataclass(frozen=True)
 class Pass:
-    """What a pass of the programme was worth; how many gaps lay before it."""
+    """What a pass of the programme was worth; how many gaps and collisions lay before it."""
 
     judged: Judged
     gaps: int
+    bent: bool
 
 
 class LiveShift:
@@ -70,7 +71,8 @@ class LiveShift:
         if bends:
             self.bent_after = len(self.gaps)
         self._plc.produce(halfway=self._bend if bends else None)
-        self.passes.append(Pass(self._judge.now(), len(self.gaps)))
+        bent = self.bent_after is not None
+        self.passes.append(Pass(self._judge.now(), len(self.gaps), bent))
 
     def _bend(self) -> None:
         set_fault(self._controller, "collision", COLLISION_MM)
@@ -78,9 +80,7 @@ class LiveShift:
     def in_force(self) -> list[Pass]:
         """Passes that must be right: after the first gap, and from two gaps after the collision."""
         bent = np.inf if self.bent_after is None else self.bent_after
-        return [
-            one for one in self.passes if 1 <= one.gaps < bent or one.gaps >= bent + RIGHT_AGAIN
-        ]
+        return [one for one in self.passes if one.gaps >= (bent + RIGHT_AGAIN if one.bent else 1)]
 
 
 def soak(seconds: float) -> Table:
