@@ -49,6 +49,7 @@ SEEN_BY_CHECK: tuple[Fault, ...] = (
 )
 SEEN_BY_CYCLE: tuple[Fault, ...] = ("sensor_knocked", "sphere_knocked", "moved_by_hand")
 SETTLES_S = 0.5
+QUIET = 0.95  # of the measurements of a healthy cell say nothing, or more
 SEEDS = range(41, 51)
 
 
@@ -126,6 +127,30 @@ def power_table(found: Sequence[Checked]) -> Table:
     return table
 
 
+def healthy_table(found: Sequence[Checked]) -> Table:
+    """What was said before the faults."""
+    table = Table(
+        "closed_loop_healthy",
+        "The same cells before each fault: what is said where nothing is wrong",
+        ("measurement", "how many", "said", "nothing told, %", "goal"),
+        "Simulated. TOO_FEW_SAMPLES of a quick check: it cannot tell, and the tool is measured.",
+    )
+    kinds = {"quick check": SEEN_BY_CHECK, "thermal cycle": SEEN_BY_CYCLE}
+    for kind, faults in kinds.items():
+        # One check comes before all sizes of a fault, a cycle before each.
+        before = {
+            (one.trial.seed, one.trial.fault, one.trial.size if faults is SEEN_BY_CYCLE else 0.0):
+            one.before for one in found if one.trial.fault in faults
+        }  # fmt: skip
+        said = Counter(code.name for code in before.values()).most_common()
+        share = 100.0 * sum(code in WELL for code in before.values()) / len(before)
+        table.add(
+            kind, len(before), ", ".join(f"{name} {count}" for name, count in said),
+            share, Goal(share, 100.0 * QUIET, at_least=True),
+        )  # fmt: skip
+    return table
+
+
 def _all_checked(seed: int) -> list[Checked]:
     return list(checked(seed))
 
@@ -133,4 +158,5 @@ def _all_checked(seed: int) -> list[Checked]:
 def tables() -> Sequence[Table]:
     """All checks, on all cores."""
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        return [power_table([one for cell in pool.map(_all_checked, SEEDS) for one in cell])]
+        found = [one for cell in pool.map(_all_checked, SEEDS) for one in cell]
+    return [power_table(found), healthy_table(found)]

@@ -4,7 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from bench.closed_loop.checks import SEEN_BY_CHECK, SEEN_BY_CYCLE, Checked, power_table
+from bench.closed_loop.checks import (
+    SEEN_BY_CHECK,
+    SEEN_BY_CYCLE,
+    Checked,
+    healthy_table,
+    power_table,
+)
 from bench.closed_loop.faults import RIGHT, SWEEP, Trial
 from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import SIZES
@@ -78,3 +84,16 @@ def test_what_is_told_of_smaller_faults_is_said():
     _, _, tried, smallest, below, _, _ = table.texts()[0]
     assert "0.2 mm: 0/10, 0.3 mm: 10/10" in tried
     assert (smallest, below) == ("0.3 mm", "ACCEPT 20")
+
+
+@pytest.mark.parametrize(("alarms", "met"), [(0, True), (1, False)])
+def test_an_alarm_without_a_fault_is_a_missed_goal(alarms, met):
+    """One check before all sizes of a fault, in one of ten cells."""
+    told = [
+        replace(one, before=Code.LIMIT_EXCEEDED if one.trial.seed < alarms else Code.ACCEPT)
+        for fault in ("collision", "sphere_knocked")
+        for one in found(fault, lambda size, cell: RIGHT[fault])
+    ]
+    checks, cycles = healthy_table(told).texts()
+    assert (checks[1], cycles[1]) == ("10", str(10 * len(SWEEP["sphere_knocked"])))
+    assert healthy_table(told).met is met
