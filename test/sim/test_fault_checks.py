@@ -92,7 +92,7 @@ def test_an_alarm_without_a_fault_is_a_missed_goal(alarms, met):
     told = [
         replace(one, before=Code.LIMIT_EXCEEDED if one.trial.seed < alarms else Code.ACCEPT)
         for fault in ("collision", "sphere_knocked")
-        for one in found(fault, lambda size, cell: RIGHT[fault])
+        for one in found(fault, lambda size, cell, code=RIGHT[fault]: code)
     ]
     checks, cycles = healthy_table(told).texts()
     assert (checks[1], cycles[1]) == ("10", str(10 * len(SWEEP["sphere_knocked"])))
