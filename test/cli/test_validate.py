@@ -353,14 +353,14 @@ class TestInParallel:
         assert (out / "report.html").exists()
 
     def test_ctrl_c_ends_all_at_once(self, tmp_path) -> None:
-        command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *8 * [str(EXCERPT)]]
+        command = [sys.executable, "-m", "robocal_ros.cli.main", "validate", *40 * [str(EXCERPT)]]
         process = subprocess.Popen(
             [*command, "--jobs", "2", "--report", str(tmp_path / "report")],
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
         )
-        until(lambda: any((tmp_path / "report").glob("*.png")))  # two of eight are ready
+        until(lambda: any((tmp_path / "report").glob("*.png")))  # two of forty are ready
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
         _, words = process.communicate(timeout=10.0)
         assert process.returncode == 130

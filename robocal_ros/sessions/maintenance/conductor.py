@@ -6,7 +6,8 @@ from traceback import extract_tb
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.sessions.maintenance.hands import Hands, Script
+from robocal_ros.sessions.maintenance.asking import Script
+from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.run import Run

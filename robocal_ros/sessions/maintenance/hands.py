@@ -1,43 +1,30 @@
-"""What the script of a run does with robot and nodes. Each thing waits from tick to tick.
-
-A script is a generator: it yields whenever it has to wait, and is resumed at the next tick.
-"""
-
-from collections.abc import Callable, Generator
-from typing import Any, TypeVar
+"""What the script of a run does with robot and nodes. Each thing waits from tick to tick."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, LimitError
+from robocal_ros.core.errors import LimitError
 from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance import requests as asked
+from robocal_ros.sessions.maintenance.asking import Asking, Script
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.disarming import SENT, Disarming
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
-from robocal_ros.sessions.maintenance.requests import Answer, Request
+from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
 from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
 
 DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot
 
 Array = NDArray[np.float64]
-R = TypeVar("R")
-Script = Generator[None, None, R]
 
 
-class SilentError(ConflictError):
-    """A node did not answer in time."""
-
-
-class Hands:
+class Hands(Asking):
     """Robot, gap and the requests to other nodes; times of a steady clock.
 
     Attributes
     ----------
-    now_s : of the tick.
-    out : requests that wait to be carried out.
     tool : whether the tool's driver may move the robot.
     left_home : whether something may have moved the robot since the run began.
     measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
@@ -45,11 +32,10 @@ class Hands:
     """
 
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
+        super().__init__()
         self.config, self.ways = config, ways
         self.robot = Mover(config, ways)
         self.gap = Gap(config.times.stale_s)
-        self.now_s = 0.0
-        self.out: list[Request] = []
         self.tool = Disarming()
         self.left_home = False
         self.measured: list[float] = []
@@ -57,8 +43,6 @@ class Hands:
         self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
         self._told_s = -np.inf  # newest reading at the last confirmation, or stop in its place
         self._measuring = 0  # number of the measurement that the driver has not answered
-        self._numbers = 0
-        self._waiting: dict[int, Answer | None] = {}
 
     # ---- time -----------------------------------------------------------------------------------
 
@@ -81,18 +65,12 @@ class Hands:
         rests = robot.resting(STANDS_S) is not None and not robot.moving
         return self.tool.doubted or not rests or bool(robot.beside_home())
 
-    def handed_out(self) -> list[Request]:
-        """The requests that wait; they are somebody else's now."""
-        found, self.out = self.out, []
-        return found
+    # ---- the tool's driver ----------------------------------------------------------------------
 
-    # ---- requests -------------------------------------------------------------------------------
-
-    def request(self, kind: Callable[..., Request], *given: Any) -> int:
-        """Ask, without waiting; its number."""
-        self._numbers += 1
-        self.out.append(kind(self._numbers, *given))
-        return self._numbers
+    def doubt(self) -> None:
+        """Nobody knows whether the tool's driver is armed; without a station there is none."""
+        if self.config.T_base_laser is not None:
+            self.tool.doubt()
 
     def answered(self, number: int, answer: Answer) -> None:
         """An answer came; one that nobody waits for is none."""
@@ -102,46 +80,7 @@ class Hands:
             self._told_s = self.robot.newest_s
         if number == self._measuring:
             self._measuring = 0
-        if number in self._waiting:
-            self._waiting[number] = answer
-
-    def expect(self, kind: Callable[..., Request], *given: Any) -> int:
-        """Ask; `waited_for` gives the answer."""
-        number = self.request(kind, *given)
-        self._waiting[number] = None
-        return number
-
-    def waited_for(self, number: int, within_s: float, what: str) -> Script[Answer]:
-        """Wait for an answer.
-
-        Raises
-        ------
-        SilentError
-            When it does not come in time.
-        """
-        until_s = self.now_s + within_s
-        while (answer := self._waiting[number]) is None:
-            if self.now_s >= until_s:
-                del self._waiting[number]
-                raise SilentError(f"{what}: no answer within {within_s:g} s")
-            yield
-        del self._waiting[number]
-        return answer
-
-    def ask(self, within_s: float, what: str, kind: Any, *given: Any) -> Script[Answer]:
-        """Ask and wait, as `waited_for`."""
-        return (yield from self.waited_for(self.expect(kind, *given), within_s, what))
-
-    def forget_answers(self) -> None:
-        """Nobody waits any more."""
-        self._waiting.clear()
-
-    # ---- the tool's driver ----------------------------------------------------------------------
-
-    def doubt(self) -> None:
-        """Nobody knows whether the tool's driver is armed; without a station there is none."""
-        if self.config.T_base_laser is not None:
-            self.tool.doubt()
+        super().answered(number, answer)
 
     def arm(self) -> Script[Answer]:
         """Arm the tool's driver; from now on it may have the robot anywhere at the station."""

@@ -8,8 +8,9 @@ from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import LEAVE, Command, Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
+from robocal_ros.sessions.maintenance.asking import Script, SilentError
 from robocal_ros.sessions.maintenance.deciding import Decider
-from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
+from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
 from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer

@@ -5,8 +5,9 @@ from collections.abc import Callable
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StorageError
 from robocal_ros.sessions.events import ACCEPT, Outcome
+from robocal_ros.sessions.maintenance.asking import Script
 from robocal_ros.sessions.maintenance.deciding import BY, Decider, withholding
-from robocal_ros.sessions.maintenance.hands import Hands, Script
+from robocal_ros.sessions.maintenance.hands import Hands
 
 HELD_S = 2.0  # another process's change is a matter of milliseconds
 WITHIN = "within the configured bounds"

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
+from robocal_ros.sessions.maintenance.asking import Script, SilentError
+from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.requests import Answer, BeginCycle, EndCycle
 from robocal_ros.sessions.maintenance.ways import HOME
 from robocal_ros.sessions.tool_driving import STANDS_S

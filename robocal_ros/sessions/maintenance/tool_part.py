@@ -8,9 +8,10 @@ from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import ToolError
 from robocal_ros.sessions.events import ROLLBACK, Command, Outcome
+from robocal_ros.sessions.maintenance.asking import Script, SilentError
 from robocal_ros.sessions.maintenance.config import Times
 from robocal_ros.sessions.maintenance.deciding import BY, Decider
-from robocal_ros.sessions.maintenance.hands import Hands, Script, SilentError
+from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.settling import is_accepted, patiently, settled
