@@ -30,11 +30,18 @@ class MaintenanceDriver:
     Parameters
     ----------
     answered : takes the number of a request and what came of it.
+    moves : told just before a motion goes out: later, the robot would be ahead of its plan.
     names : of the joints.
     """
 
-    def __init__(self, node: EndpointNode, names: tuple[str, ...], answered: Answered) -> None:
-        self._answered, self._names = answered, names
+    def __init__(
+        self,
+        node: EndpointNode,
+        names: tuple[str, ...],
+        answered: Answered,
+        moves: Callable[[], None],
+    ) -> None:
+        self._answered, self._moves, self._names = answered, moves, names
         self._output = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
         self._begin = node.add_client(BeginCycle, "thermal_node/begin_cycle")
         self._end = node.add_client(EndCycle, "thermal_node/end_cycle")
@@ -52,7 +59,10 @@ class MaintenanceDriver:
         number = request.number
         match request:
             case asked.Move(plan=plan) | asked.Stop(plan=plan):
-                self._output.publish(trajectory_message(plan, self._names))
+                message = trajectory_message(plan, self._names)
+                if isinstance(request, asked.Move):
+                    self._moves()
+                self._output.publish(message)
             case asked.BeginCycle(cycle_id=name):
                 self._call(self._begin, BeginCycle.Request(cycle_id=name), number, _status)
             case asked.EndCycle(cycle_id=name):

@@ -30,7 +30,7 @@ from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
 from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.requests import Answer, Move, Request
+from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
@@ -79,7 +79,8 @@ class MaintenanceNode(HouseNode):
         self._outputs = MaintenanceOutputs(
             self.add_output, self._nominal.name, self._serial_in_use, settings["base_frame"]
         )
-        self._driver = MaintenanceDriver(self, self._nominal.joint_names, self._answered)
+        names = self._nominal.joint_names
+        self._driver = MaintenanceDriver(self, names, self._answered, self._moves)
         self._calls = MaintenanceServices(
             self, self._running, self._clocks, self._outputs, settings["default_gap_s"]
         )
@@ -188,8 +189,10 @@ class MaintenanceNode(HouseNode):
         if self._driver is not None:
             for request in requests:
                 self._driver.carry_out(request)
-                if isinstance(request, Move) and self._session is not None:
-                    self._session.sent(self._steady.now_s())
+
+    def _moves(self) -> None:
+        if self._session is not None:
+            self._session.sent(self._steady.now_s())
 
     # ---- what goes out --------------------------------------------------------------------------
 

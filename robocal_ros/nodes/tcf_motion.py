@@ -176,8 +176,10 @@ class TcfMotion:
         return response
 
     def _send(self, plan: JointPlan) -> float:
-        self._output.publish(trajectory_message(plan, self._names))
-        return self._steady.now_s()
+        message = trajectory_message(plan, self._names)
+        sent_s = self._steady.now_s()  # not after it: a robot ahead of its plan is off it
+        self._output.publish(message)
+        return sent_s
 
     def _armed(self) -> str:
         words = f"armed: begin the measurement within {self._config.armed_s:g} s"

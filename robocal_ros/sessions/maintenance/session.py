@@ -87,7 +87,7 @@ class MaintenanceSession:
         self._hands.robot.slept(for_s)
 
     def sent(self, now_s: float) -> None:
-        """The motion that `tick` gave has gone out: its time begins then, not when planned."""
+        """The motion that `tick` gave goes out now: its time begins then, not when planned."""
         self._hands.robot.sent(now_s)
 
     def measured(self, stamp_s: float) -> None:
