@@ -103,7 +103,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
     ):
         try:
             yield client
-        except KeyboardInterrupt:
-            for worker in cluster.workers.values():  # the cluster would wait for their bags
+        except (KeyboardInterrupt, GeneratorExit):  # nobody wants the other bags any more
+            for worker in cluster.workers.values():  # the cluster would wait for theirs
                 os.kill(worker.pid, signal.SIGKILL)
             raise
