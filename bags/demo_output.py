@@ -80,7 +80,7 @@ def show(story: Story, page: Path, seconds: float, *, opened: bool) -> None:
         console.print(
             f"{gap.name}: {gap.used_s:.0f} of {gap.length_s:.0f} s; thermal "
             f"{Code(result.thermal_code).name}, tool found {Code(result.tool_found_code).name}, "
-            f"left {Code(result.tool_code).name}; "
+            f"then {Code(result.tool_code).name}; "
             f"came into force: {brought}"
         )
     near = page.relative_to(Path.cwd()) if page.is_relative_to(Path.cwd()) else page

@@ -1,6 +1,6 @@
 """A live shift at real time: six nodes of a cell as processes over DDS, driven by a PLC's calls.
 
-``tools/with_ros python -m bench.soak_shift --seconds 600`` for a look; an hour is the default.
+``tools/with_ros python -m bench.soak_shift --seconds 900`` for a look; an hour is the default.
 With ``--keep`` it writes docs/figures/soak_shift.md too. The cell is the demo's, simulated.
 """
 
@@ -27,6 +27,7 @@ from robocal_ros.core.codes import Code
 
 COLLISION_MM = 2.0
 EVERY_S = 300.0  # from the begin of a gap to the next one's
+LEAST_S = 3.0 * EVERY_S
 WARM = 2  # gaps until caches are full
 MOST_GROWTH_MB = 10.0
 LEAST_WITHIN = 0.95  # of the coordinates of the error, within 0.1 mm
@@ -35,11 +36,13 @@ RIGHT_AGAIN = 2  # gaps after a collision
 
 @dataclass(frozen=True)
 class Pass:
-    """What a pass of the programme was worth; how many gaps and collisions lay before it."""
+    """What a pass of the programme was worth; whether what was found in gaps was to make it right.
+
+    That is after the first gap, and after a collision from `RIGHT_AGAIN` gaps on.
+    """
 
     judged: Judged
-    gaps: int
-    bent: bool
+    in_force: bool
 
 
 class LiveShift:
@@ -50,7 +53,8 @@ class LiveShift:
         self.passes: list[Pass] = []
         self.gaps: list[Gap] = []
         self.memory_mb: list[dict[str, float]] = []
-        self.bent_after: int | None = None  # gaps before the collision
+        self._bent = False
+        self._right_from = 1  # so many gaps on
 
     def run(self, seconds: float) -> None:
         """All of it."""
@@ -65,26 +69,28 @@ class LiveShift:
 
     def _work_until(self, end_s: float, bends_s: float) -> None:
         while time.monotonic() < end_s:
-            self._produce(bends=self.bent_after is None and time.monotonic() >= bends_s)
+            self._produce(bends=not self._bent and time.monotonic() >= bends_s)
 
     def _produce(self, bends: bool) -> None:
         if bends:
-            self.bent_after = len(self.gaps)
+            self._bent, self._right_from = True, len(self.gaps) + RIGHT_AGAIN
         self._plc.produce(halfway=self._bend if bends else None)
-        bent = self.bent_after is not None
-        self.passes.append(Pass(self._judge.now(), len(self.gaps), bent))
+        self.passes.append(Pass(self._judge.now(), len(self.gaps) >= self._right_from))
 
     def _bend(self) -> None:
         set_fault(self._controller, "collision", COLLISION_MM)
 
-    def in_force(self) -> list[Pass]:
-        """Passes that must be right: after the first gap, and from two gaps after the collision."""
-        bent = np.inf if self.bent_after is None else self.bent_after
-        return [one for one in self.passes if one.gaps >= (bent + RIGHT_AGAIN if one.bent else 1)]
-
 
 def soak(seconds: float) -> Table:
-    """Let the cell live, replay what was recorded, and judge both."""
+    """Let the cell live, replay what was recorded, and judge both.
+
+    Raises
+    ------
+    ValueError
+        When it is too short for a gap before the collision, and two after it.
+    """
+    if seconds < LEAST_S:
+        raise ValueError(f"{seconds:g} s are too short: {LEAST_S:g} s or more")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recordings = folder / "recordings"
@@ -120,7 +126,7 @@ def _judged(shift: LiveShift, report: dict[str, Any], seconds: float) -> Table:
 
 
 def _add_errors(table: Table, shift: LiveShift) -> None:
-    judged = [one.judged for one in shift.in_force()]
+    judged = [one.judged for one in shift.passes if one.in_force]
     table.add("passes of the programme", len(shift.passes), None)
     table.add("of them in force", len(judged), None)
     for what, values in (

@@ -78,7 +78,7 @@ class Mover:
     @property
     def unheard(self) -> str:
         """Why nobody knows where the robot is, in words; empty where it is known."""
-        if not self.silent:
+        if self._q is not None and not self.silent:
             return ""
         silent_s = self._watch.silent_s
         return "joint states are " + (
