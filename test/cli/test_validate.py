@@ -359,6 +359,8 @@ class TestInParallel:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            # a test run in the background has it ignored
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         until(lambda: any((tmp_path / "report").glob("*.png")))  # two of forty are ready
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
