@@ -40,6 +40,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if here in item.path.parents:
             item.add_marker(pytest.mark.ros)
+            # other examples in a second try would hide what was found
+            if isinstance(item, pytest.Function) and hasattr(item.module, "given"):
+                item.add_marker(pytest.mark.flaky(reruns=0))
 
 
 class Executable:

@@ -3,6 +3,7 @@
 The builders accept any object with the attributes of the ROS message.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -188,7 +189,7 @@ def _rows(values: list[Any], k: int, what: str) -> Array | None:
 def _pose(translation: Any, rotation: Any, reason: Reason) -> Array:
     xyz = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
     quat = np.array([rotation.x, rotation.y, rotation.z, rotation.w], dtype=np.float64)
-    if not (np.all(np.isfinite(xyz)) and abs(float(np.linalg.norm(quat)) - 1.0) < 1e-3):
+    if not (np.all(np.isfinite(xyz)) and abs(math.hypot(*quat) - 1.0) < 1e-3):
         raise RefusedError(reason, f"translation {xyz.tolist()}, quaternion {quat.tolist()}")
     return frames.transform_from_quat(xyz, quat)
 
