@@ -144,3 +144,23 @@ def good_here_only() -> tuple[SerialArm, np.ndarray]:
         if bounds.hold(here).all() and there.tcp_shift_m > 1.05e-3:
             return arm, far
     pytest.fail("no such drift")
+
+
+def swing(m: int = 201, duration: float = 2.0) -> TrajectoryCommand:
+    """A move from rest to rest with its true rates."""
+    t = np.linspace(0.0, duration, m)
+    w = np.pi / duration
+    reach = np.array([0.4, -0.2, 0.3, -0.4, 0.3, 0.5])
+    shape = [0.5 * (1 - np.cos(w * t)), 0.5 * w * np.sin(w * t), 0.5 * w * w * np.cos(w * t)]
+    q, v, a = (x[:, None] * reach for x in shape)
+    return TrajectoryCommand(NAMES, HOME + q, t, v, a)
+
+
+def large() -> Robot:
+    """Enabled, with a drift and a bent tool, at rest at home, uncorrected: shifts of degrees."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.session.offer_tool(bent_tool())
+    robot.read(HOME)
+    robot.session.enable(True)
+    return robot

@@ -288,11 +288,6 @@ def test_a_burst_is_refused_before_it_is_looked_at(robot: Robot) -> None:
     robot.session.trajectory(line(0.1, m=10_000), robot.now)
 
 
-@pytest.fixture
-def robot() -> Robot:
-    return Robot()
-
-
 # ---- shadow --------------------------------------------------------------------------------------
 
 

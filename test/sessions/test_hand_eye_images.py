@@ -40,12 +40,6 @@ CORNERS = COLUMNS * ROWS
 PLAIN = np.full((LENS.height, LENS.width), 120, dtype=np.uint8)
 
 
-@pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
-
-
 def start_of(folder, intrinsics: bool = False) -> dict:
     target = read_target(board_file(folder, intrinsics))
     return SPHERE | {"target": target_document("camera", target)}

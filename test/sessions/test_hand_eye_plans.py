@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from hand_eye_driver import ARM, CENTRE, FRAME, Driver, sphere_set
+from hand_eye_driver import ARM, CENTRE, sphere_set
+from hand_eye_laser import driver_of
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, LimitError
 from robocal_ros.core.hand_eye.planning import SensorRange
 from robocal_ros.core.samples import JointSample
 from robocal_ros.sessions import events
-from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_planning import (
     MOST_POSES,
@@ -21,23 +21,11 @@ from robocal_ros.sessions.hand_eye_planning import (
     rough_mount,
     sphere_centre,
 )
-from robocal_ros.storage.calibrations import CalibrationHistory
 
 TRUTH = sphere_set()[0].T_flange_sensor
 GIVEN = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] + 2e-3)
 CONFIGURED = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] - 2e-3)
 QUAT = np.array([[0.0, 0.0, 0.0, 1.0]])
-
-
-@pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
-
-
-def driver_of(history, **changes) -> Driver:
-    config = HandEyeConfig(sensor_frame=FRAME, **changes)
-    return Driver(HandEyeSession(ARM, history, config, "test"))
 
 
 def test_the_request_wins_over_what_is_in_force_and_that_over_candidates(history):

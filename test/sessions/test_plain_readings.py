@@ -19,7 +19,6 @@ from robocal_ros.sessions.observations import JOINTS, JUMPS, POINT, ObservationD
 from robocal_ros.sessions.replay import replay
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_inputs import take_tool_message
-from robocal_ros.storage.calibrations import CalibrationHistory
 
 MS = 1_000_000
 NAMES = ("a", "b")
@@ -150,12 +149,6 @@ def test_a_desk_knows_the_same(samples, sizes, marks):
 @pytest.fixture(scope="module")
 def cell():
     return noisy_cell()
-
-
-@pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
 
 
 CELL_NAMES = tuple(noisy_cell().arm.joint_names)

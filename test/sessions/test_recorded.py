@@ -21,7 +21,6 @@ from robocal_ros.sessions.seeding import session_as_recorded
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.storage.calibrations import CalibrationHistory
 
 NS = 1_000_000_000
 KINDS = {
@@ -41,12 +40,6 @@ KINDS = {
         hand_eye_recorded.hand_eye_session_as_recorded,
     ),
 }
-
-
-@pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
 
 
 @pytest.mark.parametrize(

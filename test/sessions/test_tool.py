@@ -20,13 +20,6 @@ from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sim.beams import RoundTool, bent
-from robocal_ros.storage.calibrations import CalibrationHistory
-
-
-@pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
 
 
 def driver_of(history, tool=TRUTH, cell=None, **changes) -> Driver:

@@ -15,13 +15,6 @@ from robocal_ros.sessions.tool_driving import Phase
 from robocal_ros.sim.beams import bent
 from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.tool_cell import joints_at
-from robocal_ros.storage.calibrations import CalibrationHistory
-
-
-@pytest.fixture
-def history(tmp_path):
-    with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
-        yield opened
 
 
 @pytest.fixture

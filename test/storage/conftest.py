@@ -1,4 +1,17 @@
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
+
+from history_workers import SERIAL
+
+from robocal_ros.storage.calibrations import CalibrationHistory
+
+
+@pytest.fixture
+def history(tmp_path: Path) -> Iterator[CalibrationHistory]:
+    with CalibrationHistory.open(SERIAL, state_dir=tmp_path) as opened:
+        yield opened

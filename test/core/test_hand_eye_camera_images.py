@@ -1,0 +1,188 @@
+"""A camera from corners and from images of its board."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from camera_pairs import BOARD, LENS, error, sound
+from scipy.stats import chi2
+
+from robocal_ros.core.errors import (
+    InputError,
+    RankDeficientError,
+    TooFewSamplesError,
+)
+from robocal_ros.core.hand_eye.board import (
+    Chessboard,
+    Intrinsics,
+    boards_of_corners,
+    decode_image,
+    find_corners,
+    see_boards,
+)
+from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
+from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens
+
+
+def pixels(cell: BoardCell, count: int, seed: int, noise_px: float = 0.2):
+    rng = np.random.default_rng(seed)
+    views = cell.views(rng, count)
+    corners = np.array([LENS.corners(views.take(i), BOARD.points) for i in range(count)])
+    robot = cell.read_robot(cell.flange(views), rng)
+    return robot, corners + noise_px * rng.standard_normal(corners.shape)
+
+
+def true_intrinsics() -> Intrinsics:
+    K = np.array([[LENS.fx, 0.0, LENS.cx], [0.0, LENS.fy, LENS.cy], [0.0, 0.0, 1.0]])
+    return Intrinsics(K, np.array([LENS.k1, LENS.k2, 0.0, 0.0, 0.0]), (640, 480))
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_from_corners_the_covariance_holds(given: bool) -> None:
+    """Errors of intrinsics from the same images are common to all poses, and counted."""
+    cell = BoardCell(noise=BoardNoise(1e-4, 2e-4))
+    runs, total = 40, 0.0
+    for seed in range(runs):
+        robot, corners = pixels(cell, 12, 500 + seed)
+        names = [str(i) for i in range(12)]
+        camera = true_intrinsics() if given else None
+        seen = boards_of_corners(names, corners, BOARD, (640, 480), camera)
+        assert seen.noise_px == pytest.approx(0.2, rel=0.15)
+        pairs = PosePairs(
+            robot, seen.T_camera_board, seen.names, "in-hand", seen.covariance, seen.shared
+        )
+        fit = fit_pairs(pairs, GivenNoise(1e-4, 2e-4, camera_scale=1.0))
+        e = error(fit.at.X, cell.camera)
+        total += float(e @ np.linalg.solve(fit.covariance[:6, :6], e))
+    assert sound(total, 6 * runs)
+
+
+def test_intrinsics_and_their_sigma_from_corners() -> None:
+    truth = true_intrinsics()
+    _, corners = pixels(BoardCell(), 15, 20)
+    seen = boards_of_corners([str(i) for i in range(15)], corners, BOARD, (640, 480))
+    found = seen.intrinsics
+    assert found.covariance is not None
+    K, T = found.matrix, truth.matrix
+    e = np.array([K[0, 0] - T[0, 0], K[1, 1] - T[1, 1], K[0, 2] - T[0, 2], K[1, 2] - T[1, 2]])
+    e = np.concatenate([e, found.distortion - truth.distortion])
+    assert sound(float(e @ np.linalg.solve(found.covariance, e)), 9)
+
+
+def test_no_size_of_an_image_is_a_fault() -> None:
+    rng = np.random.default_rng(0)
+    sides = (1, 2, 3, 9, 16, 31, 32, 33, 100)
+    for shape in product(sides, sides):
+        assert find_corners(rng.integers(0, 256, shape, dtype=np.uint8), BOARD) is None
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_corners_that_are_none_are_refused(given: bool) -> None:
+    _, corners = pixels(BoardCell(), 12, 20)
+    names = [str(i) for i in range(12)]
+    wrong = {"in one place": 0.0 * corners, "nearly so": 1e-12 * corners}
+    wrong["in one line"] = corners * [1.0, 0.0]
+    camera = true_intrinsics() if given else None
+    for what, these in wrong.items():
+        try:
+            seen = boards_of_corners(names, these, BOARD, (640, 480), camera)
+        except (InputError, RankDeficientError):
+            continue
+        assert seen.noise_px > 1.0, what  # it is seen later, by what it misses
+        assert np.all(np.isfinite(seen.covariance))
+
+
+def test_intrinsics_come_again_to_the_last_bit() -> None:
+    import cv2
+
+    _, corners = pixels(BoardCell(), 12, 20)
+    names, threads = [str(i) for i in range(12)], cv2.getNumThreads()
+    first, *others = (boards_of_corners(names, corners, BOARD, (640, 480)) for _ in range(12))
+    for other in others:
+        assert np.array_equal(other.intrinsics.matrix, first.intrinsics.matrix)
+        assert np.array_equal(other.T_camera_board, first.T_camera_board)
+        assert np.array_equal(other.covariance, first.covariance)
+    assert cv2.getNumThreads() == threads
+
+
+def test_an_image_of_something_else_is_left_out() -> None:
+    _, corners = pixels(BoardCell(), 12, 21)
+    corners[4] += np.random.default_rng(0).standard_normal(corners[4].shape) * 3.0
+    seen = boards_of_corners([f"i{k}" for k in range(12)], corners, BOARD, (640, 480))
+    assert list(seen.rejected) == ["i4"]
+    assert "miss a flat board" in seen.rejected["i4"]
+    assert len(seen.names) == 11
+
+
+def test_boards_that_all_lie_flat_do_not_show_the_focal_length() -> None:
+    cell = BoardCell()
+    rng = np.random.default_rng(22)
+    views = cell.views(rng, 8, tilt_rad=0.005)
+    corners = np.array([LENS.corners(views.take(i), BOARD.points) for i in range(8)])
+    corners += 0.2 * rng.standard_normal(corners.shape)
+    with pytest.raises(RankDeficientError, match="tilt the board"):
+        boards_of_corners([str(i) for i in range(8)], corners, BOARD, (640, 480))
+
+
+@pytest.fixture(scope="module")
+def images():
+    cell = BoardCell(noise=BoardNoise(1e-4, 2e-4))
+    rng = np.random.default_rng(23)
+    views = cell.views(rng, 9)
+    named = [
+        (f"i{k}", LENS.image(views.take(k), BOARD.columns, BOARD.rows, BOARD.square_m))
+        for k in range(9)
+    ]
+    return cell, cell.read_robot(cell.flange(views), rng), views.matrices(), named
+
+
+def test_images_give_the_camera(images) -> None:
+    cell, robot, _, named = images
+    blank = np.full((480, 640), 90, dtype=np.uint8)
+    others = [("dark", blank), ("small", blank[:100])]
+    seen = see_boards([*named, *others], BOARD)
+    assert set(seen.rejected) == {"dark", "small"}
+    assert "no board of 9x6" in seen.rejected["dark"]
+    assert "640x480" in seen.rejected["small"]
+    assert len(seen.names) == 9
+    assert seen.noise_px < 0.1
+    pairs = PosePairs(
+        robot, seen.T_camera_board, seen.names, "in-hand", seen.covariance, seen.shared
+    )
+    found = calibrate_camera(pairs, CameraSettings(noise=GivenNoise(1e-4, 2e-4)))
+    assert found.covariance is not None
+    e = error(found.T_flange_sensor, cell.camera)
+    assert e @ np.linalg.solve(found.covariance, e) < chi2.ppf(0.9999, 6)
+
+
+def test_images_with_known_intrinsics_give_the_boards(images) -> None:
+    _, _, views, named = images
+    seen = see_boards(named[:4], BOARD, true_intrinsics())
+    assert seen.shared is None
+    away = np.linalg.norm((seen.T_camera_board - views[:4])[:, :3, 3], axis=1)
+    assert away.max() < 4.0 * np.sqrt(np.trace(seen.covariance[:, :3, :3], 0, 1, 2).max()) + 1e-4
+
+
+def test_images_without_a_board_are_too_few(images) -> None:
+    blank = np.full((480, 640), 90, dtype=np.uint8)
+    with pytest.raises(TooFewSamplesError, match=r"0 images show the board.*dark: no board"):
+        see_boards([("dark", blank)], BOARD)
+    with pytest.raises(TooFewSamplesError, match="or give the intrinsics"):
+        see_boards(images[3][:3], BOARD)
+
+
+def test_what_is_no_image_or_no_board_is_refused() -> None:
+    for data in (b"", b"nothing"):
+        with pytest.raises(InputError, match="no image"):
+            decode_image(data, "x.png")
+    with pytest.raises(InputError, match="shows no pose"):
+        Chessboard(9, 1, 0.025)
+
+
+def test_a_lens_that_cannot_be_undone_makes_no_image() -> None:
+    cell = BoardCell()
+    view = cell.views(np.random.default_rng(0), 1)
+    with pytest.raises(ValueError, match="cannot be undone"):
+        TrueLens(k1=-3.0).image(view, BOARD.columns, BOARD.rows, BOARD.square_m)

@@ -1,0 +1,52 @@
+"""A laser sensor on a robot, before targets of every kind, for the tests of its sessions."""
+
+import numpy as np
+from hand_eye_driver import (
+    ARM,
+    FRAME,
+    SPHERE,
+    Driver,
+    sphere_shots_of,
+)
+
+from robocal_ros.core import frames
+from robocal_ros.core.hand_eye.target_documents import target_document
+from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
+from robocal_ros.sessions import events
+from robocal_ros.sessions.hand_eye import HandEyeSession
+from robocal_ros.sessions.hand_eye_config import HandEyeConfig
+from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, groove_shots, step_shots
+
+SHOTS = list(sphere_shots_of(14))
+WARM = ARM.with_mdh(ARM.mdh * 1.0002)
+STAIRS = TrueStairs(frames.transform(frames.exp_rotation([0.02, -0.03, 0.4]), [0.75, -0.1, 0.1]))
+STEPS = Staircase(5, 0.09, 0.01, 0.01)
+STEP = StepTarget(STAIRS.T_base_user, STEPS.marked_corners(), STEPS.edge_user)
+# Of an edge or a groove nothing is known; the sensor sees 90 mm of depth.
+TARGETS = {
+    "edge": ({"target": {"kind": "line"}}, edge_shots, STAIRS.T_base_user, 12),
+    "groove": (
+        {"target": {"kind": "line"}, "feature": "groove"}, groove_shots, STAIRS.T_base_user, 12,
+    ),
+    "step": ({"target": target_document("step", STEP)}, step_shots, STAIRS, 8),
+}  # fmt: skip
+
+
+def driver_of(history, **changes) -> Driver:
+    config = HandEyeConfig(sensor_frame=FRAME, **changes)
+    return Driver(HandEyeSession(ARM, history, config, "test"))
+
+
+def begun(history, **changes) -> Driver:
+    """A robot at the first pose, with an open data set."""
+    driver = driver_of(history, **changes)
+    driver.robot.q = SHOTS[0][0]
+    driver.robot.rest(0.5)
+    assert driver.ask(events.START, **SPHERE).done
+    return driver
+
+
+def off_m(history, outcome, truth: np.ndarray, depth_m: float = 0.2) -> float:
+    """How far a point at the working distance is off."""
+    T = np.array(history.model(outcome.calibration_id)["T_parent_sensor"])
+    return float(np.linalg.norm(((T - truth) @ [0.0, 0.0, depth_m, 1.0])[:3]))

@@ -1,0 +1,269 @@
+"""A command begins where the robot stands, or not at all."""
+
+import numpy as np
+import pytest
+from correction_robot import (
+    DT,
+    HOME,
+    NAMES,
+    RATE,
+    ROUNDING,
+    Robot,
+    drifted,
+    large,
+    offer,
+    refused,
+    still,
+)
+
+from robocal_ros.sessions.correction import (
+    JointCommand,
+    Reason,
+    TrajectoryCommand,
+)
+
+FAR = np.radians(0.021)  # beyond the tolerance of 0.02 deg
+NEAR = np.radians(0.019)
+
+
+def moved(by: float, joint: int = 1) -> np.ndarray:
+    q = HOME.copy()
+    q[joint] += by
+    return q
+
+
+def test_nothing_goes_out_before_joint_states_have_arrived() -> None:
+    robot = Robot()
+    said = refused(Reason.STALE_JOINTS, robot.session.target, JointCommand(NAMES, HOME), 1.0)
+    assert "joint_a1" in said
+    refused(Reason.STALE_JOINTS, robot.session.trajectory, still(first_s=60.0), 1.0)
+    assert not robot.session.status().mismatch  # nothing is wrong: they will come
+    assert np.array_equal(robot.stream(), HOME)
+
+
+@pytest.mark.parametrize("on", [False, True])
+@pytest.mark.parametrize("joint", range(6))
+def test_the_first_target_is_where_the_robot_stands(on: bool, joint: int) -> None:
+    robot = Robot()
+    robot.session.enable(on)
+    robot.at = moved(NEAR, joint)
+    robot.stream()
+    robot = Robot()
+    robot.session.enable(on)
+    robot.at = moved(-FAR, joint)
+    assert NAMES[joint] in refused(Reason.START_MISMATCH, robot.stream)
+
+
+def test_after_a_mismatch_nothing_goes_out_until_it_is_enabled_again() -> None:
+    robot = large()
+    robot.at = moved(0.5)
+    refused(Reason.START_MISMATCH, robot.stream)
+    robot.at = HOME  # also where it would fit now
+    refused(Reason.START_MISMATCH, robot.stream)
+    refused(Reason.START_MISMATCH, robot.session.trajectory, still(), robot.now)
+    assert "joint_a2" in robot.session.status().mismatch
+    assert "enable" in robot.session.status().mismatch
+    stop = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
+    assert robot.session.trajectory(stop, robot.now) is stop
+    assert np.array_equal(robot.read(HOME).position, HOME)
+    robot.session.enable(True)
+    assert not robot.session.status().mismatch
+    assert np.array_equal(robot.stream(), HOME)
+    assert robot.session.status().refused[Reason.START_MISMATCH] == 3
+
+
+def test_a_trajectory_that_the_controller_rejected_is_not_believed() -> None:
+    """The robot stands at home all the time: what comes next begins there, uncorrected."""
+    robot = large()
+    first = robot.session.trajectory(still(), robot.now)
+    assert np.abs(first.position[-1] - HOME).max() > 10 * FAR
+    for _ in range(25):
+        robot.now += 1.0
+        robot.read(HOME)
+    for command in (still(first_s=0.01), still()):
+        out = robot.session.trajectory(command, robot.now)
+        first_s = command.time_from_start_s[0]
+        assert np.abs(out.position[0] - HOME).max() <= RATE * first_s + ROUNDING
+    assert np.allclose(robot.read(HOME).position, HOME, rtol=0.0, atol=1e-12)
+
+
+def test_a_trajectory_goes_on_from_the_correction_of_the_one_before() -> None:
+    robot = large()
+    first = robot.session.trajectory(still(), robot.now)
+    robot.now += 25.0
+    robot.read(first.position[-1])
+    for first_s in (0.0, 0.01):
+        out = robot.session.trajectory(still(first_s=first_s), robot.now)
+        assert np.allclose(out.position, first.position[-1], rtol=0.0, atol=1e-12)
+
+
+def test_a_trajectory_from_nowhere_is_refused_unless_it_takes_its_time() -> None:
+    """The robot was moved by hand: nobody knows what correction it shows."""
+    for first_s, fine in ((0.0, False), (0.05, False), (20.0, True)):
+        robot = large()
+        first = robot.session.trajectory(still(), robot.now)
+        robot.now += 25.0
+        robot.read(first.position[-1] + 0.3)
+        command = still(first_s=first_s)
+        if fine:
+            robot.session.trajectory(command, robot.now)
+        else:
+            refused(Reason.START_MISMATCH, robot.session.trajectory, command, robot.now)
+            assert robot.session.status().mismatch
+
+
+def straight(seconds: float = 4.0) -> TrajectoryCommand:
+    """Half a radian in each joint; 25 ms of it are beyond the tolerance."""
+    return TrajectoryCommand(NAMES, np.stack([HOME, HOME + 0.5]), np.array([0.0, seconds]))
+
+
+def test_a_robot_that_moves_under_a_trajectory_is_taken_to_follow_it() -> None:
+    """Between far points its controller goes another way than straight."""
+    robot = large()
+    at = robot.settle()
+    robot.session.trajectory(straight(), robot.now)
+    for t in np.arange(0.0, 1.0, 0.05):
+        robot.now += 0.05
+        robot.read(at + 0.02 + 0.05 * t)
+    out = robot.session.trajectory(still(HOME + 0.3, first_s=0.05), robot.now)
+    assert np.abs(out.position[0] - HOME - 0.3).max() > 10 * FAR
+
+
+def test_single_points_in_quick_succession_may_be_ahead_of_the_robot() -> None:
+    robot = large()
+    at = robot.settle()
+    for _ in range(150):  # long enough to be seen at rest
+        robot.stream()
+    for k in range(1, 4):
+        step = TrajectoryCommand(NAMES, HOME[None] + 0.005 * k, np.array([0.034]))
+        robot.session.trajectory(step, robot.now)
+        robot.now += 0.034 if k < 2 else 0.02
+        robot.read(at)
+
+
+def test_a_stopped_robot_goes_on_from_where_it_stopped() -> None:
+    robot = large()
+    robot.settle()
+    path = robot.session.trajectory(straight(), robot.now)
+    robot.now += 1.0
+    empty = TrajectoryCommand(NAMES, np.empty((0, 6)), np.empty(0))
+    robot.session.trajectory(empty, robot.now)
+    robot.now += 5.0
+    stands = path.position[0] + (path.position[1] - path.position[0]) * 1.1 / 4.0
+    robot.read(stands)
+    out = robot.session.trajectory(still(HOME + 0.15, first_s=0.05), robot.now)
+    assert np.abs(out.position[0] - HOME - 0.15).max() > 10 * FAR
+
+
+def test_a_restart_while_corrected_goes_on_where_the_robot_stands() -> None:
+    robot = large()
+    at = robot.settle()
+    assert np.abs(at - HOME).max() > 10 * FAR
+    for on in (False, True):
+        new = large()
+        new.session.enable(on)
+        new.at = at
+        assert np.abs(new.stream() - at).max() <= ROUNDING
+        last = at
+        for _ in range(2000):
+            assert np.abs(new.stream() - last).max() <= RATE * DT + ROUNDING
+            last = new.at
+        assert np.allclose(new.settle(), at if on else HOME, rtol=0.0, atol=ROUNDING)
+
+
+def test_a_restart_that_does_not_know_the_model_yet_waits() -> None:
+    at = large().settle()
+    new = Robot()
+    new.at = at
+    refused(Reason.START_MISMATCH, new.stream)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 3600.0])
+def test_after_a_pause_a_stream_begins_where_the_robot_stands(seconds: float) -> None:
+    robot = large()
+    at = robot.settle()
+    assert np.array_equal(robot.stream(dt=seconds), at)
+    robot.at = moved(0.5)
+    refused(Reason.START_MISMATCH, robot.stream, dt=seconds)
+
+
+def test_after_a_pause_at_the_uncorrected_target_the_correction_blends_in_again() -> None:
+    robot = large()
+    at = robot.settle()
+    robot.at = HOME
+    assert np.array_equal(robot.stream(dt=1.0), HOME)
+    assert np.abs(robot.stream() - HOME).max() <= RATE * DT + ROUNDING
+    assert np.allclose(robot.settle(), at, rtol=0.0, atol=ROUNDING)
+
+
+def test_between_two_messages_the_robot_may_be_anywhere(warm: Robot) -> None:
+    """A robot lags behind a stream that moves; that is no reason to stop it."""
+    at = warm.at
+    for t in np.arange(0.0, 0.5, DT):
+        warm.at = at
+        warm.stream(HOME + 2.0 * t)
+
+
+def test_a_robot_that_moves_may_lag_after_a_short_pause(warm: Robot) -> None:
+    shift = warm.stream() - HOME
+    for t in np.arange(0.0, 0.5, DT):
+        out = warm.stream(HOME + t)
+        warm.at = HOME + shift + max(0.0, t - 0.05)  # 50 ms behind
+    warm.now += 0.11
+    warm.read(out - 0.01)
+    resumed = warm.session.target(JointCommand(NAMES, HOME + 0.5), warm.now)
+    assert np.abs(resumed.position - out).max() < 5e-3
+
+
+def test_an_off_node_that_has_begun_is_transparent() -> None:
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.stream()
+    far = moved(0.7)
+    assert np.array_equal(robot.stream(far, dt=10.0), far)
+    command = still(moved(-0.4))
+    assert robot.session.trajectory(command, robot.now) is command
+
+
+def test_a_part_of_the_joints_does_not_tell_that_the_others_are_uncorrected() -> None:
+    """One joint is hardly shifted: where it stands says nothing about the rest."""
+    robot = large()
+    at = robot.settle()
+    joint = int(np.argmin(np.abs(at - HOME)))
+    assert abs(at[joint] - HOME[joint]) < NEAR < np.abs(at - HOME).max()
+    name, taught = (NAMES[joint],), HOME[[joint]]
+    robot.at = at.copy()
+    robot.at[joint] = HOME[joint]  # as if it were uncorrected: within the tolerance of both
+    part = TrajectoryCommand(name, np.tile(taught, (3, 1)), np.array([0.0, 0.5, 1.0]))
+    robot.now += 1.0
+    robot.read(robot.at)
+    robot.session.target(JointCommand(name, taught), robot.now)
+    assert np.abs(robot.stream() - at).max() <= ROUNDING
+    robot.session.trajectory(part, robot.now)
+    robot.now += 2.0
+    robot.at[joint] = HOME[joint]
+    robot.read(robot.at)
+    out = robot.session.trajectory(still(first_s=0.01), robot.now)
+    assert np.allclose(out.position, at, rtol=0.0, atol=1e-12)
+
+
+def test_old_readings_do_not_tell_where_the_robot_is(warm: Robot) -> None:
+    at = warm.stream()
+    command = JointCommand(NAMES, HOME)
+    warm.now += 0.3
+    said = refused(Reason.STALE_JOINTS, warm.session.target, command, warm.now)
+    assert "0.300 s" in said
+    warm.session.reading(JointCommand(NAMES, at), warm.now, 0.25)  # late on the way
+    refused(Reason.STALE_JOINTS, warm.session.target, command, warm.now)
+    warm.read(at)
+    assert np.array_equal(warm.session.target(command, warm.now).position, at)
+
+
+def test_a_part_of_the_joints_is_not_completed_from_old_readings(warm: Robot) -> None:
+    warm.stream()
+    part = JointCommand(NAMES[:2], HOME[:2])
+    warm.session.target(part, warm.now)
+    warm.now += 0.25
+    said = refused(Reason.STALE_JOINTS, warm.session.target, part, warm.now)
+    assert "joint_a3" in said
+    assert "0.2 s" in said
