@@ -9,13 +9,16 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.cell import MotionCell
 from robocal_ros.core.motion.measuring import start_near
 from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.sessions.driving_config import DrivingConfig
 from robocal_ros.sessions.silence import Silence
 
 Array = NDArray[np.float64]
 
 VELOCITY_S = 0.03  # span of the readings that give a velocity
+LEAST = 5  # of them: one wild reading is outvoted
 REST_RAD = 1e-4  # a robot that rests moves less
 BACK_S = 1.0  # stamps that go back by more began anew
+FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 APART_S = 0.00375  # instants of the plan that a reading is compared with
 
 
@@ -24,15 +27,16 @@ class RobotWatch:
 
     Parameters
     ----------
-    late_s : the robot lags at most so far behind its plan.
+    driving : how far the robot may lag behind its plan, and how fast its joints are.
 
     Attributes
     ----------
     silence : how long no new reading came.
     """
 
-    def __init__(self, arm: SerialArm, late_s: float) -> None:
-        self._arm, self._late_s = arm, late_s
+    def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
+        self._arm, self._late_s = arm, driving.late_s
+        self._fastest = driving.limits.of_joints(arm)[0]
         self.silence = Silence()
         self._heard_s = self._sent_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
@@ -45,7 +49,7 @@ class RobotWatch:
             if stamp_s > self._readings[-1][0] - BACK_S:
                 return  # a clock that stands still is heard as silence
             self._readings.clear()
-        self._readings.append((stamp_s, q))
+        self._readings.append((stamp_s, np.clip(q, -FARTHEST, FARTHEST)))
         self._heard_s = now_s
         self.silence.heard(now_s)
 
@@ -123,15 +127,21 @@ class RobotWatch:
         """Joints and velocities (n,) to stop from: the plan's, where the robot keeps to it.
 
         Readings lag behind what the controller commands; a stop from there would throw it back.
+        One that does not keep to its plan is where most of its last readings have it (Theil-Sen:
+        the medians of the slopes of all pairs, and of where each reading puts it): a stop from a
+        single wild reading would be a motion of its own.
         """
-        q = self._readings[-1][1]
         if self._plan is not None and keeps:
             return self._plan.at(self.driven_s(now_s))
-        recent = self._since(VELOCITY_S)
-        if recent is None:
-            return q, np.zeros_like(q)
-        (first_s, first), (last_s, last) = recent[0], recent[-1]
-        return q, (last - first) / (last_s - first_s)
+        within = self._since(VELOCITY_S) or ()
+        recent = list(self._readings)[-max(len(within), LEAST) :]
+        times, q = np.array([at_s for at_s, _ in recent]), np.array([q for _, q in recent])
+        velocity = np.zeros(q.shape[1])
+        if within:
+            i, j = np.triu_indices(len(times), 1)
+            slopes = (q[j] - q[i]) / (times[j] - times[i])[:, None]
+            velocity = np.clip(np.median(slopes, axis=0), -self._fastest, self._fastest)
+        return np.median(q + (times[-1] - times)[:, None] * velocity, axis=0), velocity
 
     def tells_speed(self, within_s: float) -> bool:
         """Whether the readings that give a velocity span no more than this."""

@@ -77,7 +77,7 @@ class ToolDriver:
         self._send, self._ask, self._closed = send, ask, closed
         self.phase, self.armed, self.told = Phase.IDLE, False, ""
         self._armed_at_s = 0.0
-        self._robot = RobotWatch(session.nominal, config.late_s)
+        self._robot = RobotWatch(session.nominal, config)
         self._cell: MotionCell | None = None
         self._beams: Counter[bool] = Counter()
         self._kind = ""  # of the last step that was driven

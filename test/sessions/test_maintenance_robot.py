@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from maintenance_cell import (
     ARM,
+    DRIVING,
     HOME,
+    LAG_S,
     LONG_S,
     POSES,
     SILENT,
+    TICK_S,
     Cell,
     config_of,
     kinds,
@@ -20,7 +23,10 @@ from maintenance_cell import (
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError, StorageError
+from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.maintenance import State
+from robocal_ros.sessions.maintenance.hands import Hands
+from robocal_ros.sessions.maintenance.ways import Ways
 from robocal_ros.sim.joint_motion import JointMotion
 
 
@@ -62,6 +68,19 @@ def test_a_robot_off_its_plan_is_stopped(cell):
     until_moving(cell, "thermal")
     cell.offset[1] = np.radians(2.0)
     cell.pass_time(1.0)
+    over(cell, fault=True)
+    assert "away from its plan" in cell.session.status(cell.now_s).fault
+
+
+def test_one_wild_reading_is_no_motion(cell):
+    until_moving(cell, "thermal")
+    cell.offset[1] = 1.0
+    cell.step()
+    cell.offset[1] = 0.0
+    q = cell.q.copy()
+    cell.pass_time(1.0)
+    longest_s = TICK_S + LAG_S + SHORTEST_STOP_S
+    assert np.max(np.abs(cell.q - q)) < DRIVING.limits.joint_velocity * longest_s
     over(cell, fault=True)
     assert "away from its plan" in cell.session.status(cell.now_s).fault
 
@@ -224,6 +243,18 @@ def test_a_robot_that_has_not_come_to_rest_is_not_handed_over(history):
     assert "not handed over at home" in cell.session.status(cell.now_s).fault
     over(cell, fault=True)
     cell.session.acknowledge("me")
+
+
+@pytest.mark.parametrize("left_s", [0.05, 5.0])
+def test_the_rest_of_the_way_home_is_driven_where_it_fits(left_s):
+    config = config_of(home_near=np.radians(2.0))
+    hands = Hands(config, Ways(ARM, config))
+    hands.begin(left_s)
+    hands.left_home = True
+    for now_s in np.arange(0.0, 0.5, TICK_S):
+        hands.robot.reading(now_s, HOME + np.radians(1.0), now_s)
+    assert next(hands.go_home(), "over") == (None if left_s > 1.0 else "over")
+    assert [type(request).__name__ for request in hands.out] == ["Move"] * (left_s > 1.0)
 
 
 def test_a_fault_ends_after_the_joints_clock_began_anew(cell):

@@ -163,6 +163,21 @@ def test_a_deviation_from_the_plan_stops_it(robot):
     stopped(robot, "deg away from its plan", follows=False)  # its readings are not where it is
 
 
+@pytest.mark.parametrize("wild_rad", [0.05, -1.0, 1e307])
+def test_one_wild_reading_stops_it_where_it_is(robot, wild_rad):
+    driving(robot, Phase.MEASURE)
+    robot.offset[4] = wild_rad
+    robot.step()
+    robot.offset[4] = 0.0
+    q = robot.q.copy()
+    at_s, plan = robot.sent[-1]
+    assert at_s == robot.now_s
+    assert np.max(np.abs(plan.q[0] - q)) <= MotionLimits().joint_velocity * PERIOD_S
+    robot.run(0.5)
+    stopped(robot, "away from its plan", follows=False)  # the readings lag behind the plan
+    assert np.max(np.abs(robot.q - q)) <= 0.5 * MotionLimits().joint_velocity * 0.12
+
+
 def test_a_cancel_stops_it(robot):
     driving(robot, Phase.MEASURE)
     robot.ask(Command("break_off", {"reason": "cancelled"}))

@@ -85,7 +85,10 @@ class Conductor:
         """
         self._close_script()
         hands, run = self._hands, self.run
-        hands.halt(at_once)
+        try:
+            hands.halt(at_once)
+        except Exception as error:  # without a stop of ours it must still be disarmed, and told
+            reason = f"{reason}; no stop was sent: {_defect(error)}"
         if hands.tool.engaged:
             hands.disengage()
         self.run, hands.doing = None, "fault"

@@ -229,7 +229,8 @@ class Hands(Asking):
             When there is no way, or it does not fit any more.
         """
         robot = self.robot
-        if not robot.beside_home():
+        near = not robot.beside_home()
+        if near:
             robot.place = (HOME, HOME)
             if not self.left_home:
                 return
@@ -242,6 +243,8 @@ class Hands(Asking):
         except LimitError as error:
             raise FaultError(error.code, f"no way home: {error}") from error
         duration_s, left_s = route.plan.duration_s, self.gap.left_s(self.now_s)
+        if duration_s >= left_s and near:
+            return  # the next run begins from here
         if duration_s >= left_s:
             words = f"the way home takes {duration_s:.1f} s, {max(left_s, 0.0):.1f} s are left"
             raise FaultError(Code.LIMIT_EXCEEDED, words)

@@ -36,7 +36,7 @@ class Mover:
         self._config, self._ways = config, ways
         self._arm = ways.cell.arm
         driving = config.driving
-        self._watch = RobotWatch(self._arm, driving.late_s)
+        self._watch = RobotWatch(self._arm, driving)
         fastest = driving.limits.of_joints(self._arm)[0]
         self.stops_within_s = driving.late_s + float(stop_time(self._arm, driving.limits, fastest))
         self._q: Array | None = None

@@ -1,0 +1,76 @@
+"""Where a robot is stopped from: its plan, or what most of its readings tell."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robocal_ros.core.motion.housing import Housing
+from robocal_ros.core.motion.limits import MotionLimits
+from robocal_ros.core.motion.stopping import SHORTEST_STOP_S, stop
+from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.sessions.robot_watch import LEAST, RobotWatch
+from robocal_ros.storage.robots import load_robot
+
+ARM = load_robot("kr150_r3100")
+LIMITS = MotionLimits()
+DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=LIMITS)
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+FASTEST = LIMITS.of_joints(ARM)[0]
+# of a robot's joint states: 1 kHz to 25 Hz
+PERIODS_S = (0.001, 0.002, 0.004, 0.008, 0.02, 0.04)
+
+
+def seen(times_s: np.ndarray, q: np.ndarray) -> RobotWatch:
+    watch = RobotWatch(ARM, DRIVING)
+    for at_s, joints in zip(times_s, q, strict=True):
+        watch.reading(at_s, joints, at_s)
+    return watch
+
+
+def steady(period_s: float, velocity: np.ndarray, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    times = 10.0 + period_s * np.arange(count)
+    return times, HOME + np.outer(times - times[-1], velocity)
+
+
+@given(
+    period_s=st.sampled_from(PERIODS_S),
+    share=st.floats(-1.0, 1.0),
+    ago=st.integers(0, 59),
+    joint=st.integers(0, 5),
+    wild=st.floats(allow_nan=False, allow_infinity=False),
+)
+def test_one_wild_reading_changes_nothing(
+    period_s: float, share: float, ago: int, joint: int, wild: float
+) -> None:
+    times, q = steady(period_s, share * FASTEST)
+    q[-1 - ago, joint] = wild
+    found, velocity = seen(times, q).state(times[-1], keeps=False)
+    assert np.allclose(found, HOME, rtol=0.0, atol=1e-9)
+    assert np.allclose(velocity, share * FASTEST, rtol=0.0, atol=1e-9)
+
+
+@given(
+    wild=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=6, max_size=6),
+    count=st.integers(1, 60),
+)
+def test_however_many_are_wild_the_stop_is_as_short_as_one_of_its_own(
+    wild: list[float], count: int
+) -> None:
+    times, q = steady(0.008, 0.3 * FASTEST)
+    q[-count:] = wild
+    found, velocity = seen(times, q).state(times[-1], keeps=False)
+    assert np.all(np.isfinite(found))
+    assert np.all(np.abs(velocity) <= FASTEST)
+    plan = stop(ARM, LIMITS, found, velocity)
+    longest_s = max(SHORTEST_STOP_S, float(np.max(FASTEST / LIMITS.of_joints(ARM)[2])))
+    reach = np.abs(plan.q[-1] - plan.q[0])
+    assert np.all(reach <= 0.5 * longest_s * FASTEST + 1e-6 * np.abs(found))
+
+
+@pytest.mark.parametrize("count", [1, 2, LEAST - 1])
+def test_too_few_readings_tell_no_speed(count: int) -> None:
+    times, q = steady(0.004, FASTEST, count)
+    found, velocity = seen(times, q).state(times[-1], keeps=False)
+    assert np.array_equal(found, np.median(q, axis=0))
+    assert not velocity.any()
