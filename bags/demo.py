@@ -57,7 +57,7 @@ class Demo:
 
     def _collide(self) -> None:
         self._judged("after gap 1: drift measured")
-        set_fault(self._controller, "collision", COLLISION_MM)
+        set_fault(self._controller.call, "collision", COLLISION_MM)
 
     def _judged(self, words: str) -> None:
         found = self._judge.now()

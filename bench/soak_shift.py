@@ -78,7 +78,7 @@ class LiveShift:
         self.passes.append(Pass(self._judge.now(), len(self.gaps) >= self._right_from))
 
     def _bend(self) -> None:
-        set_fault(self._controller, "collision", COLLISION_MM)
+        set_fault(self._controller.call, "collision", COLLISION_MM)
 
 
 def soak(seconds: float) -> Table:

@@ -7,9 +7,10 @@ the healthy tool measured. It is left in a state folder, as the nodes would leav
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
@@ -17,7 +18,7 @@ from rcl_interfaces.srv import SetParameters
 from bench.closed_loop import setting
 from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
-from bench.live.graph import CellController, LiveError
+from bench.live.graph import LiveError
 from bench.startup import ROOT
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_faults import Fault
@@ -99,8 +100,8 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")  # which is YAML too
 
 
-def set_fault(controller: CellController, fault: Fault, size: float = 0.0) -> None:
-    """Let something go wrong, see `SimulatedCell.set_fault`.
+def set_fault(call: Callable[..., Any], fault: Fault, size: float = 0.0) -> None:
+    """Let something go wrong, see `SimulatedCell.set_fault`; ``call`` calls a service.
 
     Raises
     ------
@@ -110,7 +111,7 @@ def set_fault(controller: CellController, fault: Fault, size: float = 0.0) -> No
     amount = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=size)
     name = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=fault)
     parameters = [Parameter(name="fault_size", value=amount), Parameter(name="fault", value=name)]
-    answer = controller.call(SetParameters, "/cell_sim_node/set_parameters", parameters=parameters)
+    answer = call(SetParameters, "/cell_sim_node/set_parameters", parameters=parameters)
     if not all(result.successful for result in answer.results):
         raise LiveError(f"no {fault}: {answer.results}")
 

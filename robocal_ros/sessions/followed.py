@@ -21,7 +21,7 @@ class Followed:
     def __init__(self, history: History, kind: str) -> None:
         self._history, self._kind = history, kind
         self._version = history.data_version()
-        decided = history.decisions()
+        decided = history.decisions(newest=1)
         self._seen = decided[-1].seq if decided else 0
         self.fault = ""
         self._read()

@@ -42,8 +42,8 @@ class History(Protocol):
     def pending(self, kind: str = ..., limit: int = ...) -> Sequence[Entry]:
         """Candidates that wait for a decision, newest first; ``limit``: so many at the most."""
 
-    def decisions(self, after_seq: int = ...) -> Sequence[Decision]:
-        """Decisions after a sequence number, oldest first."""
+    def decisions(self, after_seq: int = ..., newest: int = ...) -> Sequence[Decision]:
+        """Decisions after a sequence number, oldest first; ``newest``: so many at the most."""
 
     def list(self, limit: int = ...) -> Sequence[Entry]:
         """The latest calibrations, newest first."""

@@ -188,10 +188,13 @@ class HistoryReader:
             rows = read_candidates(connection, _PENDING, kind, revision, Code.ACCEPT, limit)
             return tuple(self._entry(*row) for row in rows)
 
-    def decisions(self, after_seq: int = 0) -> tuple[Decision, ...]:
-        """Decisions of every kind after a sequence number, oldest first."""
+    def decisions(self, after_seq: int = 0, newest: int = -1) -> tuple[Decision, ...]:
+        """Decisions of every kind after a sequence number, oldest first.
+
+        ``newest``: the latest so many at the most, at a cost that does not grow with the history.
+        """
         with self._reading() as connection:
-            return tuple(read_decisions(connection, after_seq))
+            return read_decisions(connection, after_seq, newest)
 
     def corrections(self, limit: int = 50) -> tuple[CorrectionRecord, ...]:
         """What the robot's commands were corrected with, newest first."""

@@ -79,11 +79,15 @@ def insert_decision(connection: sqlite3.Connection, decision: Decision) -> None:
     )
 
 
-def read_decisions(connection: sqlite3.Connection, after_seq: int) -> Iterator[Decision]:
-    """Decisions after a sequence number, oldest first."""
-    rows = connection.execute("SELECT * FROM decisions WHERE seq > ? ORDER BY seq", (after_seq,))
-    for seq, kind, action, *rest in rows:
-        yield Decision(seq, kind, Action(action), *rest)
+def read_decisions(
+    connection: sqlite3.Connection, after_seq: int, newest: int = -1
+) -> tuple[Decision, ...]:
+    """Decisions after a sequence number, oldest first; the latest ``newest``, -1: all."""
+    latest_first = "SELECT * FROM decisions WHERE seq > ? ORDER BY seq DESC LIMIT ?"
+    rows = connection.execute(latest_first, (after_seq, newest)).fetchall()
+    return tuple(
+        Decision(seq, kind, Action(action), *rest) for seq, kind, action, *rest in reversed(rows)
+    )
 
 
 def read_candidates(

@@ -37,7 +37,7 @@ def test_what_was_knocked_is_told_in_the_next_gap(
             codes = {}
             for fault in KNOCKS:
                 assert told(plc, f"before {fault}") in WELL
-                set_fault(controller, fault)
+                set_fault(controller.call, fault)
                 codes[fault] = told(plc, fault)
-                set_fault(controller, "none")
+                set_fault(controller.call, "none")
     assert codes == dict.fromkeys(KNOCKS, Code.SENSOR_OR_ROBOT_MOVED)

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from maintenance_live import HOME_DEG, LiveCell
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from robocal_msgs.msg import MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, GetMaintenance, RunMaintenanceCycle
 from std_srvs.srv import SetBool, Trigger
 
 from bench.closed_loop.faults import RIGHT
+from bench.live.cell import set_fault
 from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import Fault
 
@@ -62,15 +61,6 @@ class FaultCell:
 
         self.graph.spin_until(asked, what, WITHIN_S)
 
-    def set_fault(self, fault: str) -> None:
-        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=fault)
-        told = self.graph.call(
-            SetParameters,
-            "/cell_sim_node/set_parameters",
-            parameters=[Parameter(name="fault", value=value)],
-        )
-        assert told.results[0].successful, told
-
     def status(self, cycle_id: str = "") -> Any:
         return self.graph.call(GetMaintenance, "/maintenance_node/status", cycle_id=cycle_id)
 
@@ -85,13 +75,13 @@ class FaultCell:
 
     def tried(self, fault: Fault) -> tuple[Code, str]:
         """The code of one gap with a fault, of whoever must tell it, and how the gap ended."""
-        self.set_fault(fault)
+        set_fault(self.graph.call, fault)
         ended = self.gap(f"gap with {fault}")
         state, result = ended.state, ended.result
         code = Code(state.fault_code or result.tool_found_code)
         faulty = state.state == MaintenanceStatus.FAULT
         end = "fault" if faulty else "at home" * self.cell.at_home()
-        self.set_fault("none")
+        set_fault(self.graph.call, "none")
         self.graph.spin_for(AHEAD_S)
         if faulty:
             self.drive_home()

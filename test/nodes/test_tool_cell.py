@@ -10,8 +10,6 @@ from command import robocal_json
 from geometry_msgs.msg import TransformStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import Parameter, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import ToolStep
@@ -19,6 +17,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
+from bench.live.cell import set_fault
 from robocal_ros.core.codes import Code
 from robocal_ros.core.motion.limits import MotionLimits
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
@@ -127,11 +126,6 @@ def test_the_node_drives_a_whole_run_and_a_quick_check(graph: Any, tmp_path: Pat
     assert quick.answer == MeasureTool.Result.PASS, quick.message
 
 
-def set_fault(graph: Any, fault: str) -> None:
-    told = Parameter(name="fault", value=ParameterValue(type=4, string_value=fault))
-    graph.call(SetParameters, "/cell_sim_node/set_parameters", parameters=[told])
-
-
 def rest_after(cell: Cell, stop: JointTrajectory) -> float:
     """Seconds of joint stamps from the stop's last motion back to its first."""
     position = np.array([m.position for m in cell.joints])
@@ -148,7 +142,7 @@ def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: st
     ended = handle.get_result_async()
     if how == "silent":  # with the next motion
         graph.spin_until(lambda: len(cell.sent) == 1, "the way to it", within_s=RUN_S)
-        set_fault(graph, "joints_silent")
+        set_fault(graph.call, "joints_silent")
     graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=RUN_S)
     graph.spin_for(0.6 if how != "silent" else 0.0)  # in the middle of it
     before = len(cell.joints)
@@ -195,17 +189,17 @@ FAULTS = {
 def test_faults_of_the_moving_cell_are_refused_in_their_words(graph: Any, tmp_path: Path) -> None:
     cell = Cell(graph, tmp_path, "program")
     for fault, words in FAULTS.items():
-        set_fault(graph, fault)
+        set_fault(graph.call, fault)
         result = cell.measure()
         assert not result.success, fault
         assert words in result.message, fault
         graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
         graph.spin_for(2.5)  # the program drives its motion to the end
-    set_fault(graph, "none")
+    set_fault(graph.call, "none")
     graph.spin_for(1.0)
     ended = cell.begin(MeasureTool.Goal.FULL).get_result_async()
     graph.spin_until(lambda: cell.steps[-1].name == "high", "a circle", within_s=RUN_S)
-    set_fault(graph, "moved_by_hand")
+    set_fault(graph.call, "moved_by_hand")
     graph.spin_until(ended.done, "the result", within_s=RUN_S)
     assert ended.result().result.status == Code.RESIDUAL_TOO_LARGE
     assert "apart from the other steps" in ended.result().result.message

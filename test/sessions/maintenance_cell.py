@@ -155,8 +155,7 @@ class Cell:
         self.restart()
 
     def restart(self) -> None:
-        """Another session on the same shelf; what the one before asked for is nobody's answer."""
-        self.due.clear()
+        """Another session on the same shelf; answers to the one before may still come."""
         self.tool.measuring *= -1
         self.session = MaintenanceSession(ARM, self.history, self.config, self.shelf, self._event)
 

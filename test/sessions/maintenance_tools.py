@@ -15,6 +15,7 @@ from maintenance_cell import (
 )
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.sessions.maintenance import requests as ask
@@ -53,6 +54,13 @@ def measured_in_full(cell: Cell, **given: Any) -> int:
     number = proposed(cell.history, **given)
     cell.full = lambda cell: new_tool(number)
     return number
+
+
+def until_verified(cell: Cell) -> None:
+    """Until the accepted tool is checked."""
+    while not (cell.history.head(TOOL).revision and cell.tool.measuring):
+        cell.step()
+        assert cell.now_s < cell.ends_s
 
 
 def thermal_candidate(cell: Cell) -> int:

@@ -100,6 +100,14 @@ class TestDecisions:
         assert (decision.action, decision.by, decision.reason) == (Action.ACCEPT, "Ada", "tested")
         assert (decision.head_before, decision.head_after) == (0, 1)
 
+    def test_the_newest_decisions_are_read_alone(self, history: CalibrationHistory) -> None:
+        for revision in range(4):
+            history.accept(history.propose(proposal(based_on=revision)), **BY)
+        made = history.decisions()
+        assert [d.seq for d in made] == [1, 2, 3, 4]
+        assert history.decisions(newest=2) == made[2:]
+        assert history.decisions(3, newest=2) == made[3:]
+
     def test_the_newest_is_found_as_soon_however_many_were_refused(
         self, history: CalibrationHistory
     ) -> None:

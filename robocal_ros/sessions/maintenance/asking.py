@@ -4,6 +4,7 @@ A script is a generator: it yields whenever it has to wait, and is resumed at th
 """
 
 from collections.abc import Callable, Generator
+from itertools import count
 from typing import Any, TypeVar
 
 from robocal_ros.core.errors import ConflictError
@@ -26,10 +27,12 @@ class Asking:
     out : requests that wait to be carried out.
     """
 
+    # of all in a process: a late answer to one that is gone is not taken for another's
+    _numbers = count(1)
+
     def __init__(self) -> None:
         self.now_s = 0.0
         self.out: list[Request] = []
-        self._numbers = 0
         self._waiting: dict[int, Answer | None] = {}
 
     def handed_out(self) -> list[Request]:
@@ -39,9 +42,9 @@ class Asking:
 
     def request(self, kind: Callable[..., Request], *given: Any) -> int:
         """Ask, without waiting; its number."""
-        self._numbers += 1
-        self.out.append(kind(self._numbers, *given))
-        return self._numbers
+        number = next(self._numbers)
+        self.out.append(kind(number, *given))
+        return number
 
     def answered(self, number: int, answer: Answer) -> None:
         """An answer came; one that nobody waits for is none."""

@@ -10,7 +10,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of, reference_of
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, TOOL, Action, Entry, Head, State
+from robocal_ros.core.proposals import THERMAL, TOOL, Action, Decision, Entry, Head, State
 from robocal_ros.core.tool.judging import KnownTool, change_between
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions.decisions import decide, require_thermal
@@ -22,7 +22,8 @@ from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 KINDS = (THERMAL, TOOL)
 BY = "maintenance"
 SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser
-MOST_AT_ONCE = 10  # of a kind: each takes milliseconds, in which nobody watches the robot
+MOST_AT_ONCE = 2  # of a kind: each takes up to 20 ms, in which nobody watches the robot
+LOOKED_AT = 200  # newest decisions that a call without an id may mean
 REPEAT_NS = 60 * 1_000_000_000  # a call without an id is repeated within
 DONE = {  # what a repeated decision finds
     ACCEPT: State.IN_FORCE,
@@ -131,14 +132,14 @@ class Decider:
     def decide_only(self, name: str, by: str, wall_ns: int) -> Iterator[Outcome]:
         """A decision without an id; each outcome as soon as it is made.
 
-        Accept: the one candidate that waits. Reject: what waits, the newest first, ten of a kind
+        Accept: the one candidate that waits. Reject: what waits, the newest first, two of a kind
         in a call. Rollback: take the last acceptance back. Each may come twice: nothing more is
         done.
 
         Raises
         ------
         RobocalError
-            As `decide`, `only_pending`; BAD_INPUT where nothing was ever accepted.
+            As `decide`, `only_pending`; BAD_INPUT where nothing was accepted lately.
         """
         if name == ROLLBACK:
             yield self._take_back(by, wall_ns)
@@ -152,17 +153,20 @@ class Decider:
             yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
         for number in waiting:
             try:
-                yield self.decide(name, number, by, "", wall_ns)
+                outcome = self.decide(name, number, by, "", wall_ns)
             except RobocalError as error:  # those before it stay rejected, and are told
                 command = Command(name, {"id": number, "by": by, "reason": ""})
-                yield Outcome(command, error.code, str(error))
+                outcome = Outcome(command, error.code, str(error))
+            yield outcome
+            if outcome.status is Code.STORAGE_FAILED:
+                return  # each further one would wait for the history as long
         if any(len(entries) > MOST_AT_ONCE for entries in found):
             yield _nothing_to_do(Command(name, {"by": by}), "more wait: call again")
 
     def _meant(self, by: str, wall_ns: int) -> int:
         """The candidate to accept; where none waits, what the same caller accepted just before."""
         waits = any(self.newest(kind) for kind in KINDS)
-        made = [] if waits else [d for d in self._history.decisions() if d.kind in KINDS]
+        made = [] if waits else self._made()
         last = made[-1] if made else None
         if (
             last
@@ -173,11 +177,15 @@ class Decider:
             return last.calibration_id or 0
         return self.only_pending().id
 
+    def _made(self) -> list[Decision]:
+        """The newest decisions about kinds of this node, oldest first."""
+        return [d for d in self._history.decisions(newest=LOOKED_AT) if d.kind in KINDS]
+
     def _take_back(self, by: str, wall_ns: int) -> Outcome:
-        made = [d for d in self._history.decisions() if d.kind in KINDS]
+        made = self._made()
         accepted = [d for d in made if d.action is Action.ACCEPT]
         if not accepted:
-            raise InputError("nothing was accepted: there is nothing to roll back")
+            raise InputError("nothing was accepted lately: there is nothing to roll back")
         last = accepted[-1]
         since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
         again = self.head(last.kind).calibration_id == last.calibration_id  # by a rollback to it

@@ -29,7 +29,7 @@ class CycleResult:
     code : ACCEPT when it ran as planned, with the robot at home; NONE while it runs.
     complete : nothing that was due is left for the next gap; ``left`` names what is.
     thermal_code, thermal_id : of the end of the thermal cycle; NONE where it did not end.
-    tool_found_code : of the first tool measurement: what it found, also where that was mended.
+    tool_found_code : what was found of the tool as the gap began, also where that was mended.
     tool_code, tool_id : of the last tool measurement, and its candidate.
     tool_answer : of the last quick check.
     accepted : calibrations that were accepted without a person.

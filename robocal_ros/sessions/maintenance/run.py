@@ -122,7 +122,7 @@ class Run:
         found = self._tool.outcome
         self.result = replace(
             self.result,
-            tool_found_code=found.first.code if found.first else Code.NONE,
+            tool_found_code=found.found_code,
             tool_code=found.last.code if found.last else Code.NONE,
             tool_id=found.candidate_id,
             tool_answer=found.checked,

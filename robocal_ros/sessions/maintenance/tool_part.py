@@ -32,6 +32,7 @@ class ToolOutcome:
     ----------
     first, last : of the first and the last measurement; None before any.
     checked : the last quick check's answer.
+    bent : another tool than the one in force was found, and not just as due by the calendar.
     candidate_id : of the full measurement; 0 without.
     accepted : whether it was accepted without a person, and stayed.
     fault : why an accepted tool that failed its check is still in force; empty: it is not.
@@ -42,6 +43,7 @@ class ToolOutcome:
     first: Answer | None = None
     last: Answer | None = None
     checked: str = ""
+    bent: bool = False
     candidate_id: int = 0
     accepted: bool = False
     fault: str = ""
@@ -51,6 +53,13 @@ class ToolOutcome:
     def came(self, answer: Answer) -> None:
         """Of a measurement."""
         self.first, self.last = self.first or answer, answer
+
+    @property
+    def found_code(self) -> Code:
+        """What was found of the tool as the gap began, also where that is mended since."""
+        if self.bent:
+            return Code.LIMIT_EXCEEDED
+        return self.first.code if self.first else Code.NONE
 
     def words(self) -> list[str]:
         """What was found first, what came last, and what else there is to say; each once."""
@@ -157,6 +166,7 @@ class ToolPart:
             self._note(answer, "pass")
             return
         self._note(answer, "recalibrate", answer.candidate_id if answer.done else 0)
+        outcome.bent = answer.done and outcome.checked != "pass"
         if answer.done and (drift := self._drift()) is not None:
             self._memory.note_tool(drift_rms_m=drift.rms_m, drift_bound_m=drift.bound_m)
         if not answer.done:
