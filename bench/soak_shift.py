@@ -59,8 +59,8 @@ class LiveShift:
     def run(self, seconds: float) -> None:
         """All of it."""
         begin_s = time.monotonic()
-        while (now_s := time.monotonic()) < begin_s + seconds:
-            self._work_until(now_s + EVERY_S, begin_s + 0.5 * seconds)
+        for gap_s in np.arange(EVERY_S, seconds + 1.0, EVERY_S):
+            self._work_until(begin_s + gap_s, begin_s + 0.5 * seconds)
             name = f"gap-{len(self.gaps) + 1}"
             self.gaps.append(self._plc.gap(name, GAP_S))
             pids = self._controller.pids

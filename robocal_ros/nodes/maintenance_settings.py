@@ -59,7 +59,7 @@ SETTINGS = (
     ),
     Setting(
         "home_near_deg",
-        0.5,
+        2.0,
         "The robot is at home with all joints so near (sliding joint: mm)",
         unit="deg",
         low=0.01,

@@ -15,7 +15,7 @@ from robocal_ros.sessions.silence import Silence
 Array = NDArray[np.float64]
 
 VELOCITY_S = 0.03  # span of the readings that give a velocity
-LEAST = 5  # of them: one wild reading is outvoted
+LEAST, OLDEST_S = 5, 0.2  # of them, if not too old: one wild reading is outvoted
 REST_RAD = 1e-4  # a robot that rests moves less
 BACK_S = 1.0  # stamps that go back by more began anew
 FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
@@ -133,15 +133,21 @@ class RobotWatch:
         """
         if self._plan is not None and keeps:
             return self._plan.at(self.driven_s(now_s))
-        within = self._since(VELOCITY_S) or ()
-        recent = list(self._readings)[-max(len(within), LEAST) :]
-        times, q = np.array([at_s for at_s, _ in recent]), np.array([q for _, q in recent])
+        times, q = self._latest()
         velocity = np.zeros(q.shape[1])
-        if within:
+        if times[0] <= times[-1] - VELOCITY_S:
             i, j = np.triu_indices(len(times), 1)
             slopes = (q[j] - q[i]) / (times[j] - times[i])[:, None]
             velocity = np.clip(np.median(slopes, axis=0), -self._fastest, self._fastest)
         return np.median(q + (times[-1] - times)[:, None] * velocity, axis=0), velocity
+
+    def _latest(self) -> tuple[Array, Array]:
+        """Stamps (m,) and joints (m, n) of the readings that tell where it is and how fast."""
+        newest_s = self._readings[-1][0]
+        recent = [reading for reading in self._readings if reading[0] >= newest_s - OLDEST_S]
+        span = sum(at_s > newest_s - VELOCITY_S for at_s, _ in recent) + 1
+        recent = recent[-max(span, LEAST) :]
+        return np.array([at_s for at_s, _ in recent]), np.array([q for _, q in recent])
 
     def tells_speed(self, within_s: float) -> bool:
         """Whether the readings that give a velocity span no more than this."""

@@ -8,6 +8,7 @@ Not of ``make test``, which shares its machine: a part of ``make soak``, or
 import os
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from robocal_ros.storage.robots import load_robot
 GAP_S = 150.0
 BEND_MM = "[1.5, -0.8, 0.4]"
 COUNT = 30
+DECIDED = 1000  # decisions that the history holds before
+TWINS = ("run_trigger", "status_trigger", "accept_trigger", "reject_trigger", "rollback_trigger")
 PATIENCE_S = 0.5  # what docs/plc.md tells a PLC to wait
 
 
@@ -96,10 +99,12 @@ def test_calls_do_their_work_in_time(graph: Any, tmp_path: Path) -> None:
             Decide: ("accept", "reject", "rollback"),
             GetMaintenance: ("status",),
             RunMaintenanceCycle: ("run",),
-            Trigger: ("cancel_trigger",),
+            Trigger: ("cancel_trigger", *TWINS),
         }.items():
             for each in name:
                 graph.call(kind, f"/maintenance_node/{each}")  # discovers it
+        for _ in range(DECIDED):
+            history.reject(proposed(history, 0), by="test", reason="", wall_ns=1)
         base = proposed(history, 0)
         assert graph.call(Decide, "/maintenance_node/accept", id=base).success
         for number in range(COUNT):
@@ -114,12 +119,28 @@ def test_calls_do_their_work_in_time(graph: Any, tmp_path: Path) -> None:
             timed(Decide, "accept", id=good)
             timed(Decide, "rollback", id=base)
             assert history.head().calibration_id == base
+            timed(Trigger, "status_trigger")
+            twins(timed, history, base)
+            timed(Trigger, "run_trigger")
             timed(Trigger, "cancel_trigger")
             graph.spin_until(
                 lambda: cell.statuses[-1].state == MaintenanceStatus.IDLE, "home", within_s=60.0
             )
     show(took_s)
     assert max(max(times) for times in took_s.values()) < PATIENCE_S
+
+
+def twins(timed: Callable[..., Any], history: CalibrationHistory, base: int) -> None:
+    """The calls without an id, with all that they may have to do."""
+    in_force = history.head().revision
+    for _ in range(2):
+        proposed(history, in_force)
+    timed(Trigger, "reject_trigger")
+    proposed(history, in_force)
+    timed(Trigger, "accept_trigger")
+    timed(Trigger, "rollback_trigger")
+    assert history.head().calibration_id == base
+    assert not history.pending()
 
 
 def test_an_acknowledgement_is_in_time(graph: Any) -> None:

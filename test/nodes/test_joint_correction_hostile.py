@@ -1,7 +1,8 @@
 """Hostile messages to the joint correction node, over DDS: nothing wrong ever goes out.
 
 What goes out is finite, within the bounds, and its offset (out less in) changes no faster than the
-blend may, besides what the change of the posture alone does to it, at any one blend.
+blend may, besides what the change of the posture alone does to it, at any one blend. Of two
+postures far apart the bounds tell more than that; near ones, and the same one twice, are its point.
 """
 
 import itertools

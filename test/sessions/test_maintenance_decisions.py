@@ -59,8 +59,13 @@ def accepts(cell: Cell) -> list[Code]:
 
 
 def until_back_home(cell: Cell) -> None:
-    """Until a measurement has ended, and the robot is at home again."""
-    while cell.tool.measuring or cell.tool.armed or not cell.at_home():
+    """Until a measurement has ended, and the robot rests at home again."""
+    while (
+        cell.tool.measuring
+        or cell.tool.armed
+        or not cell.at_home()
+        or cell.now_s < cell.moved_s + 0.1
+    ):
         cell.step()
         assert cell.now_s < cell.ends_s
 
