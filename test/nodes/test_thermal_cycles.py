@@ -52,6 +52,11 @@ def end(cell: Cell, cycle_id: str = "") -> Any:
     return cell.call("end_cycle", cycle_id=cycle_id)
 
 
+def production(cell: Cell, robot: Robot) -> None:
+    """Two hours pass: a cycle that was begun before them would end by itself."""
+    cell.play(robot.visit(WARM_K, slice(2), after_h=2.0))
+
+
 def accuracy(cell: Cell, state: int, words: str = "") -> AccuracyState:
     """Wait until the node says so of itself."""
 
@@ -87,7 +92,7 @@ def test_a_shift_of_cycles(cell, robot):
 
 
 def test_triggers_of_a_plc(cell, robot):
-    cell.play(robot.visit(WARM_K, slice(2), after_h=2.0))
+    production(cell, robot)
     begun = cell.call("begin_cycle_trigger")
     assert begun.success
     assert begun.message.startswith("0 ACCEPT cycle '")
@@ -98,8 +103,9 @@ def test_triggers_of_a_plc(cell, robot):
 
 
 def test_missing_poses(cell, robot):
+    production(cell, robot)
     cell.call("begin_cycle", cycle_id="c1")
-    cell.play(robot.visit(WARM_K, slice(1, 5), after_h=2.0))
+    cell.play(robot.visit(WARM_K, slice(1, 5)))
     cell.graph.spin_until(
         lambda: cell.value("cycle") == "'c1' open, 4 of 6 poses measured", "progress is shown"
     )
@@ -115,8 +121,9 @@ def test_missing_poses(cell, robot):
 
 
 def test_a_cycle_broken_off(cell, robot):
+    production(cell, robot)
     cell.call("begin_cycle", cycle_id="c1")
-    cell.play(robot.visit(40.0, slice(3), after_h=2.0))
+    cell.play(robot.visit(40.0, slice(3)))
     begun = cell.call("begin_cycle", cycle_id="c2")
     assert "cycle 'c1' is broken off" in begun.message
     cell.play(robot.visit(WARM_K))
@@ -164,8 +171,9 @@ def test_a_knocked_sensor(graph, robot, fixed):
 
 def test_a_clock_that_jumps(cell, robot):
     """Back by an hour in mid-cycle: what an earlier clock stamped is dropped, and said so."""
+    production(cell, robot)
     cell.call("begin_cycle", cycle_id="c1")
-    cell.play(robot.visit(WARM_K, slice(3), after_h=2.0))
+    cell.play(robot.visit(WARM_K, slice(3)))
     robot.shift.now_ns -= 3600 * NS
     cell.play(robot.visit(WARM_K))
     found = end(cell, "c1")
@@ -193,8 +201,9 @@ def test_wrong_joint_names(graph, robot):
 
 def test_a_full_disk(cell, robot):
     """Nothing is lost, nothing is half-written, and the same call works once there is room."""
+    production(cell, robot)
     cell.call("begin_cycle", cycle_id="c1")
-    cell.play(robot.visit(WARM_K, after_h=2.0))
+    cell.play(robot.visit(WARM_K))
     pid, limit = cell.process.process.pid, resource.RLIMIT_FSIZE
     resource.prlimit(pid, limit, (1, resource.RLIM_INFINITY))
     refused = end(cell, "c1")
