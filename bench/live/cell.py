@@ -94,7 +94,8 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
         | {"joint_silence_s": LATE_S, "circle_speed_mm_s": 80.0, "plunge_speed_mm_s": 20.0},
         "joint_correction_node": {"reference": str(made.reference), "joint_state_age_s": LATE_S},
         "maintenance_node": motion
-        | {"auto_accept": True, "tolerance_mm": TOLERANCE_MM, "travel_speed_mm_s": 1500.0},
+        | {"auto_accept": True, "accept_tool_mm": 3.0}
+        | {"tolerance_mm": TOLERANCE_MM, "travel_speed_mm_s": 1500.0},
     }
     document = {f"/**/{name}": {"ros__parameters": given} for name, given in nodes.items()}
     path.write_text(json.dumps(document, indent=1), encoding="utf-8")  # which is YAML too

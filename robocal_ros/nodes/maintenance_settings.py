@@ -59,7 +59,7 @@ SETTINGS = (
     ),
     Setting(
         "home_near_deg",
-        2.0,
+        0.5,
         "The robot is at home with all joints so near (sliding joint: mm)",
         unit="deg",
         low=0.01,
@@ -106,7 +106,7 @@ SETTINGS = (
         0.001,
         100.0,
     ),
-    length("accept_tool_mm", 3.0, "Largest distance of the tip from the taught one", 0.001, 100.0),
+    length("accept_tool_mm", 1.0, "Largest distance of the tip from the taught one", 0.001, 100.0),
     Setting(
         "accept_tool_deg",
         1.5,

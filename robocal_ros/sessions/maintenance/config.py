@@ -24,7 +24,7 @@ class AcceptBounds:
 
     automatic: bool = False
     thermal_m: float = 1e-3
-    tool_m: float = 3e-3
+    tool_m: float = 1e-3
     tool_rad: float = float(np.radians(1.5))
 
 
@@ -93,7 +93,7 @@ class MaintenanceConfig:
     driving: DrivingConfig
     T_base_laser: Array | None = None
     travel_speed_m_s: float = 0.25
-    home_near: ArrayLike = float(np.radians(2.0))
+    home_near: ArrayLike = float(np.radians(0.5))
     measurements: int = 1
     resume_within_s: float = 240.0
     check_every_s: float = 0.0
