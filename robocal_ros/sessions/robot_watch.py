@@ -143,10 +143,9 @@ class RobotWatch:
 
     def _latest(self) -> tuple[Array, Array]:
         """Stamps (m,) and joints (m, n) of the readings that tell where it is and how fast."""
-        newest_s = self._readings[-1][0]
-        recent = [reading for reading in self._readings if reading[0] >= newest_s - OLDEST_S]
-        span = sum(at_s > newest_s - VELOCITY_S for at_s, _ in recent) + 1
-        recent = recent[-max(span, LEAST) :]
+        count = max(len(self._since(VELOCITY_S) or ()), LEAST)
+        oldest_s = self._readings[-1][0] - OLDEST_S
+        recent = [reading for reading in list(self._readings)[-count:] if reading[0] >= oldest_s]
         return np.array([at_s for at_s, _ in recent]), np.array([q for _, q in recent])
 
     def tells_speed(self, within_s: float) -> bool:
