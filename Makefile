@@ -120,7 +120,7 @@ $(STAMPS)/interfaces: $(STAMPS)/wheels $(shell find msg_defs tools/interfaces -t
 	touch $@
 
 # Python sources are linked, not copied: only new entry points, config and launch files need this again.
-$(STAMPS)/robocal_ros: $(STAMPS)/interfaces $(PYTHON_FILES) resource/robocal_ros $(shell find config launch)
+$(STAMPS)/robocal_ros: $(STAMPS)/interfaces $(PYTHON_FILES) $(shell find config launch resource)
 	@rm -rf build/robocal_ros install/robocal_ros
 	$(COLCON) robocal_ros
 	touch $@

@@ -30,6 +30,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (str(SHARE), ["package.xml"]),
+        ("bin", ["resource/bin/robocal"]),
         *shared_files(),
     ],
     python_requires=">=3.11",

@@ -37,6 +37,22 @@ def test_every_interface_is_built() -> None:
     assert built == present
 
 
+@pytest.mark.ros
+def test_the_command_is_on_the_path_of_a_sourced_workspace() -> None:
+    script = "source install/setup.bash && command -v robocal && robocal --version"
+    done = subprocess.run(
+        ["/bin/bash", "-c", script],
+        cwd=ROOT,
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    place, version = done.stdout.splitlines()
+    assert Path(place).parts[-3:] == ("robocal_ros", "bin", "robocal")
+    assert version == f"robocal {robocal_ros.__version__}"
+
+
 def test_a_folder_called_like_the_package_does_not_hide_it(tmp_path: Path) -> None:
     """As beside a clone: git names its folder robocal_ros too."""
     try:
