@@ -14,6 +14,7 @@ import robocal_ros
 from robocal_ros.core.codes import Code
 
 ROOT = Path(__file__).parent.parent
+KINDS = ("msg", "srv", "action")
 
 
 def test_one_version_everywhere() -> None:
@@ -29,12 +30,23 @@ def test_the_codes_of_the_message_are_the_codes_of_the_core() -> None:
 
 
 def test_every_interface_is_built() -> None:
-    built = set(
-        re.findall(r'"((?:msg|srv)/\w+\.\w+)"', (ROOT / "msg_defs/CMakeLists.txt").read_text())
-    )
-    folders = (ROOT / "msg_defs" / "msg", ROOT / "msg_defs" / "srv")
-    present = {f"{folder.name}/{path.name}" for folder in folders for path in folder.iterdir()}
-    assert built == present
+    listed = (ROOT / "msg_defs" / "CMakeLists.txt").read_text()
+    built = set(re.findall(r'"((?:msg|srv|action)/\w+\.\w+)"', listed))
+    files = [path for kind in KINDS for path in (ROOT / "msg_defs" / kind).iterdir()]
+    assert built == {f"{path.parent.name}/{path.name}" for path in files}
+
+
+@pytest.mark.ros
+def test_every_ros_package_that_is_imported_is_required() -> None:
+    """Else rosdep does not install it on a machine with Jazzy."""
+    from ament_index_python.packages import get_packages_with_prefixes
+
+    code = "".join(path.read_text() for path in (ROOT / "robocal_ros").rglob("*.py"))
+    imported = set(re.findall(r"^\s*(?:from|import) (\w+)", code, re.MULTILINE))
+    of_ros = imported & set(get_packages_with_prefixes()) - {"robocal_ros"}
+    assert "rclpy" in of_ros
+    manifest = ElementTree.parse(ROOT / "package.xml")
+    assert of_ros <= {element.text for element in manifest.iter("exec_depend")}
 
 
 @pytest.mark.ros
