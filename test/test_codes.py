@@ -3,16 +3,43 @@
 import re
 from pathlib import Path
 
+import pytest
+
 from robocal_ros.core.codes import Code
 
 ROOT = Path(__file__).parents[1]
 CODES = {code.name: int(code) for code in Code}
 
 
+def rows_of(page, first):
+    """The cells of each row of the table of a page whose first row begins so."""
+    text = (ROOT / "docs" / page).read_text()
+    table = text[text.index(f"| {first} |") :].split("\n\n")[0]
+    return [
+        [cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]
+    ]
+
+
 def test_documented_table():
-    rows = re.findall(r"^\| (\d+) \| ([A-Z_]+) \|", (ROOT / "docs" / "codes.md").read_text(), re.M)
-    assert len(rows) == len(CODES)
-    assert {name: int(number) for number, name in rows} == CODES
+    rows = rows_of("codes.md", "number")
+    numbers = [int(row[0]) for row in rows]
+    assert numbers == sorted(numbers)
+    assert {row[1]: int(row[0]) for row in rows} == CODES
+    assert all(len(row) == 5 and all(row) for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("page", "first", "giver"),
+    [("tcf_node.md", "ends with", "tcf_node"), ("plc.md", "`code`", "maintenance_node")],
+)
+def test_a_code_of_a_node_says_what_to_do_there_and_in_the_table(page, first, giver):
+    givers = {}
+    for _, name, by, *_ in rows_of("codes.md", "number"):
+        givers.setdefault(name, []).append(by)
+    for row in rows_of(page, first):
+        assert row[-1], row
+        for name in set(re.findall(r"[A-Z_]{4,}", " ".join(row[:2]))) & CODES.keys() - {"NONE"}:
+            assert re.search(rf"{giver}|every call", " ".join(givers[name])), (name, givers[name])
 
 
 def test_message_constants():

@@ -7,7 +7,7 @@ class Code(IntEnum):
     """Verdict or status of a calibration step.
 
     The numbers equal the constants of ``CalibrationQuality.msg`` and are never reused.
-    0 is never sent, so that an empty PLC register cannot be read as approval.
+    0 is no verdict, so that an empty PLC register cannot be read as approval.
     """
 
     NONE = 0
