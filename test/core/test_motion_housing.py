@@ -84,17 +84,19 @@ def test_a_tool_is_seen_along_its_axis_and_on_to_the_flange():
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        ({"clear_radius_m": 0.0}, "clear_radius_m > 0"),
-        ({"floor_m": 0.01}, "floor_m < 0"),
-        ({"retract_m": 0.02}, "retract_m"),
-        ({"top_m": np.nan}, "finite"),
-        ({"reach_m": 0.03}, "beyond the opening"),
+        ({"clear_radius_m": 0.0}, "opening radius 0 mm: must be positive"),
+        ({"floor_m": 0.01}, "housing depth -10 mm: must be positive"),
+        ({"floor_m": -np.inf}, "housing depth inf mm"),
+        ({"retract_m": 0.02}, "retract height 20 mm: .* above the housing top, 20 mm"),
+        ({"top_m": np.nan}, "housing top nan mm"),
+        ({"reach_m": 0.03}, "housing reach 30 mm: must be more than the opening radius, 40 mm"),
     ],
 )
-def test_sizes_that_make_no_sense_are_refused(bad, words):
+def test_sizes_that_make_no_sense_are_refused_as_the_parameters_are_called(bad, words):
+    """In mm and in the words of `opening_radius_mm`, `housing_top_mm`, `retract_mm` and so on."""
     with pytest.raises(InputError, match=words):
         Housing(**(vars(HOUSING) | bad))
-    with pytest.raises(InputError, match="radius_m"):
+    with pytest.raises(InputError, match="tool radius 0 mm"):
         ToolBody(np.eye(4), 0.1, 0.0, 0.05)
 
 

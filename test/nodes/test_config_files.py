@@ -1,5 +1,6 @@
 """The parameter files show every parameter with its default, and a node starts with them."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.motion_settings import MOTION
 from robocal_ros.nodes.recorder_node import RecorderNode
 from robocal_ros.nodes.replay_node import ReplayNode
 from robocal_ros.nodes.tcf_node import TcfNode
@@ -33,6 +35,13 @@ def test_the_file_shows_every_parameter_with_its_default(node):
     content = yaml.safe_load((CONFIG / f"{node.NAME}.yaml").read_text())
     given = content[f"/**/{node.NAME}"]["ros__parameters"]
     assert given == {s.name: s.default for s in (AUTOSTART, SERIAL, *node.SETTINGS)}
+
+
+def test_the_page_of_motions_names_them_as_the_parameters_do():
+    page = (CONFIG.parent / "docs" / "tool_motion.md").read_text()
+    known = {s.name for s in TcfNode.SETTINGS}
+    assert {s.name for s in MOTION} <= set(re.findall(r"\w+", page))
+    assert set(re.findall(r"`(\w+_(?:mm|deg|m|s|s2|acceleration|deceleration))`", page)) <= known
 
 
 def test_a_node_takes_the_file(graph, tmp_path):

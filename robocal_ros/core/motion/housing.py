@@ -32,18 +32,22 @@ class Housing:
     reach_m: float = np.inf
 
     def __post_init__(self) -> None:
-        sizes = [size for name, size in vars(self).items() if name != "reach_m"]
-        if not np.all(np.isfinite(sizes)):
-            raise InputError(f"{self}: all sizes must be finite")
-        if not self.reach_m > self.clear_radius_m:
-            raise InputError(f"{self}: reach_m must be beyond the opening")
-        if not (self.clear_radius_m > 0.0 > self.floor_m and self.top_m >= 0.0):
-            raise InputError(f"{self}: clear_radius_m > 0, top_m >= 0 and floor_m < 0 are needed")
-        if not self.retract_m > self.top_m:
-            raise InputError(
-                f"retract_m = {self.retract_m:g} must be above top_m = {self.top_m:g}: "
-                "the tip passes over the housing at this height"
-            )
+        opening, top, depth = 1e3 * self.clear_radius_m, 1e3 * self.top_m, -1e3 * self.floor_m
+        retract, reach = 1e3 * self.retract_m, 1e3 * self.reach_m
+        needed = {
+            f"opening radius {opening:g} mm: must be positive": 0.0 < opening < np.inf,
+            f"housing top {top:g} mm: must not be below the beams": 0.0 <= top < np.inf,
+            f"housing depth {depth:g} mm: must be positive, down from the beams": (
+                0.0 < depth < np.inf
+            ),
+            f"retract height {retract:g} mm: the tip passes over the housing there, it must be "
+            f"above the housing top, {top:g} mm": top < retract < np.inf,
+            f"housing reach {reach:g} mm: must be more than the opening radius, {opening:g} mm": (
+                reach > opening
+            ),
+        }
+        if wrong := [words for words, kept in needed.items() if not kept]:
+            raise InputError("; ".join(wrong))
 
     def opening_holds(self, p_laser: Array) -> bool:
         """Whether a point (3,) is in the opening."""
@@ -96,9 +100,14 @@ class ToolBody:
     flange_radius_m: float
 
     def __post_init__(self) -> None:
-        for name in ("length_m", "radius_m", "flange_radius_m"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise InputError(f"{name} = {getattr(self, name)}: must be positive and finite")
+        sizes = {
+            "tool length": self.length_m,
+            "tool radius": self.radius_m,
+            "flange radius": self.flange_radius_m,
+        }
+        for name, size in sizes.items():
+            if not 0.0 < size < np.inf:
+                raise InputError(f"{name} {1e3 * size:g} mm: must be positive and finite")
 
     @property
     def p_tip(self) -> Array:
