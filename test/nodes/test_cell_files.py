@@ -1,5 +1,6 @@
 """The files of whole cells give each node values that it takes."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,10 @@ import yaml
 
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
+from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.recorder_node import RecorderNode
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
 from robocal_ros.nodes.thermal_settings import session_config
@@ -22,6 +25,21 @@ NODES = {
     f"/**/{n.NAME}": n
     for n in (CellSimNode, ThermalNode, TcfNode, MaintenanceNode, JointCorrectionNode)
 }
+
+
+PAGE = (Path(__file__).parents[2] / "docs" / "cell_launch.md").read_text()
+
+
+def test_the_file_on_the_page_has_values_for_all_nodes():
+    sections = yaml.safe_load(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0])
+    shared = sections.pop(SHARED)["ros__parameters"]
+    nodes = NODES | {f"/**/{n.NAME}": n for n in (HandEyeNode, RecorderNode)}
+    assert set(sections) == set(nodes) - {"/**/cell_sim_node"}
+    for name, given in sections.items():
+        settings = {s.name: s for s in (AUTOSTART, SERIAL, *nodes[name].SETTINGS)}
+        for parameter, value in given["ros__parameters"].items():
+            assert settings[parameter].accept(value) == value
+        assert settings["serial"].accept(shared["serial"])
 
 
 def test_there_is_one():

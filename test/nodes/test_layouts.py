@@ -2,6 +2,7 @@
 
 import json
 import re
+import subprocess
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -43,6 +44,25 @@ def plotjuggler() -> list[str]:
 
 
 PATHS = [*foxglove(), *plotjuggler()]
+
+
+@pytest.mark.parametrize("file", ["foxglove_cell.json", "plotjuggler_cell.xml"])
+def test_the_command_of_the_page_puts_a_layout_into_a_namespace(file):
+    page = (LAYOUTS.parents[1] / "docs" / "cell_launch.md").read_text()
+    script = re.search(r"sed -E '(.*)'", page)
+    assert script
+    done = subprocess.run(
+        ["sed", "-E", script[1], LAYOUTS / file], capture_output=True, text=True, check=True
+    )
+    topics = [name for name in TYPES if name != "/diagnostics"]
+    before = (LAYOUTS / file).read_text()
+    assert '"/' in before
+    for name in topics:
+        assert done.stdout.count(f'"/robot_1{name}') == before.count(f'"{name}')
+    assert done.stdout.count('"/diagnostics') == before.count('"/diagnostics')
+    assert done.stdout.count('"/robot_1/') + done.stdout.count('"/diagnostics') == before.count(
+        '"/'
+    )
 
 
 @pytest.mark.parametrize("path", PATHS)
