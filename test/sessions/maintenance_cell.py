@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -91,6 +92,8 @@ DOWN = backwards(Ways(ARM, config_of()).home(STATION, AT_BEAMS).plan)  # as the 
 class Shelf:
     """Keeps a document; may be full, or slow: ``takes`` passes the time of a write."""
 
+    path = Path("shelf")
+
     def __init__(self) -> None:
         self.document: dict[str, Any] | None = None
         self.takes: Callable[[], None] = lambda: None
@@ -133,6 +136,7 @@ class Cell:
     full: Callable[["Cell"], Answer] = field(default=lambda cell: same_tool())
     drift: Drift | None = None  # told by the thermal node
     silent: bool = False  # joint states
+    measures_every: int = 5  # ticks
     planning_s: float = 0.0  # to make and send the next motion
 
     def __post_init__(self) -> None:
@@ -221,7 +225,8 @@ class Cell:
         self._tool_goes_on()
         if not self.silent:
             self.session.reading(self.now_s + self.clock_s, self.q + self.offset, self.now_s)
-        if round(self.now_s / TICK_S) % 5 == 0 and self.services.get("sensor") != SILENT:
+        due = round(self.now_s / TICK_S) % self.measures_every == 0
+        if due and self.services.get("sensor") != SILENT:
             self.session.measured(self.now_s)
         for item in [item for item in self.due if item[0] <= self.now_s]:
             self.due.remove(item)

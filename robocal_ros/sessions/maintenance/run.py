@@ -15,10 +15,14 @@ from robocal_ros.sessions.maintenance.memory import CycleResult, Memory
 from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.settling import is_accepted, settled
-from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
+from robocal_ros.sessions.maintenance.thermal_part import (
+    MEASUREMENT,
+    NONE_BETTER,
+    CycleBook,
+    ThermalPart,
+)
 from robocal_ros.sessions.maintenance.tool_part import ToolPart
 
-NONE_BETTER = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 UNSURE = "this cycle brought no thermal result into force, and a drift looks like a bent tool"
 
 
@@ -83,13 +87,16 @@ class Run:
         try:
             answer, left = yield from self._thermal.script(self.result.cycle_id)
         except SilentError as error:
-            answer, left = Answer(Code.CONFLICT, str(error)), ""
+            answer, left = Answer(Code.CONFLICT, str(error)), MEASUREMENT
             yield from self._hands.go_home()
         if left:
             self._left(left)
         if answer is None:
             return
         self._tell(f"thermal: {answer.message}")
+        if answer.missing:
+            poses = ", ".join(map(str, answer.missing))
+            self._tell(f"without pose {poses} of the cold reference")
         self.result = replace(self.result, thermal_code=answer.code, thermal_id=answer.candidate_id)
         if not (answer.done and answer.candidate_id):
             return

@@ -15,6 +15,9 @@ from robocal_ros.sessions.tool_driving import STANDS_S
 Array = NDArray[np.float64]
 
 NODE = "thermal node"
+MEASUREMENT = "thermal measurement"
+NONE_BETTER = (Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
+FOUND = (Code.ACCEPT, *NONE_BETTER)  # verdicts that tell the drift; any other one leaves it unknown
 
 
 @dataclass
@@ -25,14 +28,20 @@ class CycleBook:
     ----------
     id : empty: none.
     visited : poses that are done, from 1; measured or not.
+    unmeasured : of these, where too few measurements came.
     last_s : when the last one was.
     moved : whether the last cycle that ended found that the sensor or the robot has moved.
     """
 
     id: str = ""
     visited: set[int] = field(default_factory=set)
+    unmeasured: set[int] = field(default_factory=set)
     last_s: float = -np.inf
     moved: bool = False
+
+    def forget(self) -> None:
+        """No cycle is open."""
+        self.id, self.visited, self.unmeasured, self.last_s = "", set(), set(), -np.inf
 
 
 class ThermalPart:
@@ -49,24 +58,34 @@ class ThermalPart:
         return self._step_s(ways.longest_line_s(), homes)
 
     def script(self, cycle_id: str) -> Script[tuple[Answer | None, str]]:
-        """The answer of the cycle's end, None where it is not reached, and what is left."""
+        """The answer of the cycle's end, None where it is not reached, and what is left.
+
+        Raises
+        ------
+        SilentError
+            The thermal node did not answer; the robot may be away from home.
+        """
         hands, book = self._hands, self._book
         if hands.now_s - book.last_s > hands.config.resume_within_s:
-            book.id, book.visited = "", set()
+            book.forget()
         todo = [i for i in range(1, hands.ways.count + 1) if i not in book.visited]
         if todo:
             if not hands.fits(2.0 * self._times.answer_s + self._first_s(todo[0])):
-                return None, f"thermal measurement, {len(todo)} poses"
+                return None, f"{MEASUREMENT}, {len(todo)} poses"
             begun = yield from self._begin(cycle_id)
             if not begun.done:
-                return begun, ""
+                return begun, MEASUREMENT
             left = yield from self._visit(todo)
             yield from hands.go_home()
             if left:
-                return None, f"thermal measurement, {left} poses"
+                return None, f"{MEASUREMENT}, {left} poses"
         if not hands.fits(self._times.solve_s):
             return None, "end of the thermal cycle"
-        return (yield from self._end()), ""
+        unmeasured = ", ".join(map(str, sorted(book.unmeasured)))
+        answer = yield from self._end()
+        if answer.code not in FOUND:
+            return answer, MEASUREMENT
+        return answer, f"{MEASUREMENT} at pose {unmeasured}" if unmeasured else ""
 
     def _begin(self, cycle_id: str) -> Script[Answer]:
         book, hands = self._book, self._hands
@@ -91,29 +110,35 @@ class ThermalPart:
             yield from hands.drive(route, worst_s)
             q = yield from hands.stand()
             hands.doing = f"measuring pose {pose} of {hands.ways.count}"
-            yield from self._measured(q)
+            if not (yield from self._measured(q)):
+                self._book.unmeasured.add(pose)
             self._book.visited.add(pose)
             self._book.last_s = hands.now_s
         return 0
 
-    def _measured(self, q: Array) -> Script[None]:
-        """Stand at joints (n,) until the measurements are there, or their time is over."""
+    def _measured(self, q: Array) -> Script[bool]:
+        """Stand at joints (n,) until the measurements are there; False: their time is over."""
         hands, times = self._hands, self._times
         from_s = hands.robot.newest_s + times.settle_s
         until_s = hands.now_s + times.measure_s
         hands.measured.clear()
         while hands.now_s < until_s:
             hands.robot.require_at(q)
-            fresh = [stamp for stamp in hands.measured if stamp >= from_s]
-            enough = len(fresh) >= hands.config.measurements
-            if enough and hands.robot.newest_s >= max(fresh) + times.stay_s:
-                return
+            fresh = sorted(stamp for stamp in hands.measured if stamp >= from_s)
+            enough = fresh[: hands.config.measurements]  # more may come, faster than the stay ends
+            if (
+                len(enough) == hands.config.measurements
+                and hands.robot.newest_s >= enough[-1] + times.stay_s
+            ):
+                return True
             yield
+        return False
 
     def _end(self) -> Script[Answer]:
         book, hands = self._book, self._hands
         hands.doing = "thermal cycle ends"
-        name, book.id, book.visited, book.last_s = book.id, "", set(), -np.inf
+        name = book.id
+        book.forget()
         try:
             answer = yield from hands.ask(self._times.solve_s, NODE, EndCycle, name)
         except SilentError as error:

@@ -1,0 +1,90 @@
+"""What a gap leaves undone of the thermal measurement is told: the PLC reads ``complete``."""
+
+from dataclasses import replace
+
+import pytest
+from maintenance_cell import LONG_S, REFUSED, SILENT, Cell, config_of, opened
+
+from robocal_ros.core.codes import Code
+from robocal_ros.sessions.maintenance import State
+from robocal_ros.sessions.maintenance.requests import Answer
+
+UNKNOWN = set(Code) - {
+    Code.NONE,
+    Code.ACCEPT,
+    Code.NO_SIGNIFICANT_GAIN,
+    Code.WORSE_THAN_CURRENT,
+}
+
+
+@pytest.fixture
+def cell(history) -> Cell:
+    return opened(history)
+
+
+@pytest.mark.parametrize("how", [REFUSED, SILENT])
+def test_a_thermal_node_that_fails_leaves_the_measurement(cell, how):
+    cell.services["thermal"] = how
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.code, result.complete, result.left) == (
+        Code.ACCEPT,
+        False,
+        ("thermal measurement",),
+    )
+    assert "thermal: " in result.message
+    assert result.tool_answer == "pass"
+
+
+@pytest.mark.parametrize("code", sorted(UNKNOWN), ids=lambda code: code.name)
+def test_a_verdict_that_does_not_tell_the_drift_leaves_it(cell, code):
+    cell.thermal = Answer(code, "why")
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.complete, result.left) == (False, ("thermal measurement",))
+    assert result.thermal_code is code
+
+
+def test_a_pose_that_was_not_measured_is_left_by_its_number(cell):
+    cell.run("c1", LONG_S)
+    while cell.state is State.RUNNING:
+        at_second = "measuring pose 2 of" in cell.session.status(cell.now_s).doing
+        cell.services["sensor"] = SILENT if at_second else "ok"
+        cell.step()
+    result = cell.session.result("c1")
+    assert (result.complete, result.left) == (False, ("thermal measurement at pose 2",))
+    assert result.thermal_code is Code.NO_SIGNIFICANT_GAIN  # the others told enough
+    cell.open_gap()
+    cell.run("c2", LONG_S)
+    assert cell.finish().complete
+
+
+def test_a_pose_that_an_earlier_gap_missed_is_still_named(cell):
+    cell.services["sensor"] = SILENT
+    cell.run("c1", 15.0)
+    assert "poses" in cell.finish().left[0]
+    cell.services["sensor"] = "ok"
+    cell.open_gap()
+    cell.run("c2", LONG_S)
+    assert cell.finish().left == ("thermal measurement at pose 1",)
+
+
+def test_cold_poses_that_were_not_measured_are_named(cell):
+    cell.thermal = replace(cell.thermal, missing=(2, 7))
+    cell.run("c1", LONG_S)
+    assert "without pose 2, 7 of the cold reference" in cell.finish().message
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_sensor_that_measures_often_does_not_hold_the_robot(history, every):
+    """The measurements that a pose takes must be stood through, not also those that follow."""
+    config = config_of(T_base_laser=None)
+    taken_s = []
+    for ticks in (10, every):
+        cell = Cell(history, config=config, measures_every=ticks)
+        cell.open_gap()
+        begin_s = cell.now_s
+        cell.run("c1", LONG_S)
+        assert cell.finish().complete
+        taken_s.append(cell.now_s - begin_s)
+    assert taken_s[1] <= taken_s[0]
