@@ -2,16 +2,24 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import StateLostError
+from robocal_ros.core.errors import StateLostError, StorageError
 
 REMEMBERED = 200  # ended cycles
 
 
 class Keeper(Protocol):
-    """Keeps one document; whole or not at all."""
+    """Keeps one document; whole or not at all.
+
+    Attributes
+    ----------
+    path : where, for whoever must mend it.
+    """
+
+    path: Path
 
     def load(self) -> Mapping[str, Any] | None:
         """What was kept last; None before anything; raises `StateLostError` where it is gone."""
@@ -115,7 +123,7 @@ class Memory:
         Raises
         ------
         RobocalError
-            When it cannot be read.
+            When it cannot be read, or is of another version.
         """
         try:
             document = keeper.load()
@@ -127,21 +135,31 @@ class Memory:
             return memory
         if document is None:
             return cls(keeper)
-        results = [CycleResult.of_document(each) for each in document["cycles"]]
-        memory = cls(
-            keeper,
-            {result.cycle_id: result for result in results},
-            ToolRecord(**document["tool"]),
-            Code(document["fault_code"]),
-            str(document["fault"]),
-            str(document["running"]),
-        )
+        memory = cls._of_document(keeper, document)
         if memory.running:
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
             result = CycleResult(memory.running, Code.CONFLICT, words)
             memory.end(result, Code.CONFLICT, words)
             memory.save()
         return memory
+
+    @classmethod
+    def _of_document(cls, keeper: Keeper, document: Mapping[str, Any]) -> "Memory":
+        try:
+            results = [CycleResult.of_document(each) for each in document["cycles"]]
+            return cls(
+                keeper,
+                {result.cycle_id: result for result in results},
+                ToolRecord(**document["tool"]),
+                Code(document["fault_code"]),
+                str(document["fault"]),
+                str(document["running"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise StorageError(
+                f"{keeper.path} is not of this version ({type(error).__name__}: {error}): go back "
+                "to the version that wrote it, or see where the robot is and move it away"
+            ) from error
 
     def begin(self, cycle_id: str) -> None:
         """A cycle runs from now on."""
