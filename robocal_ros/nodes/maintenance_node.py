@@ -73,7 +73,7 @@ class MaintenanceNode(HouseNode):
         self._nominal = load_robot(settings["robot"])
         self._config = session_config(settings, self._nominal)
         load_motion(self._nominal)
-        self._serial_in_use, self._history = open_history(settings, self._nominal)
+        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
         self._history.wait_at_most(HISTORY_S)
         self._keeper = StateFile(self._history.path, "maintenance")
         self._outputs = MaintenanceOutputs(
@@ -157,6 +157,11 @@ class MaintenanceNode(HouseNode):
     def _take_accuracy(self, message: Any) -> None:
         if self._session is None:
             return
+        told, mine = (message.robot, message.serial), (self._nominal.name, self._serial_in_use)
+        if told != mine:
+            raise InputError(
+                f"{ACCURACY} is of robot {told}, this node keeps {mine}: mend the remappings"
+            )
         try:
             level = AccuracyLevel(message.state)
         except ValueError as error:

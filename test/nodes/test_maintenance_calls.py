@@ -331,13 +331,28 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     assert "deactivated" in plc.states[-1].reason
 
 
+MINE = {"robot": "UR10", "serial": "unset"}
+
+
+@pytest.mark.parametrize("other", [{"serial": "K8"}, {"robot": "bx200l"}, {}], ids=str)
+def test_the_accuracy_of_another_robot_does_not_count(graph, other):
+    node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
+    drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
+    told = AccuracyState(state=AccuracyState.OK, **((MINE | other) if other else {}))
+    drift.publish(told)
+    graph.spin_until(lambda: node.inputs[ACCURACY].invalid == 1, "it is refused")
+    drift.publish(AccuracyState(state=AccuracyState.OK, **MINE))
+    graph.spin_until(lambda: node.inputs[ACCURACY].received == 2, "the right one comes")
+    assert node.inputs[ACCURACY].invalid == 1
+
+
 @pytest.mark.parametrize("name", ["predicted_error_mm", "bound_mm", "due_in_s"])
 def test_a_figure_that_cannot_be_is_no_drift(graph, name):
     poses = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]
     node = graph.add(MaintenanceNode, {"home_deg": HOME_DEG, "measuring_poses_deg": poses})
     states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
     drift = graph.publisher(AccuracyState, ACCURACY, qos.LATCHED)
-    known = {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
+    known = MINE | {"predicted_error_mm": 0.1, "bound_mm": 0.2, "due_in_s": 60.0}
     for count, value in enumerate((np.nan, np.inf, -np.inf, 1e300), 1):
         drift.publish(AccuracyState(state=AccuracyState.OK, **(known | {name: value})))
         graph.spin_until(lambda n=count: node.inputs[ACCURACY].invalid == n, f"{value} is refused")
