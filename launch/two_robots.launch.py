@@ -24,7 +24,7 @@ def generate_launch_description():
         params = f"{robot}_params"
         given = {"namespace": robot, "params": LaunchConfiguration(params)}
         actions += [
-            DeclareLaunchArgument(params, default_value=share("config", "cell.yaml")),
+            DeclareLaunchArgument(params),  # each robot has a serial of its own
             IncludeLaunchDescription(
                 share("launch", "cell.launch.py"), launch_arguments=given.items()
             ),

@@ -15,8 +15,10 @@ STATE_DIR = Setting(
 )
 
 
-def open_history(settings: Mapping[str, Any], nominal: SerialArm) -> tuple[str, CalibrationHistory]:
-    """The serial in use and its history.
+def open_history(
+    settings: Mapping[str, Any], nominal: SerialArm, sole_user: str = ""
+) -> tuple[str, CalibrationHistory]:
+    """The serial in use and its history; ``sole_user``: a node of which a robot has one at most.
 
     Raises
     ------
@@ -26,7 +28,9 @@ def open_history(settings: Mapping[str, Any], nominal: SerialArm) -> tuple[str, 
     serial = settings["serial"] or NO_SERIAL
     folder = settings[STATE_DIR.name]
     state_dir = Path(folder) if folder else None
-    history = CalibrationHistory.open(serial, model_hash=nominal.model_hash, state_dir=state_dir)
+    history = CalibrationHistory.open(
+        serial, model_hash=nominal.model_hash, state_dir=state_dir, sole_user=sole_user
+    )
     return serial, history
 
 

@@ -70,7 +70,7 @@ class TcfNode(HouseNode):
         taught = taught_tool(settings, self._nominal)
         load_motion(self._nominal)
         self._config = session_config(settings, placed.laser, placed.station, taught)
-        self._serial_in_use, self._history = open_history(settings, self._nominal)
+        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
         frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
         self._outputs = TcfOutputs(self.add_output, self._nominal, self._serial_in_use, frames)
         self._guard = SourceGuard(self, JOINTS)

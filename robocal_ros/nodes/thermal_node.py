@@ -68,7 +68,7 @@ class ThermalNode(HouseNode):
         self._nominal = load_robot(settings["robot"])
         require_parameters(self._nominal, settings["drift_parameters"])
         self._config = session_config(settings, self._nominal)
-        self._serial_in_use, self._history = open_history(settings, self._nominal)
+        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
         self._outputs = ThermalOutputs(
             self.add_output, self._nominal, self._serial_in_use, settings["base_frame"]
         )

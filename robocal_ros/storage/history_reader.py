@@ -27,6 +27,7 @@ from robocal_ros.storage.history_records import (
     read_json,
 )
 from robocal_ros.storage.history_rules import Ledger
+from robocal_ros.storage.sole_user import SoleUser
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,13 +59,18 @@ class HistoryReader:
     """
 
     def __init__(
-        self, serial: str, file: HistoryFile, ledger: Ledger, model_hash: str | None
+        self,
+        serial: str,
+        file: HistoryFile,
+        ledger: Ledger,
+        model_hash: str | None,
+        sole: SoleUser | None,
     ) -> None:
         self.serial = serial
         self.path = file.path
         self.damaged = file.damaged
         self.created = file.created
-        self._file = file
+        self._file, self._sole = file, sole
         self._ledger = ledger
         self._model_hash = model_hash
         self._own_commits = 0
@@ -78,6 +84,7 @@ class HistoryReader:
         state_dir: Path | None = None,
         create: bool = True,
         busy_timeout_s: float = BUSY_TIMEOUT_S,
+        sole_user: str = "",
     ) -> Self:
         """Open the history of a robot.
 
@@ -88,6 +95,7 @@ class HistoryReader:
         state_dir : folder of the histories, default `state_folder()`.
         create : False refuses a robot that has no history.
         busy_timeout_s : longest wait for other processes.
+        sole_user : the part that only one process may play for this robot; empty: none.
 
         Raises
         ------
@@ -97,6 +105,8 @@ class HistoryReader:
             The file belongs to another serial.
         StorageError
             The file cannot be opened, or was made by a newer version.
+        ConflictError
+            Another process plays the part of ``sole_user``.
         """
         path = history_path(serial, state_dir or state_folder())
         if not create and not path.exists():
@@ -112,7 +122,13 @@ class HistoryReader:
                 if in_force is not None:
                     read_json(connection, in_force, "model")
 
-        file = open_file(path, serial, timeout_s=busy_timeout_s, verify=verify)
+        sole = SoleUser(path, sole_user, serial, busy_timeout_s) if sole_user else None
+        try:
+            file = open_file(path, serial, timeout_s=busy_timeout_s, verify=verify)
+        except Exception:
+            if sole is not None:
+                sole.close()
+            raise
         if file.damaged is not None:
             _log.warning(
                 "%s was damaged: it is kept as %s, the history of robot %s starts anew with the "
@@ -121,7 +137,7 @@ class HistoryReader:
                 file.damaged.name,
                 serial,
             )
-        return cls(serial, file, ledger, model_hash)
+        return cls(serial, file, ledger, model_hash, sole)
 
     def wait_at_most(self, seconds: float) -> None:
         """From now on wait for other processes no longer than so."""
@@ -131,6 +147,8 @@ class HistoryReader:
     def close(self) -> None:
         """Close the file; idempotent."""
         self._file.close()
+        if self._sole is not None:
+            self._sole.close()
 
     def __enter__(self) -> Self:
         return self

@@ -58,6 +58,14 @@ def test_what_it_takes_is_declared_and_shown(name):
     assert shown <= declared
 
 
+def test_each_of_two_robots_must_be_given_its_own_file():
+    """What they had in common by default, the serial, would give them one history."""
+    calls = [n for n in ast.walk(tree("two_robots")) if isinstance(n, ast.Call)]
+    declared = [c for c in calls if getattr(c.func, "id", "") == "DeclareLaunchArgument"]
+    assert declared
+    assert not any(c.keywords for c in declared)
+
+
 def test_all_nodes_of_a_cell_are_started():
     scripts = {e.name for e in metadata.distribution("robocal-ros").entry_points}
     nodes = {name for name in scripts if name.endswith("_node")} - {"replay_node"}
