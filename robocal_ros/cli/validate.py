@@ -199,7 +199,7 @@ def _show(console: "Console", document: Document) -> None:
     from rich.text import Text
 
     table = Table(title="Rms errors in mm", title_justify="left", box=None)
-    heads = ("bag", "what", "count", "without", "in force", "after", "below bound", "refused")
+    heads = ("bag", "what", "without", "in force", "after", "candidate", "below bound", "refused")
     for head in heads:
         table.add_column(head, justify="left" if head in heads[:2] else "right")
     for row in document["bags"]:
@@ -211,15 +211,21 @@ def _show(console: "Console", document: Document) -> None:
 def _cells(row: dict[str, Any]) -> list[str]:
     if "error" in row:
         return [f"not validated: {row['error']['code']}"]
-    counted = {"thermal": "cycles", "tool": "runs", "hand_eye": "calibrations"}[row["kind"]]
-    errors = [row.get(f"rms_{name}_mm") for name in ("without", "in_force", "after")]
+    errors = [row.get(f"rms_{name}_mm") for name in ("without", "in_force", "after", "candidate")]
     if row["kind"] == "hand_eye":
-        errors = [None, None, row["predicted_rms_mm"]]
+        errors[-1] = row["predicted_rms_mm"]
     share = row.get("share_below_bound")
     return [
-        row["kind"].replace("_", "-"),
-        str(row[counted]),
+        _what(row),
         *("" if error is None else f"{error:.3f}" for error in errors),
         "" if share is None else f"{share:.1%}",
         str(row["refused"]),
     ]
+
+
+def _what(row: dict[str, Any]) -> str:
+    if row["kind"] == "thermal":
+        return f"{row['cycles']} cycles, {row['accepted']} accepted"
+    if row["kind"] == "tool":
+        return f"{row['runs']} tool runs"
+    return f"{row['calibrations']} hand-eye"

@@ -9,7 +9,8 @@ import numpy as np
 
 Document = dict[str, Any]
 
-ERRORS = {"without": "nominal", "in_force": "in_force", "after": "candidate"}
+ERRORS = ("without", "in_force", "after")
+MEASURED = {"without": "nominal", "in_force": "in_force", "candidate": "candidate"}
 ERROR_KEYS = ("mean_mm", "rms_mm", "p95_mm", "max_mm", "share_within_tolerance")
 NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")  # the last: the model stays
 CYCLE = ("bag", "cycle", "stamp", "hours", "samples", "code", "revision")
@@ -50,12 +51,17 @@ def _row(bag: Document, session: Document) -> Document:
 
 
 def _thermal(session: Document) -> Document:
-    """Errors by the truth where the bag has one, else those of the verdicts; after: candidates."""
+    """Errors by the truth where the bag has one, else those of the verdicts.
+
+    What was in force after a cycle only the truth knows; by measurements there is what the
+    candidates promised, those too that nobody accepted.
+    """
     cycles, true, measured = session["cycles"], session["true"], session["measured"] or {}
+    rms = dict.fromkeys((*ERRORS, *MEASURED))
     if true is not None:
-        rms = {name: true[name]["rms_mm"] for name in ERRORS}
+        rms |= {name: true[name]["rms_mm"] for name in ERRORS}
     else:
-        rms = {name: pooled_rms_mm(cycles, judged) for name, judged in ERRORS.items()}
+        rms |= {name: pooled_rms_mm(cycles, judged) for name, judged in MEASURED.items()}
     shares = {
         name: (true or measured).get(name, {}).get("share_within_tolerance") for name in ERRORS
     }

@@ -20,8 +20,9 @@ TITLES = {
 NOTHING = "–"  # noqa: RUF001
 OVER_BOUND = "95 % of the errors are to be below the bound that was expected before the cycle"
 ERRORS_NOTE = (
-    "mm. In force: the model from before a cycle, at its oldest. After: with what was decided at "
-    "it; by measurements the candidate, each pose predicted from the others. λ: share of all "
+    "mm. Accepted: of so many cycles. In force: the model from before a cycle, at its oldest. "
+    "After: true, with what was decided at it. Candidate: measured, each pose predicted from the "
+    "others, also of cycles that were refused. λ: share of all "
     f"directions within {TOLERANCE_MM:g} mm; by measurements with the noise of the cold and of the "
     f"warm visit. Below bound: {OVER_BOUND}."
 )
@@ -54,14 +55,25 @@ def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
     told = [_cell_answer(bag) for bag in bags if bag.get("cell")]
     for row in rows:
         if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
-            true = "true " if row["judged_by"] == "truth" else ""
-            told.append(
-                f"{escape(row['bag'])}: {true}rms error {_mm(row['rms_without_mm'])} mm without "
-                f"correction, <b>{_mm(row['rms_after_mm'])} mm</b> after each cycle."
-            )
+            told.append(_thermal_answer(row))
     if failed:
         told.append(f"{failed} of {len({row['bag'] for row in rows})} bags could not be validated.")
     return "<br>".join(told) or "No thermal cycle in these bags."
+
+
+def _thermal_answer(row: Document) -> str:
+    """By measurements of the model that was in force: no candidate has corrected anything yet."""
+    true = row["judged_by"] == "truth"
+    corrected = row["rms_after_mm" if true else "rms_in_force_mm"]
+    when = "after each cycle" if true else "with the model in force, at its oldest"
+    return (
+        f"{escape(row['bag'])}: {'true ' if true else ''}rms error {_mm(row['rms_without_mm'])} mm "
+        f"without correction, <b>{_mm(corrected)} mm</b> {when} ({_accepted(row)} cycles accepted)."
+    )
+
+
+def _accepted(row: Document) -> str:
+    return f"{row['accepted']} of {row['cycles']}"
 
 
 def _cell_answer(bag: Document) -> str:
@@ -95,8 +107,8 @@ def _overview(rows: Sequence[Document]) -> list[str]:
 
 
 _THERMAL = (
-    "judged by", "cycles", "accepted", "rms without", "rms in force", "rms after", "λ without",
-    "λ in force", "λ after", "below bound",
+    "judged by", "accepted", "rms without", "rms in force", "rms after", "rms candidate",
+    "λ without", "λ in force", "λ after", "below bound",
 )  # fmt: skip
 _TOOL = ("runs", "largest change, mm", "largest true error, mm")
 _HAND_EYE = ("calibrations", "residual, mm", "expected error, mm", "true error, mm")
@@ -105,9 +117,8 @@ _HAND_EYE = ("calibrations", "residual, mm", "expected error, mm", "true error, 
 def _thermal_cells(row: Document) -> list[str]:
     return [
         row["judged_by"],
-        str(row["cycles"]),
-        str(row["accepted"]),
-        *(_mm(row[f"rms_{name}_mm"]) for name in ("without", "in_force", "after")),
+        _accepted(row),
+        *(_mm(row[f"rms_{name}_mm"]) for name in ("without", "in_force", "after", "candidate")),
         *(_share(row[f"lambda_{name}"]) for name in ("without", "in_force", "after")),
         _share(row["share_below_bound"]),
     ]

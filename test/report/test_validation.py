@@ -98,8 +98,9 @@ def test_a_row_for_each_session_and_each_bad_bag():
     assert (thermal["lambda_without"], thermal["lambda_in_force"]) == (0.2, 0.5)
     assert thermal["share_below_bound"] == 0.9
     assert thermal["lambda_after"] is None
+    assert thermal["rms_after_mm"] is None  # only a truth would tell
     # 6 measurements at 0.1 mm and 2 at 0.2 mm: sqrt((6 * 0.01 + 2 * 0.04) / 8)
-    assert thermal["rms_after_mm"] == pytest.approx(np.sqrt(0.14 / 8))
+    assert thermal["rms_candidate_mm"] == pytest.approx(np.sqrt(0.14 / 8))
     assert tool["largest_change_mm"] == 3.5
     assert tool["largest_true_error_mm"] is None
     assert bad == {"bag": "bad.mcap", "kind": None, "error": BAD["error"]}
@@ -111,12 +112,31 @@ def test_the_truth_judges_where_there_is_one():
     (row,) = summary_rows([bag("one.mcap", judged)])
     assert row["judged_by"] == "truth"
     assert (row["rms_after_mm"], row["lambda_after"], row["share_below_bound"]) == (0.05, 1.0, 1.0)
+    assert row["rms_candidate_mm"] is None
+    html = page(REPORT | {"bags": [bag("one.mcap", judged)]}, {"one.mcap": [[], []]})
+    assert "<b>0.050 mm</b> after each cycle (1 of 2 cycles accepted)" in html
+
+
+def test_candidates_that_never_came_into_force_claim_no_gain():
+    """Two refused cycles: the robot went on as it was."""
+    cycles = [
+        cycle(i, code) | {"in_force": errors(0.3), "nominal": errors(0.3)}
+        | {"candidate": errors(0.05)}
+        for i, code in ((1, "RESIDUAL_TOO_LARGE"), (2, "SENSOR_OR_ROBOT_MOVED"))
+    ]  # fmt: skip
+    html = page(
+        REPORT | {"bags": [bag("one.mcap", THERMAL | {"cycles": cycles})]}, {"one.mcap": [[], []]}
+    )
+    (lead,) = re.findall(r'<p class="lead">.*</p>', html)
+    assert "rms error 0.300 mm without correction" in lead
+    assert "<b>0.300 mm</b> with the model in force, at its oldest (0 of 2 cycles" in lead
+    assert "0.050" not in lead
 
 
 def test_a_session_without_cycles_has_no_errors():
     empty = THERMAL | {"cycles": [], "measured": None}
     (row,) = summary_rows([bag("one.mcap", empty)])
-    assert row["rms_without_mm"] is row["rms_after_mm"] is None
+    assert row["rms_without_mm"] is row["rms_candidate_mm"] is None
     assert pooled_rms_mm([], "candidate") is None
     assert thermal_figures([], None) == []
     json.dumps(row, allow_nan=False)
