@@ -4,11 +4,13 @@ import argparse
 import os
 import platform
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -140,10 +142,15 @@ def _failure(bags: Sequence[Document]) -> Document:
 
 
 def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
-    for number, session in enumerate((result.cell, *result.figures)):
-        which = f"-{number}" if number > 1 else ""
-        for drawn in session:
-            (folder / f"{Path(name).stem}{which}-{drawn.name}.png").write_bytes(drawn.png)
+    """``BAG-FIGURE.png``, from the second of a bag on ``BAG-FIGURE-2.png``.
+
+    No figure's name is a number or has a hyphen: two bags never meet in one file.
+    """
+    met: Counter[str] = Counter()
+    for drawn in chain(result.cell, *result.figures):
+        met[drawn.name] += 1
+        which = f"-{met[drawn.name]}" if met[drawn.name] > 1 else ""
+        (folder / f"{Path(name).stem}-{drawn.name}{which}.png").write_bytes(drawn.png)
 
 
 def _write(folder: Path, report: Document, html: str) -> None:

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -247,7 +248,24 @@ def test_a_bag_of_two_nodes(bags, validate, tmp_path) -> None:
     assert only_bits_differ(tool)
     assert (rows["tool"]["runs"], rows["thermal"]["cycles"]) == (5, 2)
     assert {path.name for path in out.glob("*.png")} == {
-        "both-tool.png", "both-2-cycles.png", "both-2-drift.png"
+        "both-tool.png", "both-cycles.png", "both-drift.png"
+    }  # fmt: skip
+
+
+def test_no_figure_is_written_over_another(validate, tmp_path) -> None:
+    """Two tools in one bag; the other bag's name looks like the second of them."""
+    twice, other = tmp_path / "tools.mcap", tmp_path / "tools-2.mcap"
+    with BagWriter(twice) as bag:
+        for recorded in read_bag(TOOL_RUNS):
+            given = recorded.msgtype, recorded.message, recorded.log_time_ns
+            bag.write(recorded.topic, *given)
+            if recorded.topic.endswith("/session_events"):
+                bag.write("/other_node/session_events", *given)
+    shutil.copy(TOOL_RUNS, other)
+    _, document, out, _ = validate(twice, other)
+    assert [row["bag"] for row in document["bags"]] == ["tools.mcap"] * 2 + ["tools-2.mcap"]
+    assert {path.name for path in out.glob("*.png")} == {
+        "tools-tool.png", "tools-tool-2.png", "tools-2-tool.png"
     }  # fmt: skip
 
 
