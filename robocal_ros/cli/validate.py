@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> Outcome:
     with _progress(len(jobs)) as shown:
         for number, result in validated(jobs, workers, args.scheduler):
             results[number] = result.document
-            figures[jobs[number].name] = (result.cell, *result.figures)
+            figures[jobs[number].name] = (result.cells, *result.figures)
             _keep_figures(args.report, jobs[number].name, result)
             shown.advance()
     bags = [results[number] for number in range(len(jobs))]
@@ -147,7 +147,7 @@ def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
     No figure's name is a number or has a hyphen: two bags never meet in one file.
     """
     met: Counter[str] = Counter()
-    for drawn in chain(result.cell, *result.figures):
+    for drawn in chain(result.cells, *result.figures):
         met[drawn.name] += 1
         which = f"-{met[drawn.name]}" if met[drawn.name] > 1 else ""
         (folder / f"{Path(name).stem}-{drawn.name}{which}.png").write_bytes(drawn.png)

@@ -9,25 +9,19 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from robocal_ros.cli.bag_truth import (
-    HAND_EYE,
-    TOOL,
-    check_points,
-    is_simulated,
-    true_transforms,
-)
+from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth, above, is_simulated
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
 from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.cli.replaying import Request, replay_bag
-from robocal_ros.cli.validating_cell import cell_course
+from robocal_ros.cli.validating_cell import cell_courses
 from robocal_ros.cli.validating_cycles import shift_errors, thermal_document
 from robocal_ros.cli.validating_parts import as_recorded, calibrations, decisions, tool_runs
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.report.validation_figures import Drawn, cell_figures, thermal_figures, tool_figures
+from robocal_ros.report.validation_figures import Drawn, cell_drawn, thermal_figures, tool_figures
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
@@ -55,12 +49,12 @@ class Job:
 class Validated:
     """What a bag gave: its document, in it ``error`` or ``sessions``; each session's figures.
 
-    ``cell``: figures of the cell as a whole.
+    ``cells``: the figure of each cell as a whole.
     """
 
     document: Document
     figures: tuple[tuple[Drawn, ...], ...] = ()
-    cell: tuple[Drawn, ...] = ()
+    cells: tuple[Drawn, ...] = ()
 
 
 def validate_bag(job: Job) -> Validated:
@@ -71,18 +65,18 @@ def validate_bag(job: Job) -> Validated:
             head |= _about(reader)
             replayable, others = _event_topics(reader)
             topics: list[str | None] = [*replayable] or [None]
-            sessions = [_Session(job, reader, topic).judged() for topic in topics]
-            course = cell_course(reader)
+            truth = BagTruth(reader)
+            sessions = [_Session(job, reader, topic, truth).judged() for topic in topics]
+            courses = cell_courses(reader, truth)
+        told = {"sessions": [document for document, _ in sessions], "other_decisions": others}
+        told["cells"] = [course.document() for course in courses]
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:
         words = f"{error.filename or job.path}: {error.strerror}"
         return Validated(head | {"error": refusal(RobocalError.code, words)["error"]})
-    documents = [document for document, _ in sessions]
-    head |= {"sessions": documents, "other_decisions": others}
-    head["cell"] = None if course is None else course.document()
-    cell = () if course is None else cell_figures(course)
-    return Validated(head, tuple(tuple(drawn) for _, drawn in sessions), cell)
+    figures = tuple(tuple(drawn) for _, drawn in sessions)
+    return Validated(head | told, figures, tuple(cell_drawn(course) for course in courses))
 
 
 def _about(reader: BagReader) -> Document:
@@ -125,8 +119,9 @@ def _event_topics(reader: BagReader) -> tuple[list[str], dict[str, list[Document
 class _Session:
     """One node's session in a bag; the whole bag where ``topic`` is None."""
 
-    def __init__(self, job: Job, reader: BagReader, topic: str | None) -> None:
-        self._job, self._reader, self._topic = job, reader, topic
+    def __init__(self, job: Job, reader: BagReader, topic: str | None, truth: BagTruth) -> None:
+        self._job, self._topic, self._truth = job, topic, truth
+        self._namespace = above(above(topic or ""))  # of the node that told its events
         self._given = {} if topic is None else {EVENTS: topic}
         self._recording = open_recording(reader, self._given)
         self._mark = " (simulated)" if is_simulated(reader) else ""
@@ -136,17 +131,17 @@ class _Session:
 
     def judged(self) -> tuple[Document, list[Drawn]]:
         """Replay it: what it gave, and its figures."""
-        configured, reader = self._recording.configured, self._reader
+        configured, truth, space = self._recording.configured, self._truth, self._namespace
         with tempfile.TemporaryDirectory(prefix="robocal-") as folder:
             replayed = self._replayed(Path(folder))
             common = self._common(replayed)
             if is_tool_session(configured):
-                runs = tool_runs(replayed, true_transforms(reader, TOOL, "T_flange_tool"))
+                runs = tool_runs(replayed, truth.transforms(TOOL, space))
                 found = {"kind": "tool", "runs": runs, "final": replayed["final_tool"]}
                 return common | found, tool_figures(runs, self._mark)
             if is_hand_eye_session(configured):
-                truth = true_transforms(reader, HAND_EYE, "T_flange_sensor")
-                made = {"calibrations": calibrations(replayed, truth)}
+                sensor = truth.transforms(HAND_EYE, space)
+                made = {"calibrations": calibrations(replayed, sensor)}
                 made |= {"final": replayed["final_sensor"]}
                 return common | {"kind": "hand_eye", **made}, []
             document, figures = self._thermal(Path(folder), common)
@@ -186,7 +181,8 @@ class _Session:
         with CalibrationHistory.open(serial, state_dir=folder, create=False) as history:
             made = ThermalHistory(history, arm, self._recording.start_ns)
             sigma_m = float(common["settings"]["sigma_m"])
-            cycles = made.cycles(self._forecasts, check_points(self._reader), sigma_m)
+            points = self._truth.check_points(self._namespace)
+            cycles = made.cycles(self._forecasts, points, sigma_m)
         document = thermal_document(cycles, arm)
         shown = thermal_figures(document["cycles"], shift_errors(cycles), self._mark)
         return {"kind": "thermal", **document}, shown

@@ -16,8 +16,8 @@ NO_FAULT = ("ACCEPT", "NO_SIGNIFICANT_GAIN", "WORSE_THAN_CURRENT")  # the last: 
 CYCLE = ("bag", "cycle", "stamp", "hours", "samples", "code", "revision")
 DECISION = ("bag", "node", "stamp", "command", "code", "message")
 HOUR = (
-    "bag", "hour", "minutes", "rms_without_mm", "rms_with_mm", "lambda_without", "lambda_with",
-    "bound_mm", "p95_mm", "time_below_bound",
+    "bag", "topic", "hour", "minutes", "rms_without_mm", "rms_with_mm", "lambda_without",
+    "lambda_with", "bound_mm", "p95_mm", "time_below_bound",
 )  # fmt: skip
 
 
@@ -161,8 +161,15 @@ def decisions_table(bags: Sequence[Document]) -> str:
 
 def hours_table(bags: Sequence[Document]) -> str:
     """Every hour of each simulated cell as CSV."""
-    cells = [(bag["bag"], bag["cell"]) for bag in bags if bag.get("cell")]
-    return _csv([{"bag": name, **hour} for name, cell in cells for hour in cell["by_hour"]], HOUR)
+    return _csv(
+        [
+            {"bag": bag["bag"], "topic": cell["topic"], **hour}
+            for bag in bags
+            for cell in bag.get("cells", [])
+            for hour in cell["by_hour"]
+        ],
+        HOUR,
+    )
 
 
 def _decided(bag: Document) -> list[tuple[str | None, Sequence[Document]]]:

@@ -28,6 +28,7 @@ class CellCourse:
 
     Attributes
     ----------
+    topic : on which the truth was told.
     hours : (t,) since the recording began.
     without_mm, with_mm : (t,) rms without correction, and of what was commanded; at the same poses,
         where some were visited.
@@ -39,6 +40,7 @@ class CellCourse:
         words.
     """
 
+    topic: str
     hours: Array
     without_mm: Array
     with_mm: Array
@@ -53,6 +55,7 @@ class CellCourse:
         """Figures of the whole, and of each hour."""
         hour = self.hours.astype(int)
         return {
+            "topic": self.topic,
             **self._figures(np.ones(len(hour), dtype=bool)),
             "tolerance_mm": self.tolerance_mm,
             "faults": list(self.faults),

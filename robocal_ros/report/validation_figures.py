@@ -72,9 +72,9 @@ class ModelDrift:
     sigma: Array
 
 
-def cell_figures(course: CellCourse) -> tuple[Drawn, ...]:
+def cell_drawn(course: CellCourse) -> Drawn:
     """The figure of a cell's course."""
-    return (Drawn.of("cell", CELL_CAPTION, cell_figure(course)),)
+    return Drawn.of("cell", CELL_CAPTION, cell_figure(course))
 
 
 def thermal_figures(

@@ -31,8 +31,8 @@ ERRORS_NOTE = (
 def page(report: Document, figures: Figures) -> str:
     """The whole page.
 
-    ``report``: what report.json holds; ``figures``: by the bag's name, of its cell as a whole, then
-    of each of its sessions.
+    ``report``: what report.json holds; ``figures``: by the bag's name, one of each of its cells,
+    then those of each of its sessions.
     """
     rows, bags = summary_rows(report["bags"]), report["bags"]
     simulated = any(bag.get("simulated") for bag in bags)
@@ -52,7 +52,7 @@ def page(report: Document, figures: Figures) -> str:
 def _answer(rows: Sequence[Document], bags: Sequence[Document]) -> str:
     """Is it good, in mm? In one or two sentences."""
     failed = sum("error" in row for row in rows)
-    told = [_cell_answer(bag) for bag in bags if bag.get("cell")]
+    told = [_cell_answer(bag, cell) for bag in bags for cell in bag.get("cells", [])]
     for row in rows:
         if row["kind"] == "thermal" and row["rms_without_mm"] is not None:
             told.append(_thermal_answer(row))
@@ -76,11 +76,11 @@ def _accepted(row: Document) -> str:
     return f"{row['accepted']} of {row['cycles']}"
 
 
-def _cell_answer(bag: Document) -> str:
-    cell = bag["cell"]
+def _cell_answer(bag: Document, cell: Document) -> str:
+    name = bag["bag"] + (f", {cell['topic']}" if len(bag["cells"]) > 1 else "")
     share = f", {_share(cell['lambda_with'])} of all directions within {TOLERANCE_MM:g} mm"
     return (
-        f"{escape(bag['bag'])}: true rms error of the tool {_mm(cell['rms_without_mm'])} mm "
+        f"{escape(name)}: true rms error of the tool {_mm(cell['rms_without_mm'])} mm "
         f"without correction, <b>{_mm(cell['rms_with_mm'])} mm</b> with it"
         f"{share if cell['lambda_with'] is not None else ''}."
     )
@@ -149,11 +149,10 @@ def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
         f"<h2>{escape(bag['bag'])}{mark}</h2>",
         f'<p class="faint">{bag["from"]} to {bag["to"]}, {bag["duration_s"] / 3600.0:.2f} h</p>',
     ]
-    cell, *sessions = figures
-    if bag["cell"] is not None:
-        parts += ["<h3>The cell, by the truth</h3>"]
-        parts += [figure(drawn.svg, drawn.caption) for drawn in cell]
-        parts += _cell(bag["cell"])
+    cells, *sessions = figures
+    for cell, drawn in zip(bag["cells"], cells, strict=True):
+        parts.append(f"<h3>The cell, by the truth of {escape(cell['topic'])}</h3>")
+        parts += [figure(drawn.svg, drawn.caption), *_cell(cell)]
     for session, shown in zip(bag["sessions"], sessions, strict=True):
         parts.append(f"<h3>{TITLES[session['kind']]}</h3>")
         parts += [figure(drawn.svg, drawn.caption) for drawn in shown]

@@ -162,7 +162,8 @@ def test_a_customer_reads_how_accurate_the_cell_was(tmp_path):
         f"/{node}/session_events" for node in SCHEMAS
     }
     (hour,) = csv.DictReader(io.StringIO((tmp_path / "hours.csv").read_text()))
-    told = {name: float(value) for name, value in hour.items() if name != "bag"}
+    assert (hour.pop("bag"), hour.pop("topic")) == (BAG.name, "/truth/state")
+    told = {name: float(value) for name, value in hour.items()}
     assert told["minutes"] == pytest.approx(10.0, abs=0.1)
     assert 0.0 < told["rms_with_mm"] < told["rms_without_mm"]
     assert 0.0 <= told["lambda_without"] < told["lambda_with"] <= 1.0

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from robocal_ros.report.validation import (
 from robocal_ros.report.validation_cell import CellCourse
 from robocal_ros.report.validation_figures import (
     accuracy_by_cycle,
-    cell_figures,
+    cell_drawn,
     thermal_figures,
     tool_figures,
 )
@@ -66,7 +67,7 @@ def bag(name, *sessions, simulated=False):
     return {
         "bag": name, "path": f"/x/{name}", "from": "a", "to": "b", "duration_s": 7200.0,
         "topics": {}, "simulated": simulated, "sessions": list(sessions), "other_decisions": OTHER,
-        "cell": None,
+        "cells": [],
     }  # fmt: skip
 
 
@@ -192,6 +193,7 @@ def test_the_curves_are_the_numbers_of_the_cycles():
 
 
 COURSE = CellCourse(
+    topic="/left/truth/state",
     hours=np.array([0.0, 0.5, 1.0, 1.5]),
     without_mm=np.array([0.3, 0.4, 2.0, 2.0]),
     with_mm=np.array([0.03, 0.04, 2.0, np.nan]),
@@ -219,16 +221,34 @@ def test_the_course_of_a_cell_hour_by_hour():
 
 
 def test_the_page_tells_of_the_cell():
-    told = bag("one.mcap", simulated=True) | {"cell": COURSE.document()}
-    html = page(REPORT | {"bags": [told]}, {"one.mcap": [cell_figures(COURSE)]})
+    told = bag("one.mcap", simulated=True) | {"cells": [COURSE.document()]}
+    html = page(REPORT | {"bags": [told]}, {"one.mcap": [[cell_drawn(COURSE)]]})
     assert html.count("<svg") == 1
+    assert "The cell, by the truth of /left/truth/state</h3>" in html
+    assert "one.mcap: true rms error" in html
     for said in ("collision 2 mm", "95.0%", "1.00 h", "<b>1.155 mm</b> with it"):
         assert said in html
     (row, _) = csv.DictReader(io.StringIO(hours_table([told])))
     assert float(row["lambda_with"]) == pytest.approx(0.95)
     without = hours_table([bag("two.mcap")])
     assert hours_table([told]).startswith(without)
-    assert without.split(",")[:2] == ["bag", "hour"]
+    assert without.split(",")[:3] == ["bag", "topic", "hour"]
+
+
+def test_the_page_names_each_of_two_cells():
+    right = replace(COURSE, topic="/right/truth/state", with_mm=2.0 * COURSE.with_mm)
+    cells = [COURSE, right]
+    told = bag("two.mcap", simulated=True) | {"cells": [cell.document() for cell in cells]}
+    html = page(REPORT | {"bags": [told]}, {"two.mcap": [[cell_drawn(cell) for cell in cells]]})
+    assert html.count("<svg") == 2
+    for said in (
+        "two.mcap, /left/truth/state: true rms error", "<b>1.155 mm</b> with it",
+        "two.mcap, /right/truth/state: true rms error", "<b>2.310 mm</b> with it",
+        "by the truth of /left/truth/state</h3>", "by the truth of /right/truth/state</h3>",
+    ):  # fmt: skip
+        assert said in html
+    rows = list(csv.DictReader(io.StringIO(hours_table([told]))))
+    assert [row["topic"][:6] for row in rows] == ["/left/"] * 2 + ["/right"] * 2
 
 
 def test_tables_without_a_row_have_their_columns():
