@@ -164,12 +164,16 @@ def _write(folder: Path, report: Document, html: str) -> None:
     )
 
     bags = report["bags"]
-    write_text(folder / "report.html", html)
-    write_text(folder / "report.json", json.dumps(report, indent=1, allow_nan=False) + "\n")
-    write_text(folder / "bags.csv", bags_table(bags))
-    write_text(folder / "cycles.csv", cycles_table(bags))
-    write_text(folder / "decisions.csv", decisions_table(bags))
-    write_text(folder / "hours.csv", hours_table(bags))
+    texts = {
+        "report.json": json.dumps(report, indent=1, allow_nan=False) + "\n",
+        "bags.csv": bags_table(bags),
+        "cycles.csv": cycles_table(bags),
+        "decisions.csv": decisions_table(bags),
+        "hours.csv": hours_table(bags),
+        "report.html": html,  # the last: where it is, all is
+    }
+    for name, text in texts.items():
+        write_text(folder / name, text)
 
 
 class _Progress(Protocol):

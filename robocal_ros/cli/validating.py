@@ -16,7 +16,13 @@ from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.cli.replaying import Request, replay_bag
 from robocal_ros.cli.validating_cell import cell_courses
 from robocal_ros.cli.validating_cycles import shift_errors, thermal_document
-from robocal_ros.cli.validating_parts import as_recorded, calibrations, decisions, tool_runs
+from robocal_ros.cli.validating_parts import (
+    as_recorded,
+    calibrations,
+    decisions,
+    require_finite,
+    tool_runs,
+)
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
@@ -70,6 +76,7 @@ def validate_bag(job: Job) -> Validated:
             courses = cell_courses(reader, truth)
         told = {"sessions": [document for document, _ in sessions], "other_decisions": others}
         told["cells"] = [course.document() for course in courses]
+        require_finite(told, job.path)
     except RobocalError as error:
         return Validated(head | {"error": refusal(error.code, str(error))["error"]})
     except OSError as error:

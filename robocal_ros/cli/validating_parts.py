@@ -1,6 +1,7 @@
 """Replayed tool and hand-eye sessions: their results, and how far they are from the truth."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from robocal_ros.cli.output import Document
 from robocal_ros.cli.replay_parts import seconds
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError
 from robocal_ros.sessions.events import ACCEPT, Command
 
 Array = NDArray[np.float64]
@@ -100,6 +102,25 @@ def as_recorded(command: Command, outcome: Mapping[str, Any]) -> Document:
         "code": Code(outcome["status"]).name,
         "message": str(outcome["message"]),
     }
+
+
+def require_finite(told: Any, path: str, field: str = "") -> None:
+    """See that a bag's document has finite numbers alone, for JSON knows no others.
+
+    Raises
+    ------
+    InputError
+        With the bag and the number's place in the document.
+    """
+    if isinstance(told, float) and not math.isfinite(told):
+        raise InputError(f"{field} is {told}, which is no finite number", file=path)
+    parts: Iterable[tuple[str, Any]] = ()
+    if isinstance(told, dict):
+        parts = ((f"{field}.{name}" if field else name, part) for name, part in told.items())
+    elif isinstance(told, list | tuple):
+        parts = ((f"{field}[{i}]", part) for i, part in enumerate(told))
+    for name, part in parts:
+        require_finite(part, path, name)
 
 
 def _unasked(entry: Document, asked: bool) -> bool:

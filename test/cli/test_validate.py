@@ -37,7 +37,9 @@ from robocal_ros.cli import validating_many
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validating import Job
 from robocal_ros.cli.validating_many import validated
+from robocal_ros.cli.validating_parts import require_finite
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import InputError
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.records import arguments_text, outcome_text
 from robocal_ros.sessions.replay import NOT_BITS
@@ -284,6 +286,41 @@ class TestBadBags:
         assert str(bad) in document["bags"][1]["error"]["message"]
         assert "bad.mcap" in (out / "report.html").read_text()
         assert len(report["bags"]) == 3
+
+    @pytest.mark.parametrize(
+        ("topic", "kind", "told", "words"),
+        [
+            ("/truth/state", "std_msgs/msg/String", {"data": '{"faults": {"collision": NaN}}'},
+             ("/truth/state", "faults.collision is nan")),
+            ("/truth/tool", "std_msgs/msg/String",
+             {"data": json.dumps({"T_flange_tool": np.full((4, 4), np.nan).tolist()})},
+             ("/truth/tool", "T_flange_tool")),
+        ],
+    )  # fmt: skip
+    def test_what_is_no_number_is_that_of_its_bag(
+        self, validate, tmp_path, topic, kind, told, words
+    ) -> None:
+        bad = tmp_path / "bad.mcap"
+        with BagWriter(bad) as bag:
+            for recorded in read_bag(TOOL_RUNS):
+                if recorded.topic != topic:
+                    given = recorded.msgtype, recorded.message, recorded.log_time_ns
+                    bag.write(recorded.topic, *given)
+            bag.write(topic, kind, told, recorded.log_time_ns)
+        status, document, out, report = validate(TOOL_RUNS, bad)
+        assert status == 3
+        good, row = document["bags"]
+        assert (good["runs"], row["kind"]) == (5, None)
+        for said in (str(bad), *words):
+            assert said in row["error"]["message"]
+        assert len(report["bags"]) == 2
+        for name in ("report.html", "bags.csv", "cycles.csv", "decisions.csv", "hours.csv"):
+            assert (out / name).exists()
+
+    def test_no_document_holds_what_json_cannot(self) -> None:
+        found = {"sessions": [{"runs": [{"true_error_mm": 0.1}, {"true_error_mm": np.inf}]}]}
+        with pytest.raises(InputError, match=r"x\.mcap: sessions\[0\]\.runs\[1\]\.true_error_mm"):
+            require_finite(found, "x.mcap")
 
     def test_a_bag_that_does_not_say_its_robot(self, bags, validate) -> None:
         status, document, _, _ = validate(bags / "plain.mcap")
