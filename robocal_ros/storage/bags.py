@@ -78,13 +78,20 @@ class BagReader:
     Raises
     ------
     InputError
-        When it is not such a file or folder; the message says what to do.
+        When it is not such a file or folder, or broke off before any message; the message says what
+        to do.
     """
 
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
         paths, notes = _bag_files(self._path)
         self._files = [open_file(file) for file in paths]
+        if all(file.is_barren for file in self._files):
+            raise InputError(
+                f"the recording broke off at byte {self._files[0].broke_off} before any message; "
+                "nothing can be read",
+                file=str(self._files[0].path),
+            )
         self._notes = (*notes, *(note for file in self._files for note in file.notes))
         self._types: list[Typestore] = [get_typestore(Stores.EMPTY) for _ in self._files]
         self._stack = ExitStack()

@@ -64,8 +64,9 @@ class Lost(NamedTuple):
 class McapFile:
     """Content of a file: channels, schemas and blocks; ``notes`` say where it breaks off.
 
-    ``nameless``: messages whose channel was described in what is damaged. ``lost``: damaged
-    chunks by their place in the file, as far as they were met in reading.
+    ``broke_off``: the byte at which it does. ``nameless``: messages whose channel was described in
+    what is damaged. ``lost``: damaged chunks by their place in the file, as far as they were met in
+    reading.
     """
 
     path: Path
@@ -76,8 +77,14 @@ class McapFile:
     start_ns: int | None = None
     end_ns: int | None = None
     notes: list[str] = field(default_factory=list)
+    broke_off: int | None = None
     nameless: int = 0
     lost: dict[int, Lost] = field(default_factory=dict)
+
+    @property
+    def is_barren(self) -> bool:
+        """Whether it broke off before any message, whole or damaged."""
+        return self.broke_off is not None and not (self.counts or self.lost)
 
     def msgtype(self, channel: int) -> str:
         """Full name of a channel's type; ``unknown`` where the file does not define it."""
@@ -187,7 +194,8 @@ def _scanned(stream: IO[bytes], path: Path) -> McapFile:
     loose = len(MAGIC)  # where the records begin that are in no block yet
     damage = ""
     for opcode, start, end, words in _records(stream):
-        damage = damage or words
+        if words:
+            damage, file.broke_off = words, start
         if opcode == Opcode.CHUNK or end - loose > LOOSE_BLOCK or opcode is None:
             _add_block(stream, file, Block(0, loose, start - loose, False))
             loose = start

@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -152,9 +153,13 @@ def test_a_bag_cut_anywhere_is_read_as_far_as_it_goes(
     counts = []
     for length in sorted(random.Random(2).sample(range(9, len(data) - 8), 60)):
         cut.write_bytes(data[:length])
-        with BagReader(cut) as bag:
-            info = bag.info
-            found = [message.message for message in bag.messages(raw=True)]
+        try:
+            with BagReader(cut) as bag:
+                info = bag.info
+                found = [message.message for message in bag.messages(raw=True)]
+        except InputError:  # before its first message
+            assert not counts
+            continue
         assert info.truncated
         assert "broke off" in info.notes[0]
         assert sorted(found) == sorted(message.data for message in stored[: len(found)])
@@ -163,6 +168,30 @@ def test_a_bag_cut_anywhere_is_read_as_far_as_it_goes(
     assert counts == sorted(counts)
     assert counts[0] < 60
     assert counts[-1] == 220
+
+
+@pytest.mark.parametrize(("length", "at"), [(8, 8), (20, 8), (200, 46), (700, 46)])
+def test_a_bag_cut_before_its_first_message_is_refused(
+    small_bag: Path, tmp_path: Path, length: int, at: int
+) -> None:
+    """The header ends at byte 46; then comes the first chunk."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(small_bag.read_bytes()[:length])
+    words = f"broke off at byte {at} before any message; nothing can be read"
+    with pytest.raises(InputError, match=words) as caught:
+        bag_info(cut)
+    assert caught.value.file == str(cut)
+
+
+def test_a_last_file_without_a_message_loses_the_others_nothing(
+    small_bag: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "split"
+    folder.mkdir()
+    shutil.copy(small_bag, folder / "split_0.mcap")
+    (folder / "split_1.mcap").write_bytes(small_bag.read_bytes()[:200])
+    with pytest.warns(UserWarning, match="broke off"):
+        assert len(list(read_bag(folder))) == 220
 
 
 def test_zeros_after_a_power_cut_are_told(small_bag: Path) -> None:
