@@ -11,6 +11,7 @@ from command import ROOT, environment, robocal
 
 PREFIX = ".venv/bin/robocal "
 PAGES = ("README.md", *(f"docs/{name}.md" for name in ("quickstart", "identify", "history")))
+SHOWN = ("docs/replay.md", "docs/validate.md")  # pages that show what their first command prints
 REPLAY = ("replay", "bags/demo_shift.mcap", "--robot", "kr150_r3100", "--auto")
 
 
@@ -65,6 +66,43 @@ def test_commands_run_as_typed(page: str, tmp_path: Path, monkeypatch: pytest.Mo
     assert typed
     if any("out/state" in words for words in typed):  # stands for the demo's history
         assert robocal(*REPLAY, "--state", "out/state").returncode == 0
+    printed = []
     for words in typed:
         done = robocal(*words)
         assert done.returncode == 0, (words, done.stderr)
+        printed.append(done.stdout)
+    if page in SHOWN:
+        assert_shown(page, printed[0].splitlines())
+
+
+def assert_shown(page: str, printed: list[str]) -> None:
+    """The page's first indented lines are what was printed; "…" stands for lines left out."""
+    text = (ROOT / page).read_text()
+    (block, *_) = re.findall(r"(?:^    .*\n)+", text, re.MULTILINE)
+    at, left_out = 0, False
+    for line in block.splitlines():
+        if line.strip() == "…":
+            left_out = True
+            continue
+        while left_out and at < len(printed) and not alike(line, printed[at]):
+            at += 1
+        assert at < len(printed), (page, line)
+        assert alike(line, printed[at]), (line, printed[at])
+        at, left_out = at + 1, False
+    assert at == len(printed), printed[at:]
+
+
+def alike(shown: str, printed: str) -> bool:
+    """The same words; of numbers another machine may round the last digit the other way."""
+    words, others = shown.split(), printed.split()
+    pairs = zip(words, others, strict=False)
+    return len(words) == len(others) and all(one == two or nearly(one, two) for one, two in pairs)
+
+
+def nearly(shown: str, printed: str) -> bool:
+    number = re.compile(r"-?\d+\.(\d+)(%?)")
+    one, two = number.fullmatch(shown), number.fullmatch(printed)
+    if one is None or two is None or (len(one[1]), one[2]) != (len(two[1]), two[2]):
+        return False
+    away = float(shown.rstrip("%")) - float(printed.rstrip("%"))
+    return abs(away) < 1.5 * 10.0 ** -len(one[1])
