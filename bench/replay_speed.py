@@ -18,9 +18,11 @@ from robocal_ros.core.samples import JointBlock, joint_sample
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions.observations import ObservationDesk
 from robocal_ros.sessions.replay import one_by_one
-from robocal_ros.storage.bags import BagReader
+from robocal_ros.storage.bags import BagReader, bag_info
 from robocal_ros.storage.robots import load_robot
 
+ROOT = Path(__file__).resolve().parent.parent
+GOLDEN = ROOT / "out" / "golden_shift.mcap"  # of bags/make_golden_shift.py
 HOURS = (2.0, 8.0)
 TURNS = 3
 BAGS = 8  # of the longer length, validated one after the other, then beside each other
@@ -33,10 +35,11 @@ LEAST_GAIN = 1.7  # of two cores over one
 
 
 def tables() -> list[Table]:
-    """Ingestion of joint states, whole replays of two lengths, many bags beside each other."""
+    """Ingestion, whole replays of two lengths, many bags beside each other, and a whole cell's."""
     with tempfile.TemporaryDirectory() as name:
         shifts = [write_shift(Path(name) / f"{hours:g}h.mcap", hours) for hours in HOURS]
-        return [_ingestion(shifts[0]), _replays(shifts), _many(shifts[-1])]
+        whole = [_whole_cell(GOLDEN, Path(name) / "golden")] if GOLDEN.exists() else []
+        return [_ingestion(shifts[0]), _replays(shifts), _many(shifts[-1]), *whole]
 
 
 def _ingestion(shift: LongShift) -> Table:
@@ -150,17 +153,40 @@ def _replays(shifts: list[LongShift]) -> Table:
 
 
 def _replayed(shift: LongShift) -> _Cost:
-    """Cost of the command in a process of its own."""
+    """Cost of the command with the shift's windows."""
     cold, *warm = (f"{start:.3f}:{end:.3f}" for start, end in shift.windows)
     windows = [word for window in warm for word in ("--warm", window)]
-    command = [sys.executable, "-c", _RUN, "replay", str(shift.path), "--robot", ROBOT, "--json"]
+    return _cost(["replay", str(shift.path), "--robot", ROBOT, "--json", "--cold", cold, *windows])
+
+
+def _cost(words: list[str]) -> _Cost:
+    """Cost of a command in a process of its own."""
     before, start = os.times(), time.perf_counter()
     done = subprocess.run(
-        [*command, "--cold", cold, *windows], capture_output=True, text=True, check=True
+        [sys.executable, "-c", _RUN, *words], capture_output=True, text=True, check=True
     )
     wall_s, after = time.perf_counter() - start, os.times()
     cpu_s = sum(after[2:4]) - sum(before[2:4])  # of children that have ended
     return _Cost(wall_s, cpu_s, float(done.stderr.split()[-1]) / 1024.0)
+
+
+def _whole_cell(bag: Path, report: Path) -> Table:
+    """Two nodes' sessions, thousands of truths, the course of the cell: all that validate does."""
+    info = bag_info(bag)
+    duration_s = ((info.end_ns or 0) - (info.start_ns or 0)) * 1e-9
+    cost = _cost(["validate", str(bag), "--report", str(report)])
+    table = Table(
+        "whole_cell",
+        f"robocal validate of {bag.name}: {duration_s / 3600.0:.2f} h of a whole cell, its thermal "
+        "and its tool's session as recorded, its truth",
+        ("messages", "bag, MB", "took, s", "of a core, s", "times real time", "memory, MB"),
+        "One process from its start to its report.",
+    )
+    table.add(
+        info.messages, bag.stat().st_size / 1e6, cost.wall_s, cost.cpu_s,
+        duration_s / cost.wall_s, cost.peak_mb,
+    )  # fmt: skip
+    return table
 
 
 def _many(shift: LongShift) -> Table:
