@@ -3,6 +3,10 @@
 import os
 from pathlib import Path
 
+ENDS_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM", "--")
+"""Before a command: the system asks it to end once the thread that started it is gone, however that
+ended. A node that outlived its test or bench would go on talking to those that come after."""
+
 
 def resident_mb(pid: int) -> float:
     """Resident memory, MB."""

@@ -16,7 +16,7 @@ from robocal_msgs.srv import ListCalibrations
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from bench.processes import resident_mb
+from bench.processes import ENDS_WITH_PARENT, resident_mb
 from bench.startup import EXECUTABLES
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import model_document
@@ -99,7 +99,7 @@ class LoadedGraph:
         given = ("-p", f"serial:={SERIAL}", "-p", f"robot:={ROBOT}", *more)
         with (folder / f"{name}.log").open("w") as log:
             return subprocess.Popen(
-                [str(EXECUTABLES / name), "--ros-args", *given],
+                [*ENDS_WITH_PARENT, str(EXECUTABLES / name), "--ros-args", *given],
                 env=os.environ | {"ROBOCAL_STATE": str(folder / "state")},
                 stdout=log,
                 stderr=subprocess.STDOUT,

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
+from bench.processes import ENDS_WITH_PARENT
 from bench.startup import EXECUTABLES
 from robocal_ros.nodes import qos
 
@@ -32,7 +33,10 @@ class LiveError(RuntimeError):
 
 
 class Executable:
-    """A node of the install tree as its own process, its words kept in a log file."""
+    """A node of the install tree as its own process, its words kept in a log file.
+
+    It does not outlive the thread that starts it.
+    """
 
     def __init__(
         self,
@@ -46,12 +50,13 @@ class Executable:
         program = EXECUTABLES / name
         if not program.exists():
             raise LiveError(f"{program} is missing: run make setup")
+        start = [*ENDS_WITH_PARENT, str(program), "--ros-args"]
         options = [("--params-file", str(file)) for file in files]
         options += [("-p", f"{key}:={value}") for key, value in parameters.items()]
         options += [("-r", f"{old}:={new}") for old, new in remap.items()]
         with self.log.open("w") as log:
             self._process = subprocess.Popen(
-                [str(program), "--ros-args", *(word for pair in options for word in pair)],
+                [*start, *(word for pair in options for word in pair)],
                 env=os.environ | {"ROBOCAL_STATE": str(folder / "state")},
                 stdin=subprocess.DEVNULL,
                 stdout=log,

@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
+from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.nodes import qos
 
 ROOT = Path(__file__).parent.parent.parent
@@ -46,13 +47,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class Executable:
-    """A node that runs as its own process."""
+    """A node that runs as its own process, at most as long as the thread that starts it."""
 
     def __init__(self, name: str, command: list[str], environment: dict[str, str]) -> None:
         self.name = name
         self._log = tempfile.TemporaryFile("w+")  # noqa: SIM115 (closed by stop)
         self.process = subprocess.Popen(
-            command,
+            [*ENDS_WITH_PARENT, *command],
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=self._log,

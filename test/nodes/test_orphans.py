@@ -1,0 +1,66 @@
+"""What starts nodes may be killed at any time: none of them goes on without it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from domains import free_domain
+
+ROOT = Path(__file__).parent.parent.parent
+WITHIN_S = 10.0
+FOLDERS = f"import sys; sys.path[:0] = [{str(ROOT)!r}, {str(Path(__file__).parent)!r}]"
+BENCH = f"""
+{FOLDERS}
+import time
+from pathlib import Path
+from bench.live.graph import Executable
+node = Executable("cell_sim_node", {{}}, {{}}, Path(sys.argv[1]))
+print(node.pid, flush=True)
+time.sleep(600)
+"""
+TESTS = f"""
+{FOLDERS}
+import os, time
+from conftest import EXECUTABLES, Executable
+node = Executable("cell_sim_node", [str(EXECUTABLES / "cell_sim_node")], dict(os.environ))
+print(node.process.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def lives(pid: int) -> bool:
+    """Whether a process is there and has not ended; an ended one may wait for its heir."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("script", [BENCH, TESTS], ids=["bench", "tests"])
+def test_a_node_ends_with_what_started_it(script: str, by: signal.Signals, tmp_path: Path) -> None:
+    with free_domain() as domain:
+        starter = subprocess.Popen(
+            [sys.executable, "-c", script, str(tmp_path)],
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain), "ROBOCAL_STATE": str(tmp_path)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert starter.stdout is not None
+        node = int(starter.stdout.readline())
+        time.sleep(0.5)  # it is a node by then, or on its way to one
+        assert lives(node)
+        starter.send_signal(by)
+        starter.wait()
+        deadline = time.monotonic() + WITHIN_S
+        try:
+            while lives(node) and time.monotonic() < deadline:
+                time.sleep(0.05)
+            assert not lives(node)
+        finally:
+            if lives(node):
+                os.kill(node, signal.SIGKILL)
