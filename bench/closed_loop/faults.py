@@ -117,6 +117,7 @@ class Report:
     gaps : after the fault until somebody gave the right code; one more than there were where
         nobody did.
     over_s : the longest overrun of a gap.
+    drive_faults : trajectories that the robot's drives did not take.
     """
 
     trial: Trial
@@ -125,6 +126,7 @@ class Report:
     gaps: float
     harm: Harm
     over_s: float
+    drive_faults: int
 
     @property
     def in_time(self) -> bool:
@@ -146,7 +148,8 @@ def report_of(trial: Trial, with_suite: ShiftRecord, without: ShiftRecord) -> Re
         for _, found in _told(gap):
             who, code, gaps = ALARM, found, trial.gaps + 1.0
     over_s = max(gap.over_s for gap in with_suite.gaps)
-    return Report(trial, who, code, gaps, harm(with_suite, without, after=CLEAN), over_s)
+    worse = harm(with_suite, without, after=CLEAN)
+    return Report(trial, who, code, gaps, worse, over_s, with_suite.drive_faults)
 
 
 def _told(gap: GapReport) -> list[tuple[str, Code]]:

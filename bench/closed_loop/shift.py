@@ -112,13 +112,21 @@ class Judged:
 
 @dataclass
 class ShiftRecord:
-    """What came of a shift."""
+    """What came of a shift.
+
+    Attributes
+    ----------
+    drive_faults : trajectories, from the commissioning on, that the robot's drives did not take.
+    peak_share : greatest joint speed that was commanded, over that of its drive.
+    """
 
     plan: ShiftPlan
     seed: int
     passes: list[Judged] = field(default_factory=list)
     gaps: list[GapReport] = field(default_factory=list)
     refused: list[tuple[float, str]] = field(default_factory=list)
+    drive_faults: int = 0
+    peak_share: float = 0.0
 
     def errors(self) -> tuple[Array, Array]:
         """Times (p,) and errors (p, k, 3) of the passes that were produced."""
@@ -174,6 +182,8 @@ class Worker:
             self._happens(self._now_s)
             self._record.gaps.append(plant.gap(f"cycle-{number}", plan.gap_s))
             self._produce(number, until_s)
+        motion = plant.cell.motion
+        self._record.drive_faults, self._record.peak_share = motion.faults, motion.peak_share
         return self._record
 
     def _produce(self, cycle: int, until_s: float) -> None:

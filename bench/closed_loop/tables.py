@@ -110,7 +110,8 @@ def shift_table(pairs: Sequence[Pair]) -> Table:
         ("what", "figure", "goal"),
         "Within tolerance: 95 % of the errors of a pass below 0.3 mm, in every pass from then to "
         "the next incident; what was made from the collision to the next gap is in the share of "
-        "its hour. Right after a gap: all passes up to the next one were made with a bent tool.",
+        "its hour. Right after a gap: all passes up to the next one were made with a bent tool. "
+        "Drive fault: a joint was commanded faster than its drive reaches; the robot brakes.",
     )
     records = [on for on, _ in pairs]
     plan, incidents = records[0].plan, incident_hours(records[0].plan)
@@ -121,6 +122,10 @@ def shift_table(pairs: Sequence[Pair]) -> Table:
     stood = sum(refused(record, {0, *quiet}) for record in records)
     table.add("gaps run", len(gaps), None)
     table.add("longest overrun of a gap, s", over_s, Goal(over_s, 0.0))
+    drives = sum(record.drive_faults for record in records)
+    table.add("drive faults", drives, Goal(drives, 0))
+    peak = 100.0 * max(record.peak_share for record in records)
+    table.add("greatest joint speed commanded, % of its drive's", peak, None)
     table.add("gaps from the collision until within tolerance", recovered,
               Goal(recovered, RECOVERED_GAPS))  # fmt: skip
     table.add("passes refused, hours without an incident", stood, Goal(stood, 0))
@@ -188,7 +193,7 @@ def faults_table(reports: Sequence[Report]) -> Table:
         "Faults: who reports them, and what they cost",
         ("fault", "size", "seed", "gaps after it", "reported by", "code", "right code",
          "gaps until it", "goal", "worst cycle worse by, mm", "goal ", "passes refused",
-         "overrun, s"),
+         "overrun, s", "drive faults"),
         "One gap, then the fault, then gaps after it, twelve of them for small knocks of a warm "
         "robot. Worse: rms error of the production after a gap from the fault on, with the suite "
         "less without it, of the passes that were made; stood: there were none. Refused: the "
@@ -204,7 +209,7 @@ def faults_table(reports: Sequence[Report]) -> Table:
             Goal(one.gaps, 1.0) if one.trial.must_be_told else None,
             "stood" if stood else MM * one.harm.cycle_m,
             None if stood else Goal(MM * one.harm.cycle_m, MM * FAULTY_RMS_M),
-            one.harm.refused, Goal(one.over_s, 0.0),
+            one.harm.refused, Goal(one.over_s, 0.0), Goal(one.drive_faults, 0),
         )  # fmt: skip
     return table
 

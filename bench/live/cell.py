@@ -85,7 +85,7 @@ def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
 
     motion: dict[str, object] = {"motion_silence_s": 0.5, "motion_late_s": LATE_S}
     motion |= {"deviation_mm": 5.0}  # at 1.5 m/s, where the usual 2 mm go with 0.25 m/s
-    motion |= {"laser": str(made.laser), "joint_velocity_deg_s": [115.0]}
+    motion |= {"laser": str(made.laser), "joint_velocity_deg_s": [105.0]}
     nodes: dict[str, dict[str, object]] = {
         "cell_sim_node": {"seed": SEED, "warm_h": WARM_H, "laser_csv": ""},
         "recorder_node": {"folder": str(recordings), "topics": [*TOPICS, TRUTH]},

@@ -21,6 +21,7 @@ from robocal_ros.nodes.cell_sim_settings import (
     laser_pose,
 )
 from robocal_ros.nodes.diagnostics import WARN, Health
+from robocal_ros.nodes.endpoints import LOG_EVERY_S
 from robocal_ros.nodes.run import run
 from robocal_ros.sessions.correction.inputs import trajectory_command
 from robocal_ros.sim.cell import TICK_S, SimulatedCell
@@ -108,7 +109,8 @@ class CellSimNode(HouseNode):
         if command.stamp_ns:
             start_s = (command.stamp_ns - self._origin_ns) * 1e-9
         q, qd, qdd = in_joint_order(command, cell.plan.arm)
-        cell.follow(start_s + command.time_from_start_s, q, qd, qdd)
+        if not cell.follow(start_s + command.time_from_start_s, q, qd, qdd):
+            self.get_logger().error(cell.motion.fault, throttle_duration_sec=LOG_EVERY_S)
 
     def _judge(self, message: Any) -> None:
         """A trajectory of the programme: the truth tells what would come of it.
@@ -163,9 +165,11 @@ class CellSimNode(HouseNode):
             return health
         if self._refused:
             health.worsen(WARN, self._refused)
+        if cell.motion.faults:
+            health.worsen(WARN, cell.motion.fault)
         if cell.faults.sizes:
             health.worsen(WARN, f"simulated fault: {', '.join(cell.faults.sizes)}")
-        health.values = {"moving": cell.moving}
+        health.values = {"moving": cell.moving, "drive faults": cell.motion.faults}
         health.values |= {f"{topic} sent": count for topic, count in self._out.told.items()}
         return health
 

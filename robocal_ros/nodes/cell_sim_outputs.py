@@ -121,12 +121,17 @@ class CellOutputs:
 
 
 def truth_of(cell: SimulatedCell, commanded: Commanded | None) -> dict[str, Any]:
-    """What is true now, for judging alone; K, m, and the size of each fault in SI."""
+    """What is true now, for judging alone; K, m, and the size of each fault in SI.
+
+    The share is of the drives' greatest speeds, as commanded since the begin.
+    """
     warmth, working = cell.warmth, cell.plan.working
     told = {
         "simulated": True,
         "cell_time_s": cell.now_s,
         "faults": dict(cell.faults.sizes),
+        "drive_faults": cell.motion.faults,
+        "peak_speed_share": cell.motion.peak_share,
         "motor_k": warmth.motor.tolist(),
         "link_k": warmth.link.tolist(),
     }

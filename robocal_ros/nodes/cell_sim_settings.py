@@ -15,7 +15,7 @@ from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, 
 from robocal_ros.sim.cell_faults import FAULTS
 from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
 from robocal_ros.sim.kr150_cell import T_BASE_LASER, kr150_cell, poses
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_description, load_robot
 
 Array = NDArray[np.float64]
 
@@ -231,6 +231,7 @@ def _tool_cell(settings: Mapping[str, Any]) -> CellPlan:
         station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), noise=noise),
         tool=_tool(settings, arm.T_flange_tool),
         q_start=np.where(arm.prismatic, given * MM, np.radians(given)),
+        fastest=load_description(settings["robot"]).max_velocity,
     )
 
 

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from robocal_ros.core.errors import LimitError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.sim.beam_moves import Circle, Plunge
 from robocal_ros.sim.beam_program import program
@@ -60,7 +61,7 @@ class SimulatedCell:
     def __init__(self, plan: CellPlan) -> None:
         self.plan = plan
         self._mounted = self.next_tool = plan.tool
-        self.motion = JointMotion(plan.q_start)
+        self.motion = JointMotion(plan.q_start, plan.fastest)
         self.faults = Faults()
         self._waiting: tuple[Fault, float] | None = None
         self._draws = Draws(plan.seed)
@@ -123,7 +124,7 @@ class SimulatedCell:
         q: ArrayLike,
         qd: ArrayLike | None = None,
         qdd: ArrayLike | None = None,
-    ) -> None:
+    ) -> bool:
         """Follow a trajectory at once, see `JointMotion.follow`; times as of `now_s`.
 
         Raises
@@ -131,8 +132,10 @@ class SimulatedCell:
         InputError
             When it cannot be followed.
         """
-        self.motion.follow(self.now_s, time_s, q, qd, qdd)
+        if not self.motion.follow(self.now_s, time_s, q, qd, qdd):
+            return False
         self._begin()
+        return True
 
     def hold(self) -> None:
         """Stand still at once."""
@@ -144,12 +147,13 @@ class SimulatedCell:
         Raises
         ------
         LimitError
-            When it is out of reach.
+            When it is out of reach, or too fast for the drives.
         """
         q_now = self.motion.at([self.now_s])[0][0]
         phase = 2.0 * np.pi * self._draws.of(Stream.RIPPLE, self._motions).random()
         time, q, qd, move = program(self.plan.arm, step, q_now, self.plan.ripple, phase)
-        self.follow(self.now_s + time, q, qd)
+        if not self.follow(self.now_s + time, q, qd):
+            raise LimitError(f"the robot cannot drive step {step.name}: {self.motion.fault}")
         return replace(move, start_s=self.now_s + move.start_s)
 
     # ---- time -----------------------------------------------------------------------------------

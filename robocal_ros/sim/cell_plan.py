@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
@@ -31,6 +31,7 @@ class CellPlan:
     station : the true one; its ``noise`` is the robot's scatter there.
     tool : as it is mounted at the begin.
     q_start : (n,) where the robot stands then.
+    fastest : (n,) or one for all: greatest speeds of its drives, rad/s (prismatic: m/s).
     rate_hz, reading_noise_rad : of the joint readings; without noise they are exact.
     ripple : relative, of the speed of circles that the robot's program drives.
     heat : what warms it up; None: it stays cold.
@@ -43,6 +44,7 @@ class CellPlan:
     station: BeamStation
     tool: RoundTool
     q_start: Array
+    fastest: ArrayLike = np.inf
     rate_hz: float = 125.0
     reading_noise_rad: float = 0.0
     ripple: float = 0.02

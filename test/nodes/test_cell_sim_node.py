@@ -9,6 +9,7 @@ import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, TransformStamped
+from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from robocal_msgs.msg import BeamEvent, ToolStep
 from sensor_msgs.msg import JointState, PointCloud2, Temperature
@@ -159,6 +160,32 @@ def test_what_it_cannot_follow_is_counted_and_changes_nothing(graph):
     assert not cell.node._cell.moving
 
 
+def test_a_jump_is_a_drive_fault_that_is_told(graph):
+    cell = Cell(graph)
+    truths = graph.collect(String, "/cell_sim_node/truth/state", qos.LATCHED)
+    logs = graph.collect(Log, "/rosout", qos.LATCHED)
+    diagnostics = graph.collect(DiagnosticArray, "/diagnostics")
+    cell.path([HOME + 0.5], [2.0])
+    graph.spin_until(lambda: abs(cell.states[-1].position[0] - HOME[0]) > 0.02, "it moves")
+    cell.path([HOME + 1.5], [0.008])
+    graph.spin_until(lambda: not cell.node._cell.moving, "it stands")
+    graph.spin_for(0.1)
+    _, q = cell.readings()
+    assert 0.02 < q[-1, 0] - HOME[0] < 0.5
+    assert np.max(np.abs(np.diff(q, axis=0))) < 0.4 * 0.008 * 1.1  # peak speed: 0.375 rad/s
+    graph.spin_until(lambda: truths and json.loads(truths[-1].data)["drive_faults"] == 1, "counted")
+    assert json.loads(truths[-1].data)["peak_speed_share"] > 50.0
+    graph.spin_until(lambda: any("drive fault: joint" in m.msg for m in logs), "logged")
+    assert {m.level for m in logs if "drive fault" in m.msg} == {Log.ERROR}
+    graph.spin_until(lambda: diagnosed(diagnostics, "drive fault: joint"), "diagnosed")
+    cell.path([HOME], [2.0])  # what it can follow it follows
+    graph.spin_until(lambda: cell.node._cell.moving, "it moves again")
+
+
+def diagnosed(diagnostics: Any, words: str) -> bool:
+    return any(words in status.message for array in diagnostics for status in array.status)
+
+
 def test_an_announced_step_is_driven_once(graph):
     cell = Cell(graph, run_program=True, tool_bend_mm=[1.0, -0.5, 0.0])
     steps = cell.steps()
@@ -193,9 +220,7 @@ def test_a_step_out_of_reach_is_told(graph):
     message = step_message()
     message.flange.position.x += 3.0
     cell.steps().publish(message)
-    graph.spin_until(
-        lambda: any("does not reach" in s.message for a in diagnostics for s in a.status), "told"
-    )
+    graph.spin_until(lambda: diagnosed(diagnostics, "does not reach"), "told")
     assert cell.node.is_active
 
 

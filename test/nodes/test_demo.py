@@ -11,7 +11,11 @@ from pathlib import Path
 import pytest
 from domains import free_domain
 
+from bench.live.cell import TRUTH
+from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.core.codes import Code
+from robocal_ros.sim.joint_motion import ROOM
+from robocal_ros.storage.bags import BagReader
 
 pytestmark = pytest.mark.cell
 
@@ -26,9 +30,10 @@ NOISE_MM = 0.05  # rms of a robot that repeats to some hundredths, and of what i
 def demo(tmp_path_factory) -> tuple[str, dict, Path]:
     """What the demo printed, what it told of its story, and its folder."""
     out = tmp_path_factory.mktemp("demo")
+    command = sys.executable, str(ROOT / "bags" / "demo.py")
     with free_domain() as domain:
         done = subprocess.run(
-            [sys.executable, str(ROOT / "bags" / "demo.py"), "--out", str(out), "--no-open"],
+            [*ENDS_WITH_PARENT, *command, "--out", str(out), "--no-open"],
             env=os.environ | {"ROS_DOMAIN_ID": str(domain), "COLUMNS": "120"},
             capture_output=True,
             text=True,
@@ -73,6 +78,17 @@ def test_the_line_reads_what_is_known(demo):
     states = [moment["state"] for moment in story["moments"]]
     assert states[0] == "EXPIRED"
     assert states[1:] == ["OK", "OK", "OK"]
+
+
+def test_the_drives_take_all_that_they_are_sent(demo):
+    _, _, out = demo
+    (bag,) = sorted((out / "recordings").glob("robocal_*"))
+    with BagReader(bag) as reader:
+        *_, last = (json.loads(m.message.data) for m in reader.messages([TRUTH]))
+    assert last["drive_faults"] == 0, last
+    assert (
+        0.9 < last["peak_speed_share"] < 1.0 + ROOM
+    )  # the programme is near what the drives reach
 
 
 def test_the_recording_gives_the_live_results_again(demo):

@@ -4,6 +4,7 @@ one cycle, and the robot at home or a fault that says why not. All is simulated.
 The soak takes all sixteen of the tool's side: ``ROBOCAL_FAULTS=all``; or name some of them.
 """
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -14,11 +15,13 @@ import pytest
 from maintenance_live import HOME_DEG, LiveCell
 from robocal_msgs.msg import MaintenanceStatus
 from robocal_msgs.srv import Acknowledge, GetMaintenance, RunMaintenanceCycle
+from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from bench.closed_loop.faults import RIGHT
-from bench.live.cell import set_fault
+from bench.live.cell import TRUTH, set_fault
 from robocal_ros.core.codes import Code
+from robocal_ros.nodes import qos
 from robocal_ros.sim.cell_faults import Fault
 
 pytestmark = pytest.mark.cell
@@ -42,6 +45,7 @@ class FaultCell:
 
     def __init__(self, graph: Any, folder: Path) -> None:
         self.graph, self.cell = graph, LiveCell(graph, folder)
+        self.truths = graph.collect(String, TRUTH, qos.LATCHED)
         self.until(lambda: self.told("/tcf_node/arm", SetBool, data=True), "armed")
         self.until(lambda: self.told("/tcf_node/measure_reference_trigger"), "it measures")
         self.until(lambda: " NONE " not in self.result(), "the healthy tool is measured")
@@ -106,6 +110,10 @@ def test_each_fault_has_its_code_within_one_cycle(graph: Any, tmp_path: Path) ->
     healthy = cell.gap("healthy")
     assert healthy.result.tool_code == Code.ACCEPT, healthy.result.message
     told = {fault: cell.tried(fault) for fault in MATRIX}
+    graph.spin_until(lambda: cell.truths, "the truth")
+    truth = json.loads(cell.truths[-1].data)
+    assert truth["drive_faults"] == 0, truth
+    assert 0.1 < truth["peak_speed_share"] < 1.0  # no stop threw the robot back
     wrong = {fault: said for fault, said in told.items() if said[0] is not RIGHT[fault]}
     assert not wrong
     assert all(end for _, end in told.values()), told

@@ -209,3 +209,16 @@ def test_at_worst_a_refused_pass_before_an_incident_is_outside():
 def test_at_worst_an_incident_before_the_first_pass_is_told():
     assert within_at_worst(always(GOOD), 1.0) == 1.0
     assert within_at_worst(always(None), 1.0) == 0.0
+
+
+@pytest.mark.parametrize("faults", [0, 1])
+def test_a_drive_fault_misses_its_goal(faults):
+    records = [shift(lambda t, cycle: GOOD, MIDWORK) for _ in range(2)]
+    for record in records:
+        record.gaps.append(GapReport())
+        record.peak_share = 0.8
+    records[1].drive_faults = faults
+    table = tables.shift_table([(record, record) for record in records])
+    named = {row[0]: row for row in table.rows}
+    assert named["drive faults"][2].met is (faults == 0)
+    assert named["greatest joint speed commanded, % of its drive's"][1] == 80.0

@@ -57,3 +57,5 @@ def test_the_correction_refuses_no_pass_before_the_first_gap():
     assert [one.cycle for one in made.passes] == [0, 1, 2]
     assert max(sizes(one).max() for one in made.passes) < 1e-4
     assert [gap.over_s for gap in made.gaps] == [0.0, 0.0]
+    assert made.drive_faults == 0
+    assert 0.5 < made.peak_share < 1.0

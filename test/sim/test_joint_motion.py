@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.sim.joint_motion import JointMotion
+from robocal_ros.sim.joint_motion import BRAKES_S, ROOM, JointMotion
 
 HOME = np.array([0.1, -0.4])
 
@@ -105,3 +105,56 @@ def test_what_cannot_be_followed_changes_nothing(time, q, words):
     with pytest.raises(InputError, match=words):
         motion.follow(1.0, time, q, np.zeros(np.shape(q)))
     assert np.array_equal(motion.at([1.5, 3.0])[0], before)
+
+
+# ---- drives --------------------------------------------------------------------------------------
+
+FASTEST = np.array([2.0, 3.0])
+REST = np.zeros((1, 2))
+
+
+def driven(q=HOME) -> JointMotion:
+    return JointMotion(q, FASTEST)
+
+
+def test_a_jump_is_a_drive_fault_and_the_robot_brakes():
+    motion = driven()
+    assert motion.follow(0.0, [2.0], [HOME + 2.0], REST)
+    now = 1.0
+    (here,), (speed,) = motion.at([now])
+    assert speed == pytest.approx([1.5, 1.5])
+    assert not motion.follow(now, [now + 0.008, now + 5.0], [here + 1.0, HOME], np.zeros((2, 2)))
+    assert motion.faults == 1
+    assert "joint 1 is sent at 18" in motion.fault  # a cubic's peak: 1.5 times 1 rad in 8 ms
+    assert motion.peak_share > 80.0
+    long_s = BRAKES_S * 1.5 / 2.0  # the first joint is nearest to its greatest speed
+    assert motion.end_s == pytest.approx(now + long_s)
+    time = now + np.linspace(0.0, long_s, 50)
+    q, qd = motion.at(time)
+    assert q[0] == pytest.approx(here, abs=1e-12)
+    assert qd == pytest.approx((speed * (1.0 - (time - now) / long_s)[:, None]), abs=1e-9)
+    assert q[-1] == pytest.approx(here + 0.5 * long_s * speed, abs=1e-12)
+    assert motion.follow(motion.end_s, [motion.end_s + 2.0], [HOME], REST)
+    assert motion.faults == 1
+
+
+def test_a_robot_at_rest_stays_there_at_a_jump():
+    motion = driven()
+    assert not motion.follow(0.0, [0.008], [HOME + 1.0])
+    assert motion.end_s == 0.0
+    assert np.array_equal(motion.at([0.0, 1.0])[0], [HOME, HOME])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("at", [0.1, 0.5, 0.77])
+def test_the_peak_between_points_counts(order, at):
+    """The true peak by the finest look; it is found to 1 % wherever it lies."""
+    rows = [[[1.1, 0.6], [0.1, 1.6]], [[0.3, -0.4], [0.0, 0.0]], np.zeros((2, 2))][:order]
+    free = JointMotion(HOME)
+    assert free.follow(0.0, [at, 1.0], *rows)
+    finest = np.max(np.abs(free.at(np.linspace(0.0, 1.0, 200_001))[1]), axis=0)
+    assert free.peak == pytest.approx(finest, rel=0.01)
+    for share, taken in ((1.0 + 0.8 * ROOM, True), (1.0 + 1.3 * ROOM, False)):
+        motion = JointMotion(HOME, finest / share)
+        assert motion.follow(0.0, [at, 1.0], *rows) is taken
+        assert motion.faults == (not taken)
