@@ -2,6 +2,7 @@
 
 setting      settings of the sessions, as a configured cell has them
 suite        the sessions, joined as the nodes join them
+carrying     what the maintenance asks of them
 words        what they tell each other
 plant        robot, PLC and suite on one clock: commissioning, gaps, production
 shift        the golden shift and shorter ones, and what came of them

@@ -77,6 +77,7 @@ class Plant:
     heard : takes everything that the cell tells, as it came and as samples for the sessions.
     begin_s : of the shift, once it has begun.
     commanded : joints (k, n) to which the last pass went for the working poses; None before.
+    is_open : what the PLC's heartbeat says of the gap.
     refused : what the correction refused, with the times.
     """
 
@@ -87,16 +88,12 @@ class Plant:
     refused: list[tuple[float, str]] = field(default_factory=list)
     begin_s: float = np.inf
     commanded: Array | None = None
-    _is_open: bool = False
+    is_open: bool = False
     _beat_s: float = -np.inf
 
     def __post_init__(self) -> None:
-        self.samples = CellSamples(
-            self.cell.plan.arm.joint_names,
-            setting.THERMAL.sphere,
-            station=setting.STATION,
-            frame=setting.FRAME,
-        )
+        names, sphere = self.cell.plan.arm.joint_names, setting.THERMAL.sphere
+        self.samples = CellSamples(names, sphere, station=setting.STATION, frame=setting.FRAME)
 
     @property
     def now_s(self) -> float:
@@ -125,7 +122,7 @@ class Plant:
             return
         if self.now_s >= self._beat_s + BEAT_S:
             self._beat_s = self.now_s
-            self.suite.maintenance.gap(self._is_open, self.now_s)
+            self.suite.gap(self.is_open, self.now_s)
         self._take(self.suite, came)
 
     def _take(self, suite: Suite, came: Happened) -> None:
@@ -185,7 +182,7 @@ class Plant:
         return self._thermal(suite, Command(events.END_CYCLE, told))
 
     def measure_tool(self, suite: Suite, mode: str, cycle_id: str) -> Outcome:
-        """Let the tool's driver measure, outside any gap; the robot stays where that ends.
+        """Open a gap and let the tool's driver measure; the robot stays where that ends.
 
         Raises
         ------
@@ -193,6 +190,8 @@ class Plant:
             When it is refused, or does not end.
         """
         before = suite.last_tool
+        self.is_open = True
+        suite.gap(True, self.now_s)
         suite.driver.arm(self.now_s)
         arguments = {"mode": mode, "cycle_id": cycle_id, "by": "commissioning"}
         suite.tool_command(Command(events.MEASURE_TOOL, arguments))
@@ -202,10 +201,11 @@ class Plant:
         return suite.last_tool
 
     def home_from_station(self, suite: Suite) -> None:
-        """Drive home from wherever the tool's driver left the robot."""
+        """Drive home from wherever the tool's driver left the robot, and close the gap."""
         self.listen(self.now_s + 1.0)
         self.send(suite.maintenance.ways.home(STATION, self._q).plan)
         self.listen(self.cell.motion.end_s + 1.0)
+        self.is_open = False
 
     def _show_ball(self, suite: Suite, rounds: int) -> None:
         for pose in [*np.tile(CYCLE, (rounds, 1)), HOME]:
@@ -237,7 +237,7 @@ class Plant:
             self.work(end_s)
             return GapReport()
         maintenance, result = self.suite.maintenance, None
-        self._is_open = True
+        self.is_open = True
         self.listen(self.now_s + LISTEN_S)
         try:
             left_s = end_s - self.now_s
@@ -245,12 +245,13 @@ class Plant:
             while result is not None and result.code is Code.NONE:
                 if self.now_s > end_s + WITHIN_S:
                     raise RuntimeError(f"{cycle_id}: not over {WITHIN_S:g} s after the gap's end")
+                self.is_open = self.now_s < end_s
                 self.step()
                 result = maintenance.result(cycle_id)
         except RobocalError as error:
             self.refused.append((self.now_s, f"{cycle_id}: {error}"))
         over_s = max(self.now_s, self.cell.motion.end_s) - end_s
-        self._is_open = False
+        self.is_open = False
         self.work(max(end_s, self.now_s))
         said = maintenance.status(self.now_s)
         return GapReport(result, said.fault_code, said.fault, max(over_s, 0.0))

@@ -28,6 +28,7 @@ THERMAL = ThermalConfig(
 HOUSING = Housing(clear_radius_m=0.06, top_m=0.03, floor_m=-0.12, retract_m=0.10, reach_m=0.3)
 LIMITS = MotionLimits(tcp_speed_m_s=0.25)
 DRIVING = DrivingConfig(HOUSING, 0.1, 0.01, 0.06, LIMITS)  # pin, its radius with a bend, flange
+STALE_S = 0.5  # of the heartbeat gap_open
 TRAVEL_M_S = 1.0
 TIMES = Times(check_s=20.0, full_s=35.0, tool_home_s=8.0)
 BOUNDS = AcceptBounds(automatic=True, tool_m=3e-3)

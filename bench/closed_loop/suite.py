@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.closed_loop import setting
-from bench.closed_loop.words import model_of, tool_answer, tool_of
+from bench.closed_loop.carrying import Carrier
+from bench.closed_loop.words import drift_of, model_of, tool_of
 from robocal_ros import __version__
-from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.plan import JointPlan
@@ -24,10 +24,9 @@ from robocal_ros.sessions.correction import CorrectionSession, JointCommand
 from robocal_ros.sessions.drift_following import EXPECTED
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance import MaintenanceSession
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift
-from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.maintenance.accuracy import Accuracy
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.tool import ToolSession
@@ -99,7 +98,8 @@ class Suite:
         config = replace(setting.THERMAL, prior="learned" if expected else "default")
         self.thermal = ThermalSession(nominal, history, config, __version__)
         self.tool = ToolSession(nominal, history, setting.tool_config(laser), __version__)
-        self.driver = ToolDriver(self.tool, setting.DRIVING, send, self.tool_command)
+        self._gap = Gap(setting.STALE_S)
+        self.driver = ToolDriver(self.tool, setting.DRIVING, send, self.tool_command, self._closed)
         self.maintenance = MaintenanceSession(
             nominal,
             history,
@@ -107,21 +107,37 @@ class Suite:
             Shelf(),
             lambda command, outcome: record("maintenance", command, outcome),
         )
+        self._carrier = Carrier(
+            self.maintenance,
+            self.tool,
+            self.driver,
+            send,
+            self.thermal_command,
+            self.tool_command,
+        )
         self.correction: CorrectionSession | None = None
         self.last_tool: Outcome | None = None  # of a run that has ended
         self.last_thermal: Outcome | None = None
         self._names = nominal.joint_names
         self._clock = Clock(0.0, 0)
-        self._ending: dict[str, int] = {}  # request that a thermal command answers
-        self._measuring = 0  # request that the open run answers
         self._polled_s = -np.inf
         self._offered: tuple[int, int] = (-1, -1)
 
     # ---- samples --------------------------------------------------------------------------------
 
+    def gap(self, is_open: bool, now_s: float) -> None:
+        """Take a heartbeat of the PLC, which the maintenance and the tool's driver both hear."""
+        self._gap.heard(is_open, now_s)
+        self.maintenance.gap(is_open, now_s)
+
+    def _closed(self, now_s: float) -> str:
+        self._gap.look(now_s)
+        return self._gap.closed(now_s)
+
     def step(self, samples: list[Sample], clock: Clock) -> None:
         """Take what has happened, and carry out what follows."""
         self._clock = clock
+        self._gap.look(clock.now_s)
         newest = None
         for sample in samples:
             self._take(sample)
@@ -137,7 +153,7 @@ class Suite:
         if clock.now_s >= self._polled_s + POLL_S:
             self.poll()
         for request in self.maintenance.tick(clock.now_s, clock.now_ns):
-            self._carry_out(request)
+            self._carrier.carry_out(request, clock.now_s)
 
     def _take(self, sample: Sample) -> None:
         now_s = self._clock.now_s
@@ -178,12 +194,7 @@ class Suite:
         for outcome in self.thermal.advance(wall_ns=self._clock.now_ns):
             self._record("thermal", outcome.command, outcome)
             self.last_thermal = outcome
-            if (number := self._ending.pop(outcome.command.name, 0)) != 0:
-                document = outcome.document or {}
-                missing = tuple(document.get("poses", {}).get("missing", ()))
-                code = outcome.status
-                answer = Answer(code, outcome.message, outcome.calibration_id, missing)
-                self.maintenance.answered(number, answer)
+            self._carrier.thermal_ended(outcome)
 
     def tool_command(self, command: Command) -> Outcome | None:
         """Ask the tool session, at once."""
@@ -198,55 +209,9 @@ class Suite:
 
     def _tool_ended(self, outcome: Outcome) -> None:
         self.last_tool = outcome
-        number, self._measuring = self._measuring, 0
         if outcome.document is None:
             self.driver.run_failed(outcome.message, self._clock.now_s)
-        if number:
-            self.maintenance.answered(number, tool_answer(outcome))
-
-    # ---- requests of the maintenance ------------------------------------------------------------
-
-    def _carry_out(self, request: ask.Request) -> None:
-        now_s = self._clock.now_s
-        match request:
-            case ask.Move() | ask.Stop():
-                self._send(request.plan)
-            case ask.BeginCycle():
-                self._ending[events.BEGIN_CYCLE] = request.number
-                self.thermal_command(Command(events.BEGIN_CYCLE, {"cycle_id": request.cycle_id}))
-            case ask.EndCycle():
-                self._ending[events.END_CYCLE] = request.number
-                self.thermal_command(Command(events.END_CYCLE, {"cycle_id": request.cycle_id}))
-            case ask.Arm():
-                self._answer(request.number, lambda: self.driver.arm(now_s))
-            case ask.Disarm():
-                self._answer(request.number, lambda: self.driver.disarm("maintenance", now_s))
-            case ask.Measure():
-                self._measure(request)
-            case ask.CancelMeasure():
-                if self.tool.run is not None:
-                    reason = {"code": int(Code.CONFLICT), "reason": "cancelled"}
-                    self.tool_command(Command(events.BREAK_OFF, reason))
-
-    def _answer(self, number: int, act: Callable[[], None]) -> None:
-        try:
-            act()
-            self.maintenance.answered(number, Answer(Code.ACCEPT))
-        except RobocalError as error:
-            self.maintenance.answered(number, Answer(error.code, str(error)))
-
-    def _measure(self, request: ask.Measure) -> None:
-        try:
-            self.driver.require_ready()
-        except RobocalError as error:
-            self.maintenance.answered(request.number, Answer(error.code, str(error)))
-            return
-        arguments = {"mode": request.mode, "cycle_id": request.cycle_id, "by": "maintenance"}
-        begun = self.tool_command(Command(events.MEASURE_TOOL, arguments))
-        if begun is not None and begun.done and not begun.repeated:
-            self._measuring = request.number
-        elif begun is not None:
-            self.maintenance.answered(request.number, tool_answer(begun))
+        self._carrier.tool_ended(outcome)
 
     # ---- what is in force -----------------------------------------------------------------------
 
@@ -290,6 +255,5 @@ class Suite:
         return self.maintenance.accuracy(self._clock.now_s, self._clock.now_ns)
 
     def _tell_drift(self) -> None:
-        found = self.thermal.accuracy(self._clock.now_ns)
-        drift = Drift(found.level, found.reason, found.error, found.due_in_s)
+        drift = drift_of(self.thermal, self._clock.now_ns)
         self.maintenance.drift(drift, self._clock.now_s)

@@ -5,6 +5,7 @@ import numpy as np
 from bench.closed_loop import setting
 from robocal_ros.sessions.correction import OfferedModel, OfferedTool
 from robocal_ros.sessions.events import Outcome
+from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.tool import ToolSession
@@ -56,3 +57,9 @@ def tool_answer(outcome: Outcome) -> Answer:
         deviation_mm=float(document["change"]["tip_mm"]),
         sigma_mm=float(np.max(document["sigma_mm"])),
     )
+
+
+def drift_of(session: ThermalSession, now_ns: int) -> Drift:
+    """What the thermal session tells the maintenance of the robot's accuracy."""
+    found = session.accuracy(now_ns)
+    return Drift(found.level, found.reason, found.error, found.due_in_s)

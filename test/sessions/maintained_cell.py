@@ -11,24 +11,13 @@ from maintenance_cell import BEAT_S, HOME, Shelf
 from shift import BALL, NOISE_M, T_SENSOR_BASE, warmed
 from tool_driver import TAUGHT
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
+from bench.closed_loop.carrying import Carrier
+from bench.closed_loop.words import drift_of
 from robocal_ros.core.motion.travel import joint_way
 from robocal_ros.core.samples import JointSample, PointSample
 from robocal_ros.sessions.driving_config import DrivingConfig
-from robocal_ros.sessions.events import (
-    BEGIN_CYCLE,
-    BREAK_OFF,
-    CAPTURE_REFERENCE,
-    END_CYCLE,
-    MEASURE_TOOL,
-    Command,
-    Outcome,
-)
+from robocal_ros.sessions.events import CAPTURE_REFERENCE, Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.sim.joint_motion import JointMotion
 
@@ -76,8 +65,15 @@ class MaintainedCell(Robot):
         self.thermal = ThermalSession(
             self.arm, history, ThermalConfig(tolerance_m=TOLERANCE_M), "test"
         )
-        self.pending: list[int] = []  # requests that the thermal session carries out
-        self.measuring = 0
+        self.carrier = Carrier(
+            self.maintenance,
+            self.session,
+            self.driver,
+            self.send,
+            self._to_thermal,
+            self._to_tool,
+        )
+        self.beating = False  # the gap's beat below takes its place
         self.is_open, self.beat_s, self.sensed_s = True, -np.inf, -np.inf
         self.told_s = -np.inf
         self.steps, self.rests_s = 0, 0.0
@@ -93,11 +89,13 @@ class MaintainedCell(Robot):
     def step(self) -> None:
         before = self.q
         super().step()
+        self.gap.look(self.now_s)
         still = np.max(np.abs(self.q - before)) < 1e-9
         self.rests_s = self.rests_s + PERIOD_S if still else 0.0
         self.thermal.add(JointSample(self.ns(self.now_s), self.arm.joint_names, self.q))
         if self.now_s >= self.beat_s + BEAT_S:
             self.beat_s = self.now_s
+            self.gap.heard(self.is_open, self.now_s)
             self.maintenance.gap(self.is_open, self.now_s)
         if self.maintenance.running and self.now_s >= self.told_s + TELLS_S:
             self._tell_drift()
@@ -105,13 +103,22 @@ class MaintainedCell(Robot):
             self._sense()
         for outcome in self.thermal.advance(wall_ns=self.wall_ns):
             if not outcome.outside:
-                self._thermal_done(outcome)
-        self._tool_done()
+                self.last_thermal = outcome
+                self.carrier.thermal_ended(outcome)
+        if self.outcomes and self.session.run is None:
+            self.carrier.tool_ended(self.outcomes[-1])
         self.maintenance.reading(self.now_s, self.q, self.now_s)
         self.steps += 1
         if self.steps % TICKS == 0:
             for request in self.maintenance.tick(self.now_s, self.wall_ns):
-                self.carry_out(request)
+                self.carrier.carry_out(request, self.now_s)
+
+    def _to_thermal(self, command: Command) -> None:
+        self.thermal.submit(command, self.wall_ns)
+
+    def _to_tool(self, command: Command) -> Outcome:
+        self.ask(command)
+        return self.outcomes[-1]
 
     def _sense(self) -> None:
         self.sensed_s = self.now_s
@@ -126,69 +133,6 @@ class MaintainedCell(Robot):
         self.now_s += hours * 3600.0
         self.true = warmed(self.arm, kelvin)
         self.run(0.5)
-
-    # ---- what the maintenance asks --------------------------------------------------------------
-
-    def carry_out(self, request: ask.Request) -> None:
-        match request:
-            case ask.Move(plan=plan) | ask.Stop(plan=plan):
-                self.send(plan)
-            case ask.BeginCycle(cycle_id=name):
-                self._ask_thermal(request.number, BEGIN_CYCLE, {"cycle_id": name})
-            case ask.EndCycle(cycle_id=name):
-                self._ask_thermal(request.number, END_CYCLE, {"cycle_id": name})
-            case ask.Arm():
-                self._answer(request.number, lambda: self.driver.arm(self.now_s))
-            case ask.Disarm():
-                self._answer(request.number, lambda: self.driver.disarm("asked", self.now_s))
-            case ask.Measure():
-                self._measure(request)
-            case ask.CancelMeasure():
-                self.ask(Command(BREAK_OFF, {"reason": "cancelled"}))
-
-    def _ask_thermal(self, number: int, name: str, arguments: dict[str, str]) -> None:
-        self.pending.append(number)
-        self.thermal.submit(Command(name, arguments), self.ns(self.now_s))
-
-    def _thermal_done(self, outcome: Outcome) -> None:
-        self.last_thermal = outcome
-        if self.pending:
-            answer = Answer(outcome.status, outcome.message, outcome.calibration_id)
-            self.maintenance.answered(self.pending.pop(0), answer)
-
-    def _answer(self, number: int, act: Any) -> None:
-        try:
-            act()
-        except RobocalError as error:
-            self.maintenance.answered(number, Answer(error.code, str(error)))
-        else:
-            self.maintenance.answered(number, Answer(Code.ACCEPT))
-
-    def _measure(self, request: ask.Measure) -> None:
-        try:
-            self.driver.require_ready()
-        except RobocalError as error:
-            self.maintenance.answered(request.number, Answer(error.code, str(error)))
-            return
-        self.measuring = request.number
-        self.ask(Command(MEASURE_TOOL, {"mode": request.mode, "cycle_id": request.cycle_id}))
-
-    def _tool_done(self) -> None:
-        if not self.measuring or self.session.run is not None:
-            return
-        last, number, self.measuring = self.outcomes[-1], self.measuring, 0
-        document = last.document or {}
-        change, sigma = document.get("change", {}), document.get("sigma_mm", 0.0)
-        answer = Answer(
-            last.status,
-            last.message,
-            last.calibration_id,
-            has_result=last.document is not None,
-            answer=document.get("answer", ""),
-            deviation_mm=float(change.get("tip_mm", 0.0)),
-            sigma_mm=float(np.max(sigma)),
-        )
-        self.maintenance.answered(number, answer)
 
     # ---- the PLC, and a person ------------------------------------------------------------------
 
@@ -215,9 +159,7 @@ class MaintainedCell(Robot):
 
     def _tell_drift(self) -> None:
         self.told_s = self.now_s
-        found = self.thermal.accuracy(self.ns(self.now_s))
-        drift = Drift(found.level, found.reason, found.error, found.due_in_s)
-        self.maintenance.drift(drift, self.now_s)
+        self.maintenance.drift(drift_of(self.thermal, self.wall_ns), self.now_s)
 
     def accuracy(self) -> Any:
         """What the line reads."""

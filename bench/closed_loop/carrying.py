@@ -1,0 +1,99 @@
+"""What the maintenance asks, carried out by the sessions themselves; their answers to it."""
+
+from collections.abc import Callable
+
+from bench.closed_loop.words import tool_answer
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.maintenance import MaintenanceSession
+from robocal_ros.sessions.maintenance import requests as ask
+from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_driving import ToolDriver
+
+
+class Carrier:
+    """Carries out requests.
+
+    Parameters
+    ----------
+    send : gives a plan to the robot's controller.
+    to_thermal : gives a command to the thermal session; `thermal_ended` takes its outcome.
+    to_tool : gives a command to the tool session and returns its outcome; `tool_ended` takes the
+        last outcome of a run.
+    """
+
+    def __init__(
+        self,
+        maintenance: MaintenanceSession,
+        tool: ToolSession,
+        driver: ToolDriver,
+        send: Callable[[JointPlan], None],
+        to_thermal: Callable[[Command], None],
+        to_tool: Callable[[Command], Outcome | None],
+    ) -> None:
+        self._maintenance, self._tool, self._driver = maintenance, tool, driver
+        self._send, self._to_thermal, self._to_tool = send, to_thermal, to_tool
+        self._ending: dict[str, int] = {}  # request that a thermal command answers
+        self._measuring = 0  # request that the open run answers
+
+    def carry_out(self, request: ask.Request, now_s: float) -> None:
+        """Do what is asked, now or from now on."""
+        match request:
+            case ask.Move() | ask.Stop():
+                self._send(request.plan)
+            case ask.BeginCycle():
+                self._cycle(events.BEGIN_CYCLE, request)
+            case ask.EndCycle():
+                self._cycle(events.END_CYCLE, request)
+            case ask.Arm():
+                self._answer(request.number, lambda: self._driver.arm(now_s))
+            case ask.Disarm():
+                self._answer(request.number, lambda: self._driver.disarm("maintenance", now_s))
+            case ask.Measure():
+                self._measure(request)
+            case ask.CancelMeasure() if self._tool.run is not None:
+                reason = {"code": int(Code.CONFLICT), "reason": "cancelled"}
+                self._to_tool(Command(events.BREAK_OFF, reason))
+
+    def thermal_ended(self, outcome: Outcome) -> None:
+        """Tell the maintenance, where it waits for this."""
+        if (number := self._ending.pop(outcome.command.name, 0)) != 0:
+            document = outcome.document or {}
+            missing = tuple(document.get("poses", {}).get("missing", ()))
+            code, words = outcome.status, outcome.message
+            answer = Answer(code, words, outcome.calibration_id, missing)
+            self._maintenance.answered(number, answer)
+
+    def tool_ended(self, outcome: Outcome) -> None:
+        """Tell the maintenance how its run ended, where it waits for one."""
+        number, self._measuring = self._measuring, 0
+        if number:
+            self._maintenance.answered(number, tool_answer(outcome))
+
+    def _cycle(self, name: str, request: ask.BeginCycle | ask.EndCycle) -> None:
+        self._ending[name] = request.number
+        self._to_thermal(Command(name, {"cycle_id": request.cycle_id}))
+
+    def _answer(self, number: int, act: Callable[[], None]) -> None:
+        try:
+            act()
+            self._maintenance.answered(number, Answer(Code.ACCEPT))
+        except RobocalError as error:
+            self._maintenance.answered(number, Answer(error.code, str(error)))
+
+    def _measure(self, request: ask.Measure) -> None:
+        try:
+            self._driver.require_ready()
+        except RobocalError as error:
+            self._maintenance.answered(request.number, Answer(error.code, str(error)))
+            return
+        arguments = {"mode": request.mode, "cycle_id": request.cycle_id, "by": "maintenance"}
+        begun = self._to_tool(Command(events.MEASURE_TOOL, arguments))
+        if begun is not None and begun.done and not begun.repeated:
+            self._measuring = request.number
+        elif begun is not None:
+            self._maintenance.answered(request.number, tool_answer(begun))
