@@ -17,6 +17,7 @@ from bench.closed_loop.faults import (
     SWEEP,
     WELL,
     Trial,
+    least_power,
     named_size,
     named_smallest,
     smallest_with_power,
@@ -98,12 +99,13 @@ def power_table(found: Sequence[Checked]) -> Table:
     table = Table(
         "closed_loop_checks",
         f"One fault at a time in {seeds} cells: how often the right code came",
-        ("fault", "right code", "size: right of all", "smallest with 90 %", "told below it",
-         "at the usual size, %", "goal"),
+        ("fault", "right code", "size: right of all", "smallest with 90 %", "there at least, %",
+         "told below it", "at the usual size, %", "goal"),
         "Simulated: the commissioned cell, the fault, one quick check of the tool; for what was "
         "knocked or moved a thermal cycle. A measurement without it comes before; right is only "
         "who says nothing in that. The smallest size from which on the right code comes in 90 % of "
-        "the cells or more. Of an encoder: its joint.",
+        "the cells or more; at least: what so few cells prove of that, the lower 95 % confidence "
+        "bound (Clopper-Pearson) at that size. Of an encoder: its joint.",
     )  # fmt: skip
     for fault in dict.fromkeys(one.trial.fault for one in found):
         own = [one for one in found if one.trial.fault == fault]
@@ -114,14 +116,15 @@ def power_table(found: Sequence[Checked]) -> Table:
             f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}".lstrip(": ")
             for cells in by_size.values()
         )
-        smallest = smallest_with_power((one.trial.amount, one.right) for one in own)
+        trials = [(one.trial.amount, one.right) for one in own]
+        smallest = smallest_with_power(trials)
         told = [c.code.name for c in own if smallest is None or c.trial.amount < smallest]
         below = ", ".join(f"{name} {count}" for name, count in Counter(told).most_common())
         wanted = [cells for cells in by_size.values() if cells[0].trial.must_be_told]
         share = 100.0 * min(sum(c.right for c in cells) / len(cells) for cells in wanted)
         table.add(
             fault, RIGHT[fault].name, words,
-            named_smallest(fault, smallest), below,
+            named_smallest(fault, smallest), least_power(trials, smallest), below,
             share, Goal(share, 100.0 * POWER, at_least=True),
         )  # fmt: skip
     return table

@@ -13,7 +13,7 @@ EVERY_S = 160.0  # a gap, then one pass of the programme
 CLEAN, AFTER = 1, 2  # gaps before and after the fault
 LONG_AFTER = 12  # of a knock that nobody sees: what is learned from it may add up
 WARM_S = 1800.0  # of work before those, so that there is a drift to be learned
-POWER = 0.9
+POWER, CONFIDENCE = 0.9, 0.95
 ALARM = "a false alarm before it"
 WELL = (Code.NONE, Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN, Code.WORSE_THAN_CURRENT)
 RIGHT: Mapping[Fault, Code] = {
@@ -197,6 +197,21 @@ def smallest_with_power(found: Iterable[tuple[float, bool]]) -> float | None:
             break
         smallest = size
     return smallest
+
+
+def least_power(found: Iterable[tuple[float, bool]], size: float | None) -> float | None:
+    """The lower confidence bound of the power at a size, one-sided, %, from so few trials.
+
+    Of trials as `smallest_with_power` takes them; None where there is no size. Clopper and Pearson,
+    "The use of confidence or fiducial limits", Biometrika 26 (1934): exact for a count.
+    """
+    from scipy.stats import binomtest
+
+    rights = [right for tried, right in found if tried == size]
+    if not rights:
+        return None
+    counted = binomtest(sum(rights), len(rights), alternative="greater")
+    return 100.0 * float(counted.proportion_ci(CONFIDENCE, method="exact").low)
 
 
 def named_smallest(fault: Fault, amount: float | None) -> str:

@@ -14,6 +14,7 @@ from bench.closed_loop.faults import (
     RIGHT,
     Report,
     Trial,
+    least_power,
     named_size,
     named_smallest,
     report_of,
@@ -219,17 +220,19 @@ def detection_table(reports: Sequence[Report]) -> Table:
     table = Table(
         "closed_loop_detection",
         "Smallest size of a fault that is reported within one cycle in 90 % of the cells",
-        ("fault", "sizes tried", "smallest", "code"),
-        "Reported in so many seeds of each size, and of all larger ones.",
+        ("fault", "sizes tried", "smallest", "there at least, %", "code"),
+        "Reported in so many seeds of each size, and of all larger ones; at least: what so few "
+        "prove of that, the lower 95 % confidence bound (Clopper-Pearson) at that size.",
     )
     swept = [one for one in reports if one.trial.gaps == AFTER]
     for fault in dict.fromkeys(one.trial.fault for one in swept):
         own = [one for one in swept if one.trial.fault == fault]
-        amount = smallest_with_power((one.trial.amount, one.in_time) for one in own)
+        trials = [(one.trial.amount, one.in_time) for one in own]
+        amount = smallest_with_power(trials)
         at_it = [one for one in own if one.trial.amount == amount]
         codes = ", ".join(sorted({one.code.name for one in at_it}))
         tried = ", ".join(dict.fromkeys(named_size(one.trial) for one in own))
-        table.add(fault, tried, named_smallest(fault, amount), codes)
+        table.add(fault, tried, named_smallest(fault, amount), least_power(trials, amount), codes)
     return table
 
 

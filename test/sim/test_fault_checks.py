@@ -1,6 +1,7 @@
 """The table of the fault checks can miss its goals; it says what was told of smaller faults."""
 
 from dataclasses import replace
+from math import comb
 
 import pytest
 
@@ -11,7 +12,9 @@ from bench.closed_loop.checks import (
     healthy_table,
     power_table,
 )
-from bench.closed_loop.faults import RIGHT, SWEEP, Trial
+from bench.closed_loop.faults import RIGHT, SWEEP, Report, Trial, least_power
+from bench.closed_loop.judging import Harm
+from bench.closed_loop.tables import detection_table, faults_table
 from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import SIZES
 
@@ -41,7 +44,7 @@ def test_a_sweep_holds_the_usual_size_and_something_below_it(fault):
 def test_a_fault_that_is_always_told_meets_its_goal(fault):
     table = power_table(found(fault, lambda size, cell: RIGHT[fault]))
     assert table.met
-    assert table.texts()[0][4] == ""
+    assert table.texts()[0][5] == ""
 
 
 @pytest.mark.parametrize(("missed", "met"), [(1, True), (2, False)])
@@ -81,9 +84,36 @@ def test_what_is_told_of_smaller_faults_is_said():
     table = power_table(
         found("collision", lambda s, cell: Code.LIMIT_EXCEEDED if s >= 0.3 else Code.ACCEPT)
     )
-    _, _, tried, smallest, below, _, _ = table.texts()[0]
+    _, _, tried, smallest, least, below, _, _ = table.texts()[0]
     assert "0.2 mm: 0/10, 0.3 mm: 10/10" in tried
-    assert (smallest, below) == ("0.3 mm", "ACCEPT 20")
+    assert (smallest, least, below) == ("0.3 mm", "74.113", "ACCEPT 20")
+
+
+@pytest.mark.parametrize(("right", "least"), [(0, 0.0), (9, 60.584), (10, 74.113)])
+def test_so_few_cells_prove_less_than_they_show(right, least):
+    """By the definition: with this power so many cells or more are right in one case of twenty."""
+    trials = [(0.3, cell < right) for cell in CELLS] + [(2.0, True)] * 10
+    found = least_power(trials, 0.3)
+    assert found == pytest.approx(least, abs=1e-3)
+    if right:
+        p = found / 100.0
+        tail = sum(comb(10, k) * p**k * (1.0 - p) ** (10 - k) for k in range(right, 11))
+        assert tail == pytest.approx(0.05, abs=1e-6)
+    assert least_power(trials, None) is None
+
+
+def test_the_table_of_detection_says_what_its_seeds_prove():
+    """A report of each seed at two sizes; the smaller one is told in one of them alone."""
+    harmless = Harm(0.0, 0.0, 0.0, 0)
+    reports = [
+        Report(Trial("collision", size, seed), "tool", RIGHT["collision"], gaps, harmless, 0.0, 0)
+        for size, missed in ((0.2, 9), (2.0, 0))
+        for seed in CELLS
+        for gaps in (3.0 if seed < missed else 1.0,)
+    ]
+    (row,) = detection_table(reports).texts()
+    assert row == ["collision", "0.2 mm, 2 mm", "2 mm", "74.113", "LIMIT_EXCEEDED"]
+    assert faults_table(reports).rows
 
 
 @pytest.mark.parametrize(("alarms", "met"), [(0, True), (1, False)])
