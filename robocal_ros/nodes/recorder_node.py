@@ -81,7 +81,8 @@ class RecorderNode(HouseNode):
 
     def activate(self) -> None:
         """Begin a recording."""
-        self._fault, self._lost, self._deleted, self._again_s = "", 0, 0, 0.0
+        self._fault, self._lost, self._deleted = "", 0, 0
+        self._again_s: float | None = None  # when a recording that broke off is begun again
         self._topics = RecordedTopics(self, self.settings["topics"], self._take)
         self._topics.look()
 
@@ -105,7 +106,7 @@ class RecorderNode(HouseNode):
             self._break_off(error)
 
     def _begin(self) -> BagRecording:
-        if time.monotonic() < self._again_s:
+        if self._again_s is not None:
             raise StorageError(self._fault)
         latched = set() if self._topics is None else self._topics.latched
         self._recording = BagRecording(
@@ -120,7 +121,7 @@ class RecorderNode(HouseNode):
         self._recording = None
         if not self._fault:
             self.get_logger().error(str(error))
-        if time.monotonic() >= self._again_s:
+        if self._again_s is None:
             self._fault, self._again_s = str(error), time.monotonic() + AGAIN_S
 
     # ---- time -----------------------------------------------------------------------------------
@@ -131,7 +132,11 @@ class RecorderNode(HouseNode):
             return
         topics.look()
         over_s = self.settings["hours"] * HOUR_S
-        if self._recording is not None and time.monotonic() - self._begun_s >= over_s:
+        now = time.monotonic()
+        if self._recording is not None and now - self._begun_s >= over_s:
+            self._next()
+        elif self._again_s is not None and now >= self._again_s:
+            self._again_s = None
             self._next()
 
     def _make_room(self) -> None:

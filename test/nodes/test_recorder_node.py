@@ -1,9 +1,12 @@
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
+from robocal_msgs.msg import SessionEvent
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
 from robocal_ros.nodes import qos
+from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S
+from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.storage.bag_recording import KEEP, recordings
 from robocal_ros.storage.bags import BagReader
 
@@ -72,10 +75,17 @@ def test_each_recording_opens_with_what_is_in_force(graph):
         assert not bag.info.topics.keys() - {"/model", "/words"}
 
 
-def test_what_it_cannot_write_is_told_and_it_lives_on(graph):
-    (graph.state).mkdir(exist_ok=True)
-    (graph.state / "rec").write_text("a file where the folder should be")
-    recorder = started(graph)
+def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_in_force(graph):
+    graph.state.mkdir(exist_ok=True)
+    obstacle = graph.state / "rec"
+    obstacle.write_text("a file where the folder should be")
+    model = graph.probe.create_publisher(String, "/model", qos.own(qos.LATCHED))
+    model.publish(String(data="revision 3"))
+    events = graph.probe.create_publisher(SessionEvent, "/events", EVENTS)
+    commands = ["configure", "identify"]
+    for number, command in enumerate(commands, start=1):
+        events.publish(SessionEvent(sequence=number, command=command))
+    recorder = started(graph, topics="[words, model, events]")
     publisher = graph.publisher(String, "/words")
     said(graph, publisher, String, "lost")
     answer = graph.call(Trigger, f"/{NODE}/keep")
@@ -83,6 +93,20 @@ def test_what_it_cannot_write_is_told_and_it_lives_on(graph):
     assert "nothing is being recorded" in answer.message
     assert recorder.process.poll() is None
     assert "cannot be made" in recorder.output
+    obstacle.unlink()
+
+    def recorded_again() -> bool:
+        said(graph, publisher, String, "again")
+        return bool(recordings(obstacle))
+
+    graph.spin_until(recorded_again, "a recording", AGAIN_S + 10.0)
+    graph.spin_for(2 * LOOK_S)
+    assert recorder.stop() == 0
+    (folder,) = recordings(obstacle)
+    assert words(folder, "/model") == ["revision 3"]
+    assert set(words(folder, "/words")) <= {"again"}
+    with BagReader(folder) as bag:
+        assert [m.message.command for m in bag.messages(["/events"])] == commands
 
 
 def test_the_type_is_the_one_that_is_offered(graph):
