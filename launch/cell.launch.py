@@ -43,6 +43,7 @@ def cell_node(name, condition=None):
         parameters=[in_share("config", f"{name}.yaml"), LaunchConfiguration("params")],
         remappings=[
             (trajectories, LaunchConfiguration("controller")),
+            (CONTROLLER, LaunchConfiguration("controller")),  # as recorder_node knows it
             ("kinematic_model", "thermal_node/model"),
             ("tool_frame", "tcf_node/tool"),
         ],

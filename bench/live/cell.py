@@ -33,6 +33,7 @@ PARAMETERS = ROOT / "config" / "cells" / "kr150_shift.yaml"
 SEED = 1
 WARM_H = 3.0  # so long ago the cell was commissioned and began to work
 PROGRAM, CONTROLLER = "/program/joint_trajectory", "/robot/joint_trajectory"
+RECORDED = "joint_trajectory_controller/joint_trajectory"  # by default
 TRUTH = "/cell_sim_node/truth/state"
 TOLERANCE_MM = 0.5  # the bound of a measured tool, with the default prior, is some 0.3 mm
 LATE_S = 0.6  # joint states may come so late: this machine may have other work too
@@ -127,7 +128,7 @@ def wiring() -> Mapping[str, Mapping[str, str]]:
     }
     return {
         "cell_sim_node": {"joint_trajectory": CONTROLLER, "~/truth/commanded": CONTROLLER},
-        "recorder_node": {},
+        "recorder_node": {"joint_trajectory": PROGRAM, RECORDED: CONTROLLER},
         "thermal_node": {},
         "tcf_node": out,
         "joint_correction_node": out | corrects,

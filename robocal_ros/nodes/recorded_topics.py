@@ -43,7 +43,8 @@ class RecordedTopics:
         self, node: Node, wanted: Collection[str], take: Callable[[Recorded, bytes], None]
     ) -> None:
         self._node, self._take = node, take
-        self._wanted = [node.resolve_topic_name(topic) for topic in wanted]
+        # Two of them may be remapped to one.
+        self._wanted = list(dict.fromkeys(node.resolve_topic_name(topic) for topic in wanted))
         self.found: dict[str, Recorded] = {}
         self.latched: set[str] = set()
         self.unknown: dict[str, str] = {}

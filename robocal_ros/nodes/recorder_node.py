@@ -22,6 +22,7 @@ ROOM_S = 5.0
 AGAIN_S = 10.0  # after a recording broke off
 HOUR_S = 3600.0
 
+DIAGNOSTICS = "/diagnostics"
 TOPICS = (
     "joint_states",
     "beam_events",
@@ -31,7 +32,19 @@ TOPICS = (
     "measured_point",
     "measured_pose",
     "motor_temperatures",
+    "profile",
+    "target_pose",
     "gap_open",
+    "joint_trajectory",
+    "joint_targets",
+    "joint_commands",
+    "joint_correction_node/joint_trajectory",
+    "joint_correction_node/joint_targets",
+    "joint_correction_node/joint_commands",
+    "maintenance_node/joint_trajectory",
+    "tcf_node/joint_trajectory",
+    "tcf_node/next_step",
+    "joint_trajectory_controller/joint_trajectory",
     "accuracy_state",
     "thermal_node/session_events",
     "thermal_node/model",
@@ -45,6 +58,8 @@ TOPICS = (
     "joint_correction_node/status",
     "maintenance_node/status",
     "maintenance_node/session_events",
+    "/tf_static",
+    DIAGNOSTICS,
 )
 
 SETTINGS = (
@@ -198,7 +213,7 @@ class RecorderNode(HouseNode):
         if topics.unknown:
             told = "; ".join(f"{topic}: {why}" for topic, why in topics.unknown.items())
             health.worsen(WARN, f"not recorded: {told}")
-        if not topics.found:
+        if not topics.found.keys() - {DIAGNOSTICS}:  # which is its own, too
             health.worsen(WARN, "none of the topics is there yet")
         counts: dict[str, object] = {
             f"{r.topic} recorded": r.messages for r in topics.found.values()

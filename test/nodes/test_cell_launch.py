@@ -16,7 +16,8 @@ from trajectory_msgs.msg import JointTrajectory
 ROOT = Path(__file__).parents[2]
 SHARE = ROOT / "install" / "robocal_ros" / "share" / "robocal_ros"
 FILES = ("cell", "two_robots", "replay")
-CONTROLLER = "/robot_1/joint_trajectory_controller/joint_trajectory"
+DEFAULT = "joint_trajectory_controller/joint_trajectory"
+CONTROLLER = "/robot_1/arm_controller/joint_trajectory"
 
 
 def tree(name: str) -> ast.Module:
@@ -88,6 +89,7 @@ def test_a_cell_of_one_robot_in_its_namespace(graph, tmp_path):
                 "__node": name,
                 "__ns": "/robot_1",
                 trajectories: CONTROLLER.removeprefix("/robot_1/"),
+                DEFAULT: CONTROLLER.removeprefix("/robot_1/"),
                 "kinematic_model": "thermal_node/model",
                 "tool_frame": "tcf_node/tool",
             },
@@ -112,7 +114,8 @@ def test_a_cell_of_one_robot_in_its_namespace(graph, tmp_path):
 
     movers = {"joint_correction_node"}
     graph.spin_until(lambda: senders(CONTROLLER) >= movers, "who moves the robot", 30.0)
-    graph.spin_until(lambda: takers(CONTROLLER) == {"cell_sim_node"}, "the robot", 30.0)
+    followers = {"cell_sim_node", "recorder_node"}
+    graph.spin_until(lambda: takers(CONTROLLER) == followers, "robot and recorder", 30.0)
     users = {"joint_correction_node", "recorder_node"}
     graph.spin_until(lambda: takers("/robot_1/thermal_node/model") >= users, "users of the model")
     types = dict(graph.probe.get_topic_names_and_types())

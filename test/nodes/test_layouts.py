@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from robocal_ros.nodes.recorder_node import TOPICS
 from robocal_ros.nodes.replay_topics import message_class
 
 LAYOUTS = Path(__file__).parents[2] / "config" / "layouts"
@@ -73,6 +74,10 @@ def test_the_field_exists(path):
         name = field.split("[")[0]
         assert name in value.get_fields_and_field_types(), f"{path}: no field {name}"
         value = getattr(value, name)
+
+
+def test_a_recording_has_what_is_shown():
+    assert set(TYPES) <= {f"/{topic.lstrip('/')}" for topic in TOPICS}
 
 
 def test_each_type_is_shown():

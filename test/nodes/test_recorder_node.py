@@ -1,16 +1,31 @@
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
+import pytest
 from robocal_msgs.msg import SessionEvent
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
+from tool_cell_live import written_laser
+from tool_driver import noisy_cell
 
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S
+from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS
+from robocal_ros.nodes.tcf_node import TcfNode
+from robocal_ros.nodes.thermal_node import ThermalNode
 from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.storage.bag_recording import KEEP, recordings
 from robocal_ros.storage.bags import BagReader
 
 NODE = "recorder_node"
+LEFT_OUT = {"/image"}  # large
+WIRED = {"/kinematic_model": "/thermal_node/model", "/tool_frame": "/tcf_node/tool"}
+MOTION = {  # by what moves a robot
+    "trajectory_msgs/msg/JointTrajectory",
+    "std_msgs/msg/Float64MultiArray",
+    "robocal_msgs/msg/ToolStep",
+}
 
 
 def started(graph, **parameters):
@@ -117,3 +132,29 @@ def test_the_type_is_the_one_that_is_offered(graph):
     graph.spin_for(0.5)
     (folder,) = recordings(graph.state / "rec")
     assert words(folder, "/words") == [True]
+
+
+NODES = {
+    ThermalNode: {},
+    TcfNode: {"motion": "trajectory"},
+    HandEyeNode: {},
+    JointCorrectionNode: {},
+    MaintenanceNode: {"home_deg": [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]},
+}
+
+
+@pytest.mark.parametrize("kind", NODES, ids=lambda kind: kind.NAME)
+def test_what_a_node_takes_and_how_it_moves_the_robot_is_recorded(graph, tmp_path, kind):
+    given = dict(NODES[kind])
+    if kind is TcfNode:
+        given |= {"laser": written_laser(tmp_path, noisy_cell())}
+    node = graph.add(kind, given)
+    assert node.state == "active"
+    recorded = {graph.probe.resolve_topic_name(topic) for topic in TOPICS}
+    inputs = {node.resolve_topic_name(topic) for topic in node.inputs}
+    assert {WIRED.get(topic, topic) for topic in inputs - LEFT_OUT} <= recorded
+    offered = node.get_publisher_names_and_types_by_node(kind.NAME, "/")
+    moves = {topic for topic, types in offered if MOTION & set(types)}
+    targets = {topic for topic, _ in offered if topic.endswith("/joint_targets")}
+    assert moves | targets <= recorded
+    assert bool(moves) == (kind in (TcfNode, JointCorrectionNode, MaintenanceNode))

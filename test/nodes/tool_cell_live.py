@@ -17,10 +17,18 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.cell_sim_messages import planned_step
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.sim.beams import RoundTool
+from robocal_ros.sim.tool_cell import ToolCell
 from robocal_ros.storage.laser_files import LaserFile, write_laser
 
 STATION = "north"
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
+
+
+def written_laser(folder: Path, cell: ToolCell) -> str:
+    """File of a cell's beams."""
+    path = folder / "laser.yaml"
+    write_laser(path, LaserFile(cell.laser, STATION, cell.arm.name, cell.arm.model_hash))
+    return str(path)
 
 
 class LiveCell(Driver):
@@ -30,10 +38,8 @@ class LiveCell(Driver):
         cell = noisy_cell()
         super().__init__(None, cell, RoundTool.cylinder(tool, 0.0025))
         self.graph = graph
-        path = folder / "laser.yaml"
-        write_laser(path, LaserFile(cell.laser, STATION, cell.arm.name, cell.arm.model_hash))
         settings = {
-            "laser": str(path),
+            "laser": written_laser(folder, cell),
             "serial": "K7",
             "input_period_ms": 2.0,
             "taught_xyz_mm": (TAUGHT[:3, 3] * 1e3).tolist(),
