@@ -11,11 +11,18 @@ from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_shots import SHOTS
 from robocal_ros.sessions.observations import JOINTS, MEASURING
-from robocal_ros.sessions.replay import EVENTS, input_topics, read_events, topic_kind
+from robocal_ros.sessions.replay import (
+    EVENTS,
+    input_topics,
+    needed_inputs,
+    read_events,
+    topic_kind,
+)
+from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.storage.bags import BagMessage, BagReader
 
 MEASURED = (*MEASURING, EDGES, *SHOTS)
-INPUTS = (JOINTS, *MEASURED)
+INPUTS = (JOINTS, *MEASURED, TEMPERATURES)
 
 
 @dataclass(frozen=True)
@@ -24,6 +31,7 @@ class Recording:
 
     Attributes
     ----------
+    events : topic of the commands, or None.
     inputs : topic of the bag to input of the session.
     configured : the recorded configuration, or None.
     commands : recorded commands, each with its recorded outcome.
@@ -31,6 +39,7 @@ class Recording:
     """
 
     reader: BagReader
+    events: str | None
     inputs: Mapping[str, str]
     configured: Command | None
     commands: list[tuple[Command, dict[str, Any]]]
@@ -49,6 +58,28 @@ class Recording:
         """First and last log time."""
         info = self.reader.info
         return info.start_ns or 0, info.end_ns or 0
+
+    def require_inputs(self) -> None:
+        """Refuse to obey commands whose samples are not here.
+
+        Raises
+        ------
+        InputError
+            When the bag lacks an input that the session had.
+        """
+        lacking = needed_inputs(self.configured, self.commands) - set(self.inputs.values())
+        if not lacking:
+            return
+        recorded = {} if self.configured is None else self.configured.arguments.get("topics", {})
+        words = " and ".join(
+            f"{kind} of {recorded[kind]}" if kind in recorded else kind for kind in sorted(lacking)
+        )
+        given = " ".join(f"--topic {kind}:=TOPIC" for kind in sorted(lacking))
+        raise InputError(
+            f"the session of {self.events} had {words}, which the bag lacks: record it too; where "
+            f"the bag has it by another name, 'robocal replay' takes {given}",
+            file=self.reader.info.path,
+        )
 
     def samples(self) -> Iterator[BagMessage]:
         """Messages of the inputs, as they were recorded."""
@@ -80,7 +111,7 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
     inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
     start_ns = _first_joint_stamp(reader, inputs)
     configured, commands = _events(reader, event_topic, start_ns)
-    return Recording(reader, inputs, configured, commands, start_ns)
+    return Recording(reader, event_topic, inputs, configured, commands, start_ns)
 
 
 def _has(topics: Mapping[str, Any]) -> str:

@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="INPUT:=TOPIC",
         help="topic of an input: joint_states, measured_point, measured_pose, beam_events, "
-        "profile, image, target_pose, session_events",
+        "profile, image, target_pose, motor_temperatures, session_events",
     )
     parser.add_argument(
         "--state",

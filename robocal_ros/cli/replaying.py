@@ -86,11 +86,8 @@ def replay_bag(request: Request, watch: Watch) -> Document:
     """
     with BagReader(request.bag) as reader:
         recording = open_recording(reader, request.topics)
-        if not (_given(request) or recording.commands):
-            words = _NO_COMMANDS if request.robot_named else _NO_COMMANDS + _NO_ROBOT
-            raise InputError(words, file=str(request.bag))
-        if not _given(request) and any(c.name == MAINTAIN for c, _ in recording.commands):
-            raise InputError(_NOT_REPLAYED, file=str(request.bag))
+        if not _given(request):
+            _require_commands(request, recording)
         arm = request.find_robot(recording.configured)
         with _history(request, arm) as history:
             for is_of, replayed, node in _OF_OTHER_NODES:
@@ -128,6 +125,16 @@ _NOT_REPLAYED = (
 )
 
 _GOES_ON = "{} already holds calibrations: the replay went on from there"
+
+
+def _require_commands(request: Request, recording: Recording) -> None:
+    """Refuse a recording without commands that can be obeyed."""
+    if not recording.commands:
+        words = _NO_COMMANDS if request.robot_named else _NO_COMMANDS + _NO_ROBOT
+        raise InputError(words, file=str(request.bag))
+    if any(command.name == MAINTAIN for command, _ in recording.commands):
+        raise InputError(_NOT_REPLAYED, file=str(request.bag))
+    recording.require_inputs()
 
 
 def _given(request: Request) -> bool:

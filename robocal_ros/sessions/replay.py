@@ -153,6 +153,20 @@ def input_topics(topics: Iterable[str], configured: Command | None = None) -> di
     return found
 
 
+def needed_inputs(
+    configured: Command | None, commands: Iterable[tuple[Command, Mapping[str, Any]]]
+) -> set[str]:
+    """Inputs without whose samples recorded commands cannot come out as they did.
+
+    Those of which the marks tell samples; motor temperatures only where a learned prior uses them.
+    """
+    marks = {mark for command, _ in commands for mark in command.marks or {}}
+    inputs = {mark.split("/")[0] for mark in marks - {JUMPS}}  # of edges each beam has its own
+    config = {} if configured is None else configured.arguments.get("config", {})
+    unused = {TEMPERATURES} if config.get("prior", "default") == "default" else set()
+    return inputs - unused
+
+
 @dataclass(frozen=True)
 class One:
     """One sample of a recording."""
