@@ -45,7 +45,7 @@ SETTINGS = (
         low=0.0,
         high=1000.0,
     ),
-    Setting("topics", [""], "What to play; empty: all but recorded session events"),
+    Setting("topics", [""], "What to play; empty: all that moves nothing"),
     Setting("remap", [""], "Entries recorded:=played"),
     Setting("latched", ["/tf_static"], "Played topics whose last messages are kept for latecomers"),
     Setting("wait_for_subscribers", [""], "Played topics that must have a subscriber first"),

@@ -14,8 +14,20 @@ from robocal_ros.core.errors import InputError
 
 DEPTH = 1000
 LATCHED_DEPTH = 100
-EVENTS_TYPE = "robocal_msgs/msg/SessionEvent"
 CLOCK = "/clock"
+OWN = "a live node makes its own"
+MOVES = "it may move a robot"
+VOUCHES = "it says that a robot may move now"
+LEFT_OUT = {  # unless they are named, by type or by the last part of the name
+    "robocal_msgs/msg/SessionEvent": OWN,
+    "diagnostic_msgs/msg/DiagnosticArray": OWN,
+    "trajectory_msgs/msg/JointTrajectory": MOVES,
+    "trajectory_msgs/msg/MultiDOFJointTrajectory": MOVES,
+    "std_msgs/msg/Float64MultiArray": MOVES,  # as forward_command_controller takes them
+    "robocal_msgs/msg/ToolStep": MOVES,
+    "joint_targets": MOVES,
+    "gap_open": VOUCHES,
+}
 
 
 @dataclass
@@ -184,8 +196,8 @@ def chosen_topics(
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Topics to play (recorded name to played name), and those left out with the reason.
 
-    ``wanted`` empty means all but the clock and recorded session events: a live node makes its
-    own. ``remap`` has entries ``recorded:=played``.
+    ``wanted`` empty means all but the clock and `LEFT_OUT`. ``remap`` has entries
+    ``recorded:=played``.
 
     Raises
     ------
@@ -205,11 +217,17 @@ def chosen_topics(
             left[topic] = "the clock is made here"
         elif wanted and topic not in wanted:
             left[topic] = "not wanted"
-        elif not wanted and msgtype == EVENTS_TYPE:
-            left[topic] = "a live node makes its own; name it in 'topics' to play it"
+        elif not wanted and (why := _left_out(msgtype, topic, names.get(topic, topic))):
+            left[topic] = f"{why}; name it in 'topics' to play it"
         else:
             chosen[topic] = names.get(topic, topic)
     return chosen, left
+
+
+def _left_out(msgtype: str, *names: str) -> str:
+    """Why a topic is not played by itself; empty when it is."""
+    ends = (name.rsplit("/", 1)[-1] for name in names)
+    return next((LEFT_OUT[key] for key in (msgtype, *ends) if key in LEFT_OUT), "")
 
 
 def _pair(entry: str) -> tuple[str, str]:

@@ -22,13 +22,21 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
-from robocal_ros.nodes.replay_topics import chosen_topics
+from robocal_ros.nodes.replay_topics import chosen_topics, message_class
 from robocal_ros.storage.bags import BagWriter
 from robocal_ros.storage.robots import load_robot
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
 START_NS = 100 * NS
+HELD_BACK = {
+    "/robot/gap_open": ("std_msgs/msg/Bool", "may move now"),
+    "/arm_controller/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", "move a robot"),
+    "/forward/commands": ("std_msgs/msg/Float64MultiArray", "move a robot"),
+    "/joint_targets": ("sensor_msgs/msg/JointState", "move a robot"),
+    "/tcf_node/next_step": ("robocal_msgs/msg/ToolStep", "move a robot"),
+    "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", "makes its own"),
+}
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -44,6 +52,8 @@ def write_bag(path: Path, count: int, period_ns: int) -> Path:
         event = {"command": "configure", "arguments": "{}", "outcome": "{}"}
         bag.write("/n/session_events", "robocal_msgs/msg/SessionEvent", event, ns)
         bag.write("/odd", "std_msgs/msg/String", {"data": "odd"}, ns)
+        for topic, (msgtype, _) in HELD_BACK.items():
+            bag.write(topic, msgtype, message_class(msgtype)(), ns)
     return path
 
 
@@ -85,6 +95,25 @@ def test_everything_arrives_as_fast_as_it_is_acknowledged(graph, tmp_path):
     assert status["best_effort"] == {}
     assert "/n/session_events" in status["skipped"]
     assert listener.events == []
+
+
+def test_what_may_move_a_robot_is_played_only_where_it_is_named(graph, tmp_path):
+    bag = write_bag(tmp_path / "shift.mcap", 10, 1_000_000)
+    listener = Listener(graph)
+    process = graph.start("replay_node", {"bag": bag, "rate": 0.0} | WAIT)
+    listener.until("done")
+    told = listener.status
+    for topic, (_, why) in HELD_BACK.items():
+        assert why in told["skipped"][topic]
+        assert "name it in 'topics'" in told["skipped"][topic]
+    own = {"/diagnostics"}
+    assert {topic for topic in HELD_BACK if graph.probe.count_publishers(topic)} == own
+    assert process.stop() == 0
+    named = [*HELD_BACK, "/joint_states", "/note"]
+    listener.reports.clear()
+    graph.start("replay_node", {"bag": bag, "rate": 0.0, "topics": str(named)} | WAIT)
+    listener.until("done")
+    assert listener.status["sent"].keys() == set(named)
 
 
 def test_recorded_time_goes_at_its_rate_and_is_the_clock(graph, tmp_path):
