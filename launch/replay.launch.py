@@ -2,7 +2,10 @@
 
 ros2 launch robocal_ros replay.launch.py bag:=/data/recordings/robocal_X params:=cell.yaml
 
-Without a graph, faster, and with a report: ``robocal validate``.
+Give it a ROS_DOMAIN_ID of its own: never the graph of a live cell. What is found goes to the
+history of the serial REPLAY, whatever ``params`` says. It begins when each topic of
+``wait_for_subscribers`` (default: joint_states) has a subscriber; one that the bag has not is
+refused. Without a graph, faster, and with a report: ``robocal validate``.
 """
 
 from launch.actions import DeclareLaunchArgument
@@ -20,10 +23,11 @@ def in_share(*path):
     return PathJoinSubstitution([FindPackageShare(PACKAGE), *path])
 
 
-def estimator(name, *files):
-    """Describe an estimator on the clock of the recording."""
-    given = [in_share("config", file) for file in files]
-    params = [*given, LaunchConfiguration("params"), {"use_sim_time": True}]
+def estimator(name):
+    """Describe an estimator on the clock of the recording, with a history of its own."""
+    given = [in_share("config", file) for file in (f"{name}.yaml", "replay.yaml")]
+    apart = in_share("config", "replay_history.yaml")
+    params = [*given, LaunchConfiguration("params"), apart, {"use_sim_time": True}]
     return Node(package=PACKAGE, executable=name, name=name, parameters=params, output="screen")
 
 
@@ -33,15 +37,21 @@ def generate_launch_description():
         package=PACKAGE,
         executable="replay_node",
         name="replay_node",
-        parameters=[{"bag": LaunchConfiguration("bag")}],
+        parameters=[
+            {
+                "bag": LaunchConfiguration("bag"),
+                "wait_for_subscribers": LaunchConfiguration("wait_for_subscribers"),
+            }
+        ],
         output="screen",
     )
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag"),
             DeclareLaunchArgument("params", default_value=in_share("config", "cell.yaml")),
-            estimator("thermal_node", "thermal_node.yaml", "thermal_node_replay.yaml"),
-            estimator("tcf_node", "tcf_node.yaml"),
+            DeclareLaunchArgument("wait_for_subscribers", default_value="[joint_states]"),
+            estimator("thermal_node"),
+            estimator("tcf_node"),
             player,
         ]
     )

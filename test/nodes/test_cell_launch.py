@@ -46,7 +46,7 @@ def test_it_is_installed_and_names_what_exists(name):
     assert executables <= scripts
     assert all((SHARE.parents[1] / "lib" / "robocal_ros" / node).is_file() for node in executables)
     files = {word for word in found if re.fullmatch(r"\w+\.yaml", word)}
-    files |= {f"{node}.yaml" for node in executables} if name == "cell" else set()
+    files |= {f"{node}.yaml" for node in executables}
     assert all((SHARE / "config" / word).is_file() for word in files)
 
 
@@ -65,6 +65,18 @@ def test_each_of_two_robots_must_be_given_its_own_file():
     declared = [c for c in calls if getattr(c.func, "id", "") == "DeclareLaunchArgument"]
     assert declared
     assert not any(c.keywords for c in declared)
+
+
+def test_a_replay_has_its_own_serial_after_the_parameters_of_the_cell():
+    """test_config_files.py shows what it does there."""
+    (given,) = (
+        n.value
+        for n in ast.walk(tree("replay"))
+        if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "params"
+    )
+    shown = ast.unparse(given)
+    assert shown.index("LaunchConfiguration('params')") < shown.index("apart")
+    assert "apart = in_share('config', 'replay_history.yaml')" in ast.unparse(tree("replay"))
 
 
 def test_all_nodes_of_a_cell_are_started():

@@ -7,6 +7,8 @@ import pytest
 import yaml
 from lifecycle_msgs.srv import GetState
 from rclpy.qos import ReliabilityPolicy
+from tool_cell_live import written_laser
+from tool_driver import noisy_cell
 
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
@@ -15,6 +17,7 @@ from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.motion_settings import MOTION
 from robocal_ros.nodes.recorder_node import RecorderNode
 from robocal_ros.nodes.replay_node import ReplayNode
+from robocal_ros.nodes.tcf_node import INPUTS as TCF_INPUTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import INPUTS, ThermalNode
 
@@ -54,14 +57,16 @@ def test_a_node_takes_the_file(graph, tmp_path):
     graph.spin_until((graph.state / "R7.sqlite").exists, "the history of this serial")
 
 
-def test_with_the_file_for_replays_no_input_loses_anything(graph):
-    path = CONFIG / "thermal_node_replay.yaml"
-    given = yaml.safe_load(path.read_text())["/**/thermal_node"]["ros__parameters"]
-    inputs = {f"/{name}" for name in INPUTS}
+@pytest.mark.parametrize("node", [ThermalNode, TcfNode], ids=lambda node: node.NAME)
+def test_with_the_file_for_replays_no_input_loses_anything(graph, tmp_path, node):
+    path = CONFIG / "replay.yaml"
+    given = yaml.safe_load(path.read_text())[f"/**/{node.NAME}"]["ros__parameters"]
+    inputs = {f"/{name}" for name in (INPUTS if node is ThermalNode else TCF_INPUTS)}
     assert set(given.pop("qos_overrides")) == inputs
     assert given.pop("use_sim_time")
-    assert set(given) <= {s.name for s in ThermalNode.SETTINGS}
-    graph.start("thermal_node", None, None, "--ros-args", "--params-file", str(path))
+    assert set(given) <= {s.name for s in node.SETTINGS}
+    settings = {"laser": written_laser(tmp_path, noisy_cell())} if node is TcfNode else None
+    graph.start(node.NAME, settings, None, "--ros-args", "--params-file", str(path))
 
     def reliability(topic: str) -> list[ReliabilityPolicy]:
         infos = graph.probe.get_subscriptions_info_by_topic(topic)
@@ -70,5 +75,31 @@ def test_with_the_file_for_replays_no_input_loses_anything(graph):
     graph.spin_until(
         lambda: all(reliability(t) == [ReliabilityPolicy.RELIABLE] for t in inputs),
         "all inputs are reliable",
+        30.0,
     )
     graph.spin_until(lambda: reliability("/clock"), "it follows the clock")
+
+
+@pytest.mark.parametrize("sections", ["/**", "/** /**/{}", "/** /{}", "/{} /**"])
+@pytest.mark.parametrize("node", [ThermalNode, TcfNode], ids=lambda node: node.NAME)
+def test_a_replay_never_opens_the_history_of_the_robot(graph, tmp_path, node, sections):
+    """Files in the order of replay.launch.py; sections of the cell's own as one may write them."""
+    given = {"serial": "R7"}
+    if node is TcfNode:
+        given |= {"laser": written_laser(tmp_path, noisy_cell())}
+    names = [section.format(node.NAME) for section in sections.split()]
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(
+        yaml.safe_dump({name: {"ros__parameters": dict(given)} for name in names}, sort_keys=False)
+    )
+    parts = [
+        CONFIG / f"{node.NAME}.yaml",
+        CONFIG / "replay.yaml",
+        mine,
+        CONFIG / "replay_history.yaml",
+    ]
+    words = [word for part in parts for word in ("--params-file", str(part))]
+    process = graph.start(node.NAME, None, None, "--ros-args", *words)
+    state = graph.call(GetState, f"/{node.NAME}/get_state")
+    graph.spin_until(lambda: list(graph.state.glob("*.sqlite")), f"{state}\n{process.output}")
+    assert {path.stem for path in graph.state.glob("*.sqlite")} == {"REPLAY"}

@@ -24,7 +24,7 @@ from robocal_ros.storage.robots import load_robot
 
 pytestmark = pytest.mark.data
 
-CONFIG = Path(__file__).parents[2] / "config" / "thermal_node_replay.yaml"
+CONFIG = Path(__file__).parents[2] / "config" / "replay.yaml"
 INPUTS = ("joint_states", "measured_pose")
 EVENT_TOPIC = "/thermal_node/session_events"
 CYCLE = "window-1"  # as --auto names it
