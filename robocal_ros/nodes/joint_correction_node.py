@@ -120,7 +120,7 @@ class JointCorrectionNode(HouseNode):
         self.add_timer(LOOK_S, self._look, steady=True)
         if self.settings[ACTION]:
             if self._proxy is None:
-                acting = self._goal, self._taught, self._stop
+                acting = self._goal, self._taught, self._stop, self._tell_path
                 self._proxy = TrajectoryProxy(self, f"~/{ACTION}", *acting)
             self._proxy.open(self.settings[ACTION])
 
@@ -206,7 +206,7 @@ class JointCorrectionNode(HouseNode):
             self._put_out(TRAJECTORY, message, *self._corrected(message))
             if self._session.course is not None:
                 self._session.course.begin(time.monotonic())
-            self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
+            self._tell_path()
         else:
             self._put_out(TRAJECTORY, message, _STOP, _STOP)
             self._stop()
@@ -254,6 +254,9 @@ class JointCorrectionNode(HouseNode):
     def _tell_offset(self, cause: int, now_s: float) -> None:
         self._commanded = True
         self._report.offset(cause, now_s)
+
+    def _tell_path(self) -> None:
+        self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
 
     def _look_at_graph(self) -> None:
         for guard in self._sources.values():

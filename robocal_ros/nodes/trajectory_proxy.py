@@ -74,7 +74,7 @@ class TrajectoryProxy:
     ----------
     correct : the corrected trajectory of a taught one, and its course; raises `RefusedError`.
     taught : taught positions and velocities of (names, positions, velocities or None), each (k,).
-    stop : called for a goal that is a stop.
+    stop, sent : called for a goal that is a stop; after any other one has gone out.
     """
 
     def __init__(
@@ -84,8 +84,10 @@ class TrajectoryProxy:
         correct: Callable[[Any], tuple[Any, Course | None]],
         taught: Callable[[tuple[str, ...], Array, Array | None], tuple[Array, Array | None]],
         stop: Callable[[], None],
+        sent: Callable[[], None],
     ) -> None:
-        self._node, self._correct, self._taught, self._stop = node, correct, taught, stop
+        self._node, self._correct, self._taught = node, correct, taught
+        self._stop, self._sent = stop, sent
         self._goals: list[_Goal] = []
         self._clients: dict[str, ActionClient] = {}
         self._name = ""  # of the controller's action; empty when closed
@@ -171,6 +173,8 @@ class TrajectoryProxy:
         goal.asked_s = time.monotonic()
         if goal.course is not None:
             goal.course.begin(goal.asked_s)
+        if request.trajectory.points:
+            self._sent()
         future.add_done_callback(lambda done: self._answered(goal, done.result()))
 
     def _cancelled(self, caller: ServerGoalHandle) -> CancelResponse:

@@ -17,7 +17,7 @@ from joint_correction_live import NODE, NOMINAL, drifted, model_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
-from robocal_msgs.msg import KinematicModel
+from robocal_msgs.msg import JointOffset, KinematicModel
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -152,6 +152,20 @@ def test_a_goal_reaches_the_taught_pose_and_all_else_passes(cell: Any) -> None:
     for point, taught in zip(points, (HOME, MOVED), strict=True):
         assert np.abs(tcp(ACTUAL, point.positions) - tcp(NOMINAL, taught)).max() < 1e-8
         assert np.abs(tcp(ACTUAL, taught) - tcp(NOMINAL, taught)).max() > 1e-5
+
+
+def test_what_a_goal_is_corrected_by_is_told(cell: Any) -> None:
+    """As of a trajectory of the topic: once when it goes out, then ten times a second."""
+    offsets = cell.graph.collect(JointOffset, f"{NODE}/correction")
+    cell.begin(settled=False)
+    assert not offsets
+    cell.send(HOME, MOVED).ends(GoalStatus.STATUS_SUCCEEDED)
+    cell.graph.spin_until(lambda: len(offsets) > 3, "offsets")
+    assert [o.cause for o in offsets].count(JointOffset.TRAJECTORY) == 1
+    assert {o.cause for o in offsets} == {JointOffset.TRAJECTORY, JointOffset.PERIODIC}
+    cell.graph.spin_until(lambda: offsets[-1].blend == 1.0, "blended in")
+    expected = cell.robot.goals[-1].trajectory.points[-1].positions - MOVED
+    assert np.abs(np.array(offsets[-1].offset) - expected).max() < 1e-9
 
 
 def test_feedback_is_of_the_taught_world(cell: Any) -> None:
