@@ -35,7 +35,7 @@ GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
 START_S = 120.0  # of all nodes, on a machine with much else to do
 ASK_S = 0.2  # between two calls of ~/status
 LEAD = 4  # rests at home, a second each: after a gap the correction blends in from there
-EACH = 6  # of the cell's working poses one in so many is visited
+EACH = 9  # of the cell's working poses one in so many is visited
 SPEED_RAD_S, REST_S = 1.8, 0.1  # as fast as the slowest drive goes: the demo is short
 STATES = ("NONE", "OK", "DUE", "DEGRADED", "EXPIRED", "FAULT")  # of AccuracyState, by number
 
