@@ -84,5 +84,5 @@ def test_a_file_that_was_cut_off_is_told_as_that(tmp_path, share):
     whole, cut = tmp_path / "set.mcap", tmp_path / "cut.mcap"
     write_data_set(whole, data_set(points=400), PROFILE, "laser", ARM)
     cut.write_bytes(whole.read_bytes()[: int(share * whole.stat().st_size)])
-    with pytest.raises(InputError, match="truncated"):
+    with pytest.raises(InputError, match="broke off"):
         read_data_set(cut, ARM)
