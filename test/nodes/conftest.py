@@ -1,5 +1,6 @@
 """Harness of the node tests: a graph of its own for each test, spun in the test's own thread."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -230,3 +231,12 @@ def graph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Graph]:
             yield graph
         finally:
             graph.close()
+            del graph
+            gc.collect()  # what of DDS is held in a cycle ends now, when nobody discovers anything
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _imports_stay() -> None:
+    """Each `gc.collect` looks at what the tests made alone."""
+    gc.collect()
+    gc.freeze()
