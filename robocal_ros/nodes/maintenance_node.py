@@ -160,7 +160,8 @@ class MaintenanceNode(HouseNode):
         told, mine = (message.robot, message.serial), (self._nominal.name, self._serial_in_use)
         if told != mine:
             raise InputError(
-                f"{ACCURACY} is of robot {told}, this node keeps {mine}: mend the remappings"
+                f"{ACCURACY} is of robot and serial {told}, this node keeps {mine}: "
+                "give both nodes the same, or mend the remapping"
             )
         try:
             level = AccuracyLevel(message.state)

@@ -10,6 +10,7 @@ from multiprocessing import forkserver, get_context
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from jsonschema import Draft202012Validator
 
@@ -60,12 +61,9 @@ def robocal(*arguments: object, **variables: str) -> subprocess.CompletedProcess
 @cache
 def _forks() -> ForkServerContext:
     forkserver.set_forkserver_preload(WARM)
-    before = os.environ.get("PYTHONPATH", "")
-    os.environ["PYTHONPATH"] = f"{Path(__file__).parent}:{environment()['PYTHONPATH']}"
-    try:
+    with patch.dict(os.environ, environment()):
+        os.environ["PYTHONPATH"] = f"{Path(__file__).parent}:{os.environ['PYTHONPATH']}"
         forkserver.ensure_running()
-    finally:
-        os.environ["PYTHONPATH"] = before
     return get_context("forkserver")
 
 
