@@ -66,9 +66,13 @@ def test_a_bent_tool_is_seen_in_the_first_gap_and_right_after_the_second(shift):
 
 
 def test_no_gap_is_overrun_and_nothing_is_refused(shift):
+    """Nor does the correction refuse the pass before the first gap."""
     record, _ = shift
     assert [(gap.over_s, gap.fault) for gap in record.gaps] == [(0.0, "")] * 2
+    assert [one.cycle for one in record.passes] == [0, 1, 2]
     assert record.refused == []
+    assert record.drive_faults == 0
+    assert 0.5 < record.peak_share < 1.0  # counted at all, and within the drives' speed
 
 
 @pytest.mark.parametrize("node", SCHEMAS)

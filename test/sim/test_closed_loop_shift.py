@@ -49,13 +49,3 @@ def test_gaps_and_passes_begin_where_they_are_planned():
     assert [one.cycle for one in made.passes] == [0, 1, 2]
     begins_s = [one.time_s - PASS_S - REST_S for one in made.passes]
     assert begins_s == pytest.approx([0.5, BEGINS_S, BEGINS_S + EVERY_S], abs=0.02)  # two ticks
-
-
-def test_the_correction_refuses_no_pass_before_the_first_gap():
-    made = run_shift(plan(), seed=3)
-    assert made.refused == []
-    assert [one.cycle for one in made.passes] == [0, 1, 2]
-    assert max(sizes(one).max() for one in made.passes) < 1e-4
-    assert [gap.over_s for gap in made.gaps] == [0.0, 0.0]
-    assert made.drive_faults == 0
-    assert 0.5 < made.peak_share < 1.0
