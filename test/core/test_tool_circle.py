@@ -54,8 +54,9 @@ def passed(
     return [replace(e, time_s=e.time_s + latency, sigma_s=JITTER) for e in found]
 
 
-def jittered(edges: list[BeamEdge], rng: np.random.Generator) -> list[BeamEdge]:
-    return [replace(e, time_s=e.time_s + JITTER * rng.standard_normal()) for e in edges]
+def jittered(edges: list[BeamEdge], rng: np.random.Generator, times: float = 1.0) -> list[BeamEdge]:
+    """Stamps that scatter so many times more than their sigma says."""
+    return [replace(e, time_s=e.time_s + times * JITTER * rng.standard_normal()) for e in edges]
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -149,6 +150,27 @@ def test_best_attains_the_bound_and_says_it(latency):
     squared = [e @ np.linalg.solve(f.covariance, e) for e, f in zip(error, found, strict=True)]
     assert np.sum(squared) == pytest.approx(1000.0, abs=4.0 * np.sqrt(2000.0))
     assert (found[0].latency_sigma_s is None) == (latency is not None)
+
+
+def test_edges_that_scatter_more_than_told_widen_all_that_is_told_once():
+    """Five times over twelve turns: the scatter is found from 91 residuals, so that a squared error
+    over its covariance is n F(n, 91) (96 - 5 unknowns), of mean n 91 / 89 for n numbers.
+    """
+    m, late, centre, rho, runs = motion(beta=BETA), 0.007, (0.006, 0.005), 0.004, 300
+    edges = passed(centre, rho, beta=BETA, window=(0.0, 12.0 * PERIOD), latency=late)
+    free, random = len(edges) - 5, np.random.default_rng(11)
+    squared = {"centre": 0.0, "latency": 0.0, "radius": 0.0}
+    for _ in range(runs):
+        found = fit_circle(m, jittered(edges, random, times=5.0))
+        off = found.centre - centre
+        squared["centre"] += off @ np.linalg.solve(found.covariance, off)
+        squared["latency"] += ((found.latency_s - late) / found.latency_sigma_s) ** 2
+        off = found.rho - rho
+        squared["radius"] += off @ np.linalg.solve(found.estimate.covariance[2:4, 2:4], off)
+    for name, count in (("centre", 2), ("latency", 1), ("radius", 2)):
+        mean, spread = count * free / (free - 2), np.sqrt(2.0 * count * (free + count) / free)
+        wanted = pytest.approx(runs * mean, abs=4.0 * np.sqrt(runs) * spread)
+        assert squared[name] == wanted, name
 
 
 @pytest.mark.parametrize("direction", [1, -1])

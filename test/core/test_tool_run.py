@@ -16,6 +16,7 @@ from robocal_ros.core.tool.crossed_run import estimate_tool, run_problem
 from robocal_ros.core.tool.flange_path import JointPath
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.quick_check import CheckRule, quick_check
+from robocal_ros.core.tool.run_traits import RunTraits
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise, bent
 from robocal_ros.sim.tool_cell import MeasuredRun, RunPlan, ToolCell
 from robocal_ros.sim.ur10_station import BETA_RAD, T_BASE_LASER, TAUGHT, laser_of
@@ -190,6 +191,30 @@ def test_errors_are_what_the_covariance_says():
     assert np.sum(squared) == pytest.approx(300.0, abs=4.0 * np.sqrt(600.0))
     rms = np.sqrt(np.mean(np.sum(np.square(tips), axis=1)))
     assert rms == pytest.approx(np.sqrt(np.mean(bound)), rel=4.0 / np.sqrt(360.0))
+
+
+@pytest.mark.parametrize("step_m", [1e-7, 3e-5])
+def test_edges_that_scatter_more_than_told_widen_all_that_is_told_once(step_m):
+    """Three times, over 60 runs; the scatter is found from about 20 residuals, so that a squared
+    error over its covariance is n F(n, 20), of mean n 20 / 18 for n numbers.
+    """
+    runs, free, true = 60, 20, bent(TAUGHT, [0.002, -0.001, 0.001], [0.02, -0.01, 0.0])
+    squared = {"tool": 0.0, "latency": 0.0, "radius": 0.0}
+    for seed in range(runs):
+        cell = make_cell(exact=False, noise=TrueNoise(step_m, 6e-6))
+        cell.robot = RobotNoise(step_m, 2e-6)
+        run = cell.full_run(RoundTool.cylinder(true, 0.0025), TAUGHT, rng(seed))
+        found = run.estimate(FREE)
+        lean = found.T_flange_tool[:3, :2].T @ (found.axis - true[:3, 2])
+        off = np.append(found.tip - true[:3, 3], lean)
+        squared["tool"] += off @ np.linalg.solve(found.covariance, off)
+        squared["latency"] += (found.latency_s / found.latency_sigma_s) ** 2
+        sigma = RunTraits.of(found, ["low", "high", "upright"], 125.0).radius_sigma_m
+        squared["radius"] += np.sum((found.radius - 0.0025) ** 2) / sigma**2
+    for name, count in (("tool", 5), ("latency", 1), ("radius", 6)):
+        mean, spread = count * free / (free - 2), np.sqrt(2.0 * count * (free + count) / free)
+        wanted = pytest.approx(runs * mean, abs=4.0 * np.sqrt(runs) * spread)
+        assert squared[name] == wanted, name
 
 
 def test_the_classic_method_is_worse_for_a_thick_bent_tool():

@@ -185,10 +185,7 @@ def _checked(problem: CircleProblem, found: Estimate[CircleState], edge_m: float
             "not constant: record joints and give them; or else check radius, period, start, beam "
             "angle and the stamps' sigma"
         )
-    chi2 = float(np.sum(found.residual**2))
-    wide = chi2 / free if chi2 > bound else 1.0
-    J = motion.centre_jacobian
-    spread = wide * found.covariance
+    J, spread = motion.centre_jacobian, found.covariance
     sigma = float(np.sqrt(spread[4, 4])) if "latency" in found.names else None
     return CircleFit(
         "best", motion.centre(state.d), J @ spread[:2, :2] @ J.T, state.d, state.rho,

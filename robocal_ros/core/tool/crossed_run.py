@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.descent import SOUND_FIT, chi2_quantile
 from robocal_ros.core.errors import RankDeficientError, ResidualError
 from robocal_ros.core.estimation import Estimate, solve
 from robocal_ros.core.tool.beam_edges import BEAMS, BeamEdge, BeamError, edges_of
@@ -18,11 +17,11 @@ from robocal_ros.core.tool.crossed_model import (
     RunProblem,
     ToolState,
     Touch,
-    across,
     touch_of,
 )
 from robocal_ros.core.tool.flange_path import FlangePath
 from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.core.tool.run_covariance import tool_covariance, widened
 from robocal_ros.core.tool.tool_axis import (
     require_height,
     require_upright,
@@ -52,7 +51,8 @@ class ToolEstimate:
     radius : (circles, 2) of the tool as each circle and beam sees it, m.
     misfit_m : rms of the edges' residuals, m.
     shift_m : largest shift of a step against the others, m.
-    widening : factor of the covariance: 1 where the sigmas explain edges, shifts and what was held.
+    estimate : with the covariance that all sigmas here are of: wider where the noise that was told
+        does not explain edges, shifts or what was held.
     """
 
     T_flange_tool: Array
@@ -62,7 +62,6 @@ class ToolEstimate:
     radius: Array
     misfit_m: float
     shift_m: float
-    widening: float
     estimate: Estimate[ToolState]
 
     @property
@@ -109,20 +108,18 @@ def estimate_tool(
     _require_steps(steps, held)
     problem, start = run_problem(laser, path, steps, T_flange_tool, noise, taper, held)
     _require_motion(problem, start)
-    found = solve(problem, start, prior_information=problem.prior, robust=False)
-    _require_fit(problem, steps, found)
-    state = found.state
+    solved = solve(problem, start, prior_information=problem.prior, robust=False)
+    _require_fit(problem, steps, solved)
+    found, state = widened(problem, solved), solved.state
     R = retaught(T_flange_tool[:3, :3], state.axis)
-    widening = _widening(problem, found)
     return ToolEstimate(
         T_flange_tool=frames.transform(R, state.tip),
-        covariance=widening * _tool_covariance(found, R),
+        covariance=tool_covariance(found.covariance, state.axis, R),
         latency_s=state.latency_s,
         latency_sigma_s=float(np.sqrt(found.covariance[5, 5])),
         radius=state.radius,
         misfit_m=_misfit(problem, found),
         shift_m=float(np.linalg.norm(state.shift, axis=1).max()),
-        widening=widening,
         estimate=found,
     )
 
@@ -276,18 +273,3 @@ def _require_fit(
             f"{limit * 1e3:.3f} mm): was the robot moved by hand in between, the tool touched, or "
             "the laser frame made at another station?"
         )
-
-
-def _widening(problem: RunProblem, found: Estimate[ToolState]) -> float:
-    """Misfit per degree of freedom where it is larger than the sigmas explain, else 1."""
-    away = problem.deviation(found.state)
-    misfit = float(np.sum(found.residual**2) + away @ problem.prior @ away)
-    free = len(found.residual) - problem.undetermined
-    return misfit / free if free > 0 and misfit > chi2_quantile(SOUND_FIT, free) else 1.0
-
-
-def _tool_covariance(found: Estimate[ToolState], R_flange_tool: Array) -> Array:
-    """(5, 5) of the tip and of the tilts along the tool's x and y."""
-    turn = np.eye(5)
-    turn[3:, 3:] = R_flange_tool[:, :2].T @ across(found.state.axis)
-    return np.asarray(turn @ found.covariance[:5, :5] @ turn.T)

@@ -71,7 +71,7 @@ class RunTraits:
         """Of a measured tool; ``circles``: names in the order of its radii."""
         found = estimate.estimate
         own = np.array([name.startswith("radius_") for name in found.names])
-        variance = estimate.widening * np.diag(found.covariance)[own]
+        variance = np.diag(found.covariance)[own]
         radii = zip(circles, estimate.radius.tolist(), strict=True)
         return cls(
             {name: (x, y) for name, (x, y) in radii},
