@@ -61,7 +61,7 @@ def run_whole(args: argparse.Namespace, rule: "InputRule") -> Outcome:
     else:
         circles = [step.name for step in steps if step.kind == "circle"]
         found = estimate_tool(laser, path, steps, taught)
-        known = KnownTool(found.T_flange_tool, found.covariance)
+        known = KnownTool.measured(found)
         document = run_document(known, found, circles, judge_run(found, ToolLimits()))
     document["warnings"] = warnings
     warn(warnings)

@@ -95,12 +95,13 @@ class ToolResults:
     def _full(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         estimate = run.estimate(Held())
         run.require_like_healthy(estimate)
-        found = KnownTool(estimate.T_flange_tool, estimate.covariance)
+        found, in_force = KnownTool.measured(estimate), self._current.tool
         taught, healthy = self._config.T_flange_taught, self._current.measured_healthy
         absolute = healthy is None
         if healthy is not None:
             found = changed_tool(taught, healthy, found)
-        in_force = self._current.tool
+            if self._current.head.model is None:
+                in_force = KnownTool.taught(taught, healthy)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits)
         document = run_document(found, estimate, run.circles, verdict) | {
             "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
@@ -113,7 +114,7 @@ class ToolResults:
         """Keep how the healthy tool measures; in force at once: by itself it moves nothing."""
         run.require_even_readings()
         estimate = run.estimate(Held())
-        found = KnownTool(estimate.T_flange_tool, estimate.covariance)
+        found = KnownTool.measured(estimate)
         taught = self._config.T_flange_taught
         verdict = judge_healthy(found, estimate, taught)
         document = run_document(found, estimate, run.circles, verdict)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from maintained_cell import POSES, MaintainedCell
-from tool_driver import TAUGHT, TRUTH
+from tool_driver import TAUGHT, TRUTH, Driver
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
@@ -17,6 +17,7 @@ from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.sessions.maintenance import AcceptBounds
+from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 GAP_S = 240.0
@@ -155,6 +156,20 @@ def test_a_tool_that_is_measured_after_something_moved_waits(warm):
     assert result.tool_code is Code.ACCEPT
     assert f"tool candidate {result.tool_id} waits" in result.message.replace("tool: ", "")
     assert result.accepted == ()
+
+
+def test_a_full_measurement_of_a_healthy_tool_leaves_all_as_it_is(history):
+    """Due by the calendar, of the taught tool: no candidate waits, and the line stays right."""
+    cell = MaintainedCell(history, TAUGHT, poses=np.zeros((0, 6)), full_every_s=3600.0)
+    commissioning = ToolSession(cell.arm, history, cell.session.config, "test")
+    assert Driver(commissioning, cell.cell, cell.tool).measure("reference").done
+    cell.run(0.5)
+    result = cell.maintain("c1", GAP_S)
+    assert (result.tool_code, result.tool_answer) == (Code.NO_SIGNIFICANT_GAIN, "pass")
+    assert result.tool_found_code is Code.ACCEPT
+    assert history.get(result.tool_id).code is Code.NO_SIGNIFICANT_GAIN
+    assert history.pending(TOOL) == ()
+    assert cell.accuracy().level is not AccuracyLevel.DEGRADED
 
 
 def test_small_steps_do_not_creep_past_the_bounds(history):

@@ -21,7 +21,7 @@ from robocal_ros.core.tool.crossed_model import (
 )
 from robocal_ros.core.tool.flange_path import FlangePath
 from robocal_ros.core.tool.laser_frame import LaserFrame
-from robocal_ros.core.tool.run_covariance import tool_covariance, widened
+from robocal_ros.core.tool.run_covariance import of_laser, tool_covariance, widened
 from robocal_ros.core.tool.tool_axis import (
     require_height,
     require_upright,
@@ -46,7 +46,8 @@ class ToolEstimate:
     ----------
     T_flange_tool : (4, 4) z along the axis from flange to tip, turned about it as it was taught.
     covariance : (5, 5) of the tip (flange axes, m^2) and of the axis' direction along the tool's
-        own x and y (rad^2).
+        own x and y (rad^2); ``own_covariance`` (5, 5) its part that is this run's alone, without
+        the laser frame's, which all runs at a station have in common.
     latency_s, latency_sigma_s : of the edges behind the robot's readings.
     radius : (circles, 2) of the tool as each circle and beam sees it, m.
     misfit_m : rms of the edges' residuals, m.
@@ -57,6 +58,7 @@ class ToolEstimate:
 
     T_flange_tool: Array
     covariance: Array
+    own_covariance: Array
     latency_s: float
     latency_sigma_s: float
     radius: Array
@@ -111,10 +113,12 @@ def estimate_tool(
     solved = solve(problem, start, prior_information=problem.prior, robust=False)
     _require_fit(problem, steps, solved)
     found, state = widened(problem, solved), solved.state
+    own = found.covariance - of_laser(problem, solved)
     R = retaught(T_flange_tool[:3, :3], state.axis)
     return ToolEstimate(
         T_flange_tool=frames.transform(R, state.tip),
         covariance=tool_covariance(found.covariance, state.axis, R),
+        own_covariance=tool_covariance(own, state.axis, R),
         latency_s=state.latency_s,
         latency_sigma_s=float(np.sqrt(found.covariance[5, 5])),
         radius=state.radius,

@@ -1,6 +1,6 @@
 """Is a measured tool good, in mm? Against the tool in force, within what may change."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -37,26 +37,45 @@ class ToolLimits:
 
 @dataclass(frozen=True, eq=False)
 class KnownTool:
-    """A tool as it is kept: pose (4, 4) in the flange frame and covariance (5, 5), or None."""
+    """A tool as it is kept.
+
+    Attributes
+    ----------
+    T_flange_tool : (4, 4) pose in the flange frame.
+    covariance : (5, 5) as of a `ToolEstimate`; None: not measured.
+    own_covariance : (5, 5) what of it is its own run's alone; None: not known.
+    against : (4, 4) the healthy tool as measured, where this tool is the change against it.
+    """
 
     T_flange_tool: Array
     covariance: Array | None = None
+    own_covariance: Array | None = None
+    against: Array | None = None
+
+    @classmethod
+    def measured(cls, estimate: ToolEstimate) -> "KnownTool":
+        """As a run shows it, with the robot's absolute error and the laser frame's."""
+        return cls(estimate.T_flange_tool, estimate.covariance, estimate.own_covariance)
+
+    @classmethod
+    def taught(cls, T_flange_tool: Array, healthy: "KnownTool") -> "KnownTool":
+        """The taught tool: no change against the healthy one's run, and so exact.
+
+        A run differs from it by its own noise and the healthy run's.
+        """
+        exact = np.zeros((5, 5))
+        return cls(T_flange_tool, exact, healthy.own_covariance, healthy.T_flange_tool)
 
     def document(self) -> Document:
         """In full precision, SI; `of_document` reads it back to the last bit."""
-        return {
-            "T_flange_tool": self.T_flange_tool.tolist(),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
-        }
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: None if part is None else part.tolist() for name, part in parts.items()}
 
     @classmethod
     def of_document(cls, document: Document) -> "KnownTool":
         """Read what `document` gave."""
-        covariance = document["covariance"]
-        return cls(
-            np.array(document["T_flange_tool"]),
-            None if covariance is None else np.array(covariance),
-        )
+        parts = {field.name: document.get(field.name) for field in fields(cls)}
+        return cls(**{name: np.array(part) for name, part in parts.items() if part is not None})
 
 
 @dataclass(frozen=True)
@@ -84,7 +103,8 @@ def changed_tool(taught: Array, healthy: KnownTool, measured: KnownTool) -> Know
     both = [known.covariance for known in (healthy, measured)]
     known = [c for c in both if c is not None]
     covariance = np.sum(known, axis=0) if len(known) == len(both) else None
-    return KnownTool(frames.transform(turn @ taught[:3, :3], tip), covariance)
+    T = frames.transform(turn @ taught[:3, :3], tip)
+    return KnownTool(T, covariance, measured.own_covariance, healthy.T_flange_tool)
 
 
 def judge_healthy(found: KnownTool, estimate: ToolEstimate, taught: Array) -> Verdict:
@@ -155,11 +175,26 @@ def judge_tool(
 
 
 def unchanged(found: KnownTool, in_force: KnownTool) -> bool:
-    """Whether two measured tools differ by no more than their noise (chi-square, 5 unknowns)."""
-    if found.covariance is None or in_force.covariance is None:
+    """Whether two tools differ by no more than their noise (chi-square, 5 unknowns)."""
+    spread = _spread_between(found, in_force)
+    if spread is None:
         return False
     R = in_force.T_flange_tool[:3, :3]
     tilt = R[:, :2].T @ (found.T_flange_tool[:3, 2] - in_force.T_flange_tool[:3, 2])
     d = np.append(found.T_flange_tool[:3, 3] - in_force.T_flange_tool[:3, 3], tilt)
-    distance = float(d @ np.linalg.solve(found.covariance + in_force.covariance, d))
-    return distance <= chi2_quantile(UNCHANGED, len(d))
+    return float(d @ np.linalg.solve(spread, d)) <= chi2_quantile(UNCHANGED, len(d))
+
+
+def _spread_between(found: KnownTool, in_force: KnownTool) -> Array | None:
+    """Covariance (5, 5) of the difference of two tools; None where it is not known.
+
+    In that of two changes against one run of the healthy tool its error cancels, and the laser
+    frame's: what is each run's own is left. All other tools count whole.
+    """
+    run, other = found.against, in_force.against
+    one_run = run is not None and other is not None and np.array_equal(run, other)
+    if one_run and found.own_covariance is not None and in_force.own_covariance is not None:
+        return found.own_covariance + in_force.own_covariance
+    if found.covariance is None or in_force.covariance is None:
+        return None
+    return found.covariance + in_force.covariance

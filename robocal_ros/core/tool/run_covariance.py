@@ -25,6 +25,13 @@ def widened(problem: RunProblem, found: Estimate[ToolState]) -> Estimate[ToolSta
     return replace(found, covariance=misfit / free * found.covariance)
 
 
+def of_laser(problem: RunProblem, found: Estimate[ToolState]) -> Array:
+    """Part of the covariance C that the errors of the laser's points make: C P C, P their prior."""
+    points = [i for i, name in enumerate(found.names) if name.startswith("laser_")]
+    by_point = found.covariance[:, points]
+    return np.asarray(by_point @ problem.prior[np.ix_(points, points)] @ by_point.T)
+
+
 def tool_covariance(covariance: Array, axis: Array, R_flange_tool: Array) -> Array:
     """(5, 5) of the tip and of the tilts along the tool's x and y."""
     turn = np.eye(5)
