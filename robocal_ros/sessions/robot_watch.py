@@ -1,6 +1,8 @@
 """Where the robot is, against the plan that it was sent."""
 
+from bisect import bisect_right
 from collections import deque
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,8 +158,7 @@ class RobotWatch:
     def _since(self, span_s: float) -> list[tuple[float, Array]] | None:
         """Readings of the last ``span_s``; None before there are enough."""
         readings = list(self._readings)
-        if not readings or readings[-1][0] - readings[0][0] < span_s:
+        first_s = readings[-1][0] - span_s if readings else np.inf
+        if not readings or readings[0][0] > first_s:
             return None
-        first_s = readings[-1][0] - span_s
-        first = max(i for i, (at_s, _) in enumerate(readings) if at_s <= first_s)
-        return readings[first:]
+        return readings[bisect_right(readings, first_s, key=itemgetter(0)) - 1 :]

@@ -150,15 +150,16 @@ class TrueRobot:
             (T @ np.append(centre, 1.0))[:, :3]
             for T, centre in zip(frames[1:], self.body.centre, strict=True)
         ]
-        load = np.zeros((len(frames[0]), self.nominal.n))
+        driven = np.array(frames[:-1])
+        axes, origins = driven[:, :, :3, 2], driven[:, :, :3, 3]
+        pull = np.empty_like(axes)
         mass, moment = 0.0, np.zeros((len(frames[0]), 3))  # of all that the joint carries
         for i in reversed(range(self.nominal.n)):
-            axis, origin = frames[i][:, :3, 2], frames[i][:, :3, 3]
             mass, moment = mass + self.body.mass[i], moment + self.body.mass[i] * centres[i]
-            slides = self.nominal.prismatic[i]
-            pull = mass * GRAVITY if slides else np.cross(moment - mass * origin, GRAVITY)
-            load[:, i] = np.sum(axis * pull, axis=1)
-        return load
+            pull[i] = mass * GRAVITY if self.nominal.prismatic[i] else moment - mass * origins[i]
+        turns = ~self.nominal.prismatic
+        pull[turns] = np.cross(pull[turns], GRAVITY)
+        return np.asarray(np.sum(axes * pull, axis=2).T)
 
 
 def shift(axis: int, length: Array) -> Array:

@@ -74,3 +74,14 @@ def test_too_few_readings_tell_no_speed(count: int) -> None:
     found, velocity = seen(times, q).state(times[-1], keeps=False)
     assert np.array_equal(found, np.median(q, axis=0))
     assert not velocity.any()
+
+
+def test_a_span_that_rounding_ends_before_the_first_reading_is_not_there_yet():
+    first_s, last_s, span_s = 0.014, 0.044, 0.03
+    assert last_s - first_s >= span_s
+    assert last_s - span_s < first_s
+    watch = seen(np.array([first_s, last_s]), np.tile(HOME, (2, 1)))
+    assert watch.resting(span_s) is None
+    assert not watch.tells_speed(1.0)
+    watch.reading(0.05, HOME, 0.05)
+    assert watch.resting(span_s) == pytest.approx(HOME, abs=0.0)
