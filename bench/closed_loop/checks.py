@@ -1,8 +1,12 @@
 """From which size on a fault is reported with the right code. Simulated.
 
 Each seed is another cell, commissioned once, then checked with one fault after the other: by a
-quick check of the tool, or by a thermal cycle where the sphere sensor shows it. Each takes a
+quick check of the tool, or by a thermal cycle where the sphere sensor shows it. Each takes half a
 second, where a whole gap takes several.
+
+There are as many cells as prove a power of 90 %, with 95 % confidence, of a size that is missed in
+no more than one of them: 46. A size that is missed more often in the first few is tried in no
+others, nor is a smaller one: that can only withhold a proof, never give one.
 """
 
 import os
@@ -10,8 +14,10 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 from bench.closed_loop.faults import (
+    ENUMERATED,
     POWER,
     RIGHT,
     SWEEP,
@@ -20,7 +26,9 @@ from bench.closed_loop.faults import (
     least_power,
     named_size,
     named_smallest,
-    smallest_with_power,
+    proven,
+    rights_by_size,
+    smallest_held,
 )
 from bench.closed_loop.plant import equipped
 from bench.closed_loop.shift import ROBOT
@@ -47,11 +55,15 @@ SEEN_BY_CHECK: tuple[Fault, ...] = (
     "double_edge",
     "wrong_station",
     "frozen_encoder",
+    "joints_silent",
+    "frozen_clock",
 )
 SEEN_BY_CYCLE: tuple[Fault, ...] = ("sensor_knocked", "sphere_knocked", "moved_by_hand")
 SETTLES_S = 0.5
 QUIET = 0.95  # of the measurements of a healthy cell say nothing, or more
-SEEDS = range(41, 51)
+CELLS, FIRST, MISSES = 46, 6, 1
+SEEDS = range(41, 41 + CELLS)
+Sizes = Mapping[Fault, Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -64,12 +76,12 @@ class Checked:
 
     @property
     def right(self) -> bool:
-        """Whether it is the code of this fault, and none was told before it."""
-        return self.code is RIGHT[self.trial.fault] and self.before in WELL
+        """Whether it is the code of this fault, which was not told before it."""
+        return self.code is RIGHT[self.trial.fault] and self.before is not self.code
 
 
-def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterator[Checked]:
-    """Every fault that a check can see, at all of its sizes, in the cell of a seed."""
+def checked(seed: int, sizes: Sizes = SWEEP) -> Iterator[Checked]:
+    """Every fault that a check can see, at these sizes, in the cell of a seed."""
     nominal = load_robot(ROBOT)
     cell = SimulatedCell(kr150_cell(nominal, seed, points=0))
     with equipped(nominal, cell) as (plant, suite):
@@ -93,39 +105,51 @@ def checked(seed: int, sizes: Mapping[Fault, Sequence[float]] = SWEEP) -> Iterat
                 cell.set_fault("none")
 
 
+def still_open(found: Sequence[Checked]) -> Sizes:
+    """The sizes of `SWEEP` that may still be proven, and are larger than those that cannot."""
+    misses = Counter((one.trial.fault, one.trial.size) for one in found if not one.right)
+    lost: dict[Fault, float] = {}
+    for (fault, size), count in misses.items():
+        if count > MISSES and fault not in ENUMERATED:
+            lost[fault] = max(size, lost.get(fault, 0.0))
+    return {
+        fault: [size for size in sizes if size > lost.get(fault, 0.0)]
+        for fault, sizes in SWEEP.items()
+    }
+
+
 def power_table(found: Sequence[Checked]) -> Table:
     """How often the right code came, by size."""
-    seeds = len({one.trial.seed for one in found})
     table = Table(
         "closed_loop_checks",
-        f"One fault at a time in {seeds} cells: how often the right code came",
-        ("fault", "right code", "size: right of all", "smallest with 90 %", "there at least, %",
-         "told below it", "at the usual size, %", "goal"),
+        f"One fault at a time in {CELLS} cells: how often the right code came",
+        ("fault", "right code", "size: right of all", "smallest with 90 %", "told below it",
+         "at the usual size at least, %", "goal"),
         "Simulated: the commissioned cell, the fault, one quick check of the tool; for what was "
         "knocked or moved a thermal cycle. A measurement without it comes before; right is only "
-        "who says nothing in that. The smallest size from which on the right code comes in 90 % of "
-        "the cells or more; at least: what so few cells prove of that, the lower 95 % confidence "
-        "bound (Clopper-Pearson) at that size. Of an encoder: its joint.",
+        "who does not tell the same in that. The smallest size from which on a power of 90 % is "
+        "proven, as "
+        f"the right code came in all or all but {MISSES} of {CELLS} cells: the lower 95 % "
+        f"confidence bound (Clopper-Pearson). A size that is missed more often in {FIRST} cells is "
+        "tried in no more of them, nor are smaller ones. Of an encoder: its joint.",
     )  # fmt: skip
     for fault in dict.fromkeys(one.trial.fault for one in found):
         own = [one for one in found if one.trial.fault == fault]
         by_size: dict[float, list[Checked]] = {}
-        for one in own:
+        for one in sorted(own, key=lambda one: one.trial.size):
             by_size.setdefault(one.trial.size, []).append(one)
         words = ", ".join(
             f"{named_size(cells[0].trial)}: {sum(c.right for c in cells)}/{len(cells)}".lstrip(": ")
             for cells in by_size.values()
         )
-        trials = [(one.trial.amount, one.right) for one in own]
-        smallest = smallest_with_power(trials)
+        smallest = smallest_held(rights_by_size((c.trial.amount, c.right) for c in own), proven)
         told = [c.code.name for c in own if smallest is None or c.trial.amount < smallest]
         below = ", ".join(f"{name} {count}" for name, count in Counter(told).most_common())
         wanted = [cells for cells in by_size.values() if cells[0].trial.must_be_told]
-        share = 100.0 * min(sum(c.right for c in cells) / len(cells) for cells in wanted)
+        least = 100.0 * min(least_power([c.right for c in cells]) for cells in wanted)
         table.add(
-            fault, RIGHT[fault].name, words,
-            named_smallest(fault, smallest), least_power(trials, smallest), below,
-            share, Goal(share, 100.0 * POWER, at_least=True),
+            fault, RIGHT[fault].name, words, named_smallest(fault, smallest), below,
+            least, Goal(least, 100.0 * POWER, at_least=True),
         )  # fmt: skip
     return table
 
@@ -154,12 +178,15 @@ def healthy_table(found: Sequence[Checked]) -> Table:
     return table
 
 
-def _all_checked(seed: int) -> list[Checked]:
-    return list(checked(seed))
+def _all_checked(seed: int, sizes: Sizes) -> list[Checked]:
+    return list(checked(seed, sizes))
 
 
 def tables() -> Sequence[Table]:
     """All checks, on all cores."""
+    found: list[Checked] = []
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        found = [one for cell in pool.map(_all_checked, SEEDS) for one in cell]
+        for seeds in SEEDS[:FIRST], SEEDS[FIRST:]:
+            cells = pool.map(partial(_all_checked, sizes=still_open(found)), seeds)
+            found += [one for cell in cells for one in cell]
     return [power_table(found), healthy_table(found)]

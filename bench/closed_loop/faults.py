@@ -1,7 +1,8 @@
 """What each fault costs, who reports it, and from which size on. Simulated."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 
 from bench.closed_loop.judging import Harm, harm
 from bench.closed_loop.plant import GapReport
@@ -183,39 +184,47 @@ def sweep(seeds: Sequence[int]) -> list[Trial]:
     ]
 
 
-def smallest_with_power(found: Iterable[tuple[float, bool]]) -> float | None:
-    """The smallest size of one fault from which on trials are right with the wanted power.
-
-    Of trials by size, in time or with the right code or not; None where no size is.
-    """
-    by_size: dict[float, list[bool]] = {}
-    for size, right in found:
-        by_size.setdefault(size, []).append(right)
-    smallest = None
-    for size in sorted(by_size, reverse=True):
-        if sum(by_size[size]) < POWER * len(by_size[size]):
-            break
-        smallest = size
-    return smallest
+Held = Callable[[Sequence[bool]], bool]
 
 
-def least_power(found: Iterable[tuple[float, bool]], size: float | None) -> float | None:
-    """The lower confidence bound of the power at a size, one-sided, %, from so few trials.
+def shown(rights: Sequence[bool]) -> bool:
+    """Whether trials of one size, right or not, are right with the wanted power."""
+    return sum(rights) >= POWER * len(rights)
 
-    Of trials as `smallest_with_power` takes them; None where there is no size. Clopper and Pearson,
-    "The use of confidence or fiducial limits", Biometrika 26 (1934): exact for a count.
+
+def proven(rights: Sequence[bool]) -> bool:
+    """Whether so many trials also prove it."""
+    return least_power(rights) >= POWER
+
+
+def least_power(rights: Sequence[bool]) -> float:
+    """The lower confidence bound of the power, one-sided, from trials that were right or not.
+
+    Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934): exact
+    for a count.
     """
     from scipy.stats import binomtest
 
-    rights = [right for tried, right in found if tried == size]
-    if not rights:
-        return None
     counted = binomtest(sum(rights), len(rights), alternative="greater")
-    return 100.0 * float(counted.proportion_ci(CONFIDENCE, method="exact").low)
+    return float(counted.proportion_ci(CONFIDENCE, method="exact").low)
+
+
+def rights_by_size(found: Iterable[tuple[float, bool]]) -> dict[float, list[bool]]:
+    """Trials of one fault by their size, the largest first."""
+    by_size: dict[float, list[bool]] = {}
+    for size, right in found:
+        by_size.setdefault(size, []).append(right)
+    return dict(sorted(by_size.items(), reverse=True))
+
+
+def smallest_held(found: Mapping[float, Sequence[bool]], held: Held) -> float | None:
+    """The smallest size of `rights_by_size` from which on it held; None where no size does."""
+    sizes = list(takewhile(lambda size: held(found[size]), found))
+    return sizes[-1] if sizes else None
 
 
 def named_smallest(fault: Fault, amount: float | None) -> str:
-    """What `smallest_with_power` found, in words."""
+    """What `smallest_held` found, in words."""
     if amount is None:
         return "none"
     return "" if fault in ENUMERATED else named_size(Trial(fault, amount, 0))

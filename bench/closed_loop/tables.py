@@ -18,7 +18,9 @@ from bench.closed_loop.faults import (
     named_size,
     named_smallest,
     report_of,
-    smallest_with_power,
+    rights_by_size,
+    shown,
+    smallest_held,
     sweep,
     unseen,
 )
@@ -227,12 +229,13 @@ def detection_table(reports: Sequence[Report]) -> Table:
     swept = [one for one in reports if one.trial.gaps == AFTER]
     for fault in dict.fromkeys(one.trial.fault for one in swept):
         own = [one for one in swept if one.trial.fault == fault]
-        trials = [(one.trial.amount, one.in_time) for one in own]
-        amount = smallest_with_power(trials)
+        rights = rights_by_size((one.trial.amount, one.in_time) for one in own)
+        amount = smallest_held(rights, shown)
+        least = None if amount is None else 100.0 * least_power(rights[amount])
         at_it = [one for one in own if one.trial.amount == amount]
         codes = ", ".join(sorted({one.code.name for one in at_it}))
         tried = ", ".join(dict.fromkeys(named_size(one.trial) for one in own))
-        table.add(fault, tried, named_smallest(fault, amount), least_power(trials, amount), codes)
+        table.add(fault, tried, named_smallest(fault, amount), least, codes)
     return table
 
 

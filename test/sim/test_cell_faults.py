@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kr150_shift import ABOVE, CYCLE, HOME, WORK, cell_of, first_circle, went
 
-from bench.closed_loop.faults import smallest_with_power
+from bench.closed_loop.faults import proven, rights_by_size, shown, smallest_held
 from robocal_ros.sim.cell_faults import FAULTS, NEXT_MOTION, SIZES
 from robocal_ros.sim.kr150_cell import TAUGHT
 from robocal_ros.sim.robot import Effects
@@ -242,8 +242,17 @@ def test_no_size_brings_the_cell_down(fault, size):
         assert np.all(np.isfinite(told[name]))
 
 
-def test_the_smallest_size_is_found_from_the_largest_downwards():
-    often = [(2.0, True)] * 10 + [(1.0, True)] * 9 + [(1.0, False)]
-    assert smallest_with_power(often) == 1.0
-    assert smallest_with_power([*often, (0.5, False), (0.2, True)]) == 1.0  # by chance
-    assert smallest_with_power([(2.0, False)]) is None
+@pytest.mark.parametrize(("held", "cells", "missed"), [(shown, 10, 1), (proven, 46, 1)])
+def test_the_smallest_size_is_found_from_the_largest_downwards(held, cells, missed):
+    def smallest(*misses):
+        """By the misses at 2, 1, ... ."""
+        trials = [
+            (2.0 / 2**step, cell >= count)
+            for step, count in enumerate(misses)
+            for cell in range(cells)
+        ]
+        return smallest_held(rights_by_size(reversed(trials)), held)
+
+    assert smallest(0, missed) == 1.0
+    assert smallest(0, missed, missed + 1, 0) == 1.0  # by chance
+    assert smallest(missed + 1, 0) is None
