@@ -5,10 +5,9 @@ import webbrowser
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from bench.demo import GOAL_S
 from bench.live.plc import Gap
 from robocal_ros.core.codes import Code
-
-GOAL_S = 180.0  # of the whole demo
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ PARTS = {
     "speed": "times",
     "correction": "correction",
     "startup": "startup",
+    "demo": "demo",
     "correction_stream": "correction_stream",
     "closed_loop": "closed_loop.tables",
     "fault_checks": "closed_loop.checks",
