@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Duration
 from command import robocal_json
 from geometry_msgs.msg import TransformStamped
 from lifecycle_msgs.msg import Transition
@@ -15,7 +16,7 @@ from robocal_msgs.action import MeasureTool
 from robocal_msgs.msg import ToolStep
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.live.cell import set_fault
 from robocal_ros.core.codes import Code
@@ -26,6 +27,9 @@ from robocal_ros.nodes import qos
 pytestmark = pytest.mark.cell
 
 RUN_S = 60.0
+BACK = Duration(sec=2)
+CHANGE_STATE = "/tcf_node/change_state"
+ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE
 BUSY = {"motion_silence_s": 0.5}  # the machine of the tests has other work: readings come late
 BEND_MM = [2.0, -1.0, 0.5]
 
@@ -50,6 +54,7 @@ class Cell:
         self.truth = graph.collect(TransformStamped, "/cell_sim_node/truth", qos.LATCHED)
         self.joints = graph.collect(JointState, "joint_states")
         self.sent = graph.collect(JointTrajectory, "/tcf_node/joint_trajectory")
+        self.drive = graph.probe.create_publisher(JointTrajectory, "/tcf_node/joint_trajectory", 10)
         self.steps = graph.collect(ToolStep, "/tcf_node/next_step", qos.LATCHED)
         graph.start("cell_sim_node", simulated, remap)
         graph.spin_until(lambda: self.truth and csv.exists(), "the cell")
@@ -86,6 +91,17 @@ class Cell:
                 return
             self.graph.spin_for(0.2)
         raise AssertionError(answer.message)
+
+    def drive_back(self) -> None:
+        """A person drives the robot to where it stood at first."""
+        back = JointTrajectoryPoint(positions=self.joints[0].position, time_from_start=BACK)
+        back.velocities = back.accelerations = [0.0] * len(back.positions)
+        self.drive.publish(JointTrajectory(joint_names=self.joints[0].name, points=[back]))
+        self.graph.spin_until(
+            lambda: np.allclose(self.joints[-1].position, back.positions, rtol=0.0, atol=1e-6),
+            "the robot is back",
+        )
+        self.graph.spin_for(0.5)
 
 
 def found(cell: Cell, result: Any) -> None:
@@ -126,24 +142,40 @@ def test_the_node_drives_a_whole_run_and_a_quick_check(graph: Any, tmp_path: Pat
     assert quick.answer == MeasureTool.Result.PASS, quick.message
 
 
-def rest_after(cell: Cell, stop: JointTrajectory) -> float:
-    """Seconds of joint stamps from the stop's last motion back to its first."""
-    position = np.array([m.position for m in cell.joints])
-    stamp = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in cell.joints])
+def rest_after(joints: list[JointState]) -> float:
+    """Seconds of joint stamps from the last motion to the end."""
+    position = np.array([m.position for m in joints])
+    stamp = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in joints])
     moving = np.flatnonzero(np.max(np.abs(np.diff(position, axis=0)), axis=1) > 1e-9)
     return float(stamp[-1] - stamp[moving[-1] + 1])
 
 
-@pytest.mark.parametrize("how", ["cancel", "disarm", "silent", "deactivate", "kill"])
-def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: str) -> None:
+HOW = ("cancel", "disarm", "silent", "deactivate", "kill")  # which ends the node
+
+
+def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path) -> None:
+    """One after the other, in one cell."""
     cell = Cell(graph, tmp_path, "trajectory")
-    cell.arm()
+    for how in HOW:
+        print(how)
+        cell.arm()
+        stops(cell, how)
+        if how == "silent":
+            set_fault(graph.call, "none")
+        elif how == "deactivate":
+            graph.call(ChangeState, CHANGE_STATE, transition=Transition(id=ACTIVATE))
+        cell.drive_back()
+
+
+def stops(cell: Cell, how: str) -> None:
+    """A run is stopped in the middle of its first circle."""
+    graph, sent, stood = cell.graph, len(cell.sent), len(cell.joints)
     handle = cell.begin(MeasureTool.Goal.FULL)
     ended = handle.get_result_async()
     if how == "silent":  # with the next motion
-        graph.spin_until(lambda: len(cell.sent) == 1, "the way to it", within_s=RUN_S)
+        graph.spin_until(lambda: len(cell.sent) == sent + 1, "the way to it", within_s=RUN_S)
         set_fault(graph.call, "joints_silent")
-    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=RUN_S)
+    graph.spin_until(lambda: len(cell.sent) == sent + 2, "the first circle", within_s=RUN_S)
     graph.spin_for(0.6 if how != "silent" else 0.0)  # in the middle of it
     before = len(cell.joints)
     if how == "cancel":
@@ -153,14 +185,14 @@ def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: st
     elif how == "kill":
         assert cell.tcf.stop(signal.SIGTERM) == 0
     elif how == "deactivate":
-        graph.call(ChangeState, "/tcf_node/change_state", transition=Transition(id=4))
+        graph.call(ChangeState, CHANGE_STATE, transition=Transition(id=DEACTIVATE))
         disarmed = graph.call(SetBool, "/tcf_node/arm", data=False)
         assert disarmed.success, disarmed.message
         assert disarmed.message == "disarmed: the node is not active"
         armed = graph.call(SetBool, "/tcf_node/arm", data=True)
         assert not armed.success
         assert armed.message == "the node is inactive: activate it to arm"
-    graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=3.0)
+    graph.spin_until(lambda: len(cell.sent) == sent + 3, "the stop", within_s=3.0)
     stop = cell.sent[-1]
     duration = stop.points[-1].time_from_start
     assert duration.sec == 0
@@ -174,7 +206,7 @@ def test_the_robot_stands_still_after_a_stop(graph: Any, tmp_path: Path, how: st
         assert not ended.result().result.success
     if how != "silent":
         # From the stop's arrival, a tick of the cell and the stop's own time later it stands.
-        assert rest_after(cell, stop) > 1.0 - duration.nanosec * 1e-9 - 0.1
+        assert rest_after(cell.joints[stood:]) > 1.0 - duration.nanosec * 1e-9 - 0.1
         assert len(cell.joints) > before
     if how in ("cancel", "disarm", "silent"):
         graph.spin_until(lambda: cell.steps[-1].kind == ToolStep.NONE, "nothing is awaited")
