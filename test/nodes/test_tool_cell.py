@@ -112,14 +112,6 @@ def found(cell: Cell, result: Any) -> None:
     assert away @ np.linalg.solve(covariance, away) < 16.3  # chi-square of 3, 1e-3
 
 
-def test_the_robots_program_drives_what_is_announced(graph: Any, tmp_path: Path) -> None:
-    cell = Cell(graph, tmp_path, "program")
-    found(cell, cell.measure())
-    names = [s.name for s in cell.steps if s.kind]
-    assert names == ["low", "high", "upright", "plunge_1", "plunge_2"]
-    assert cell.sent == []
-
-
 def test_the_node_drives_a_whole_run_and_a_quick_check(graph: Any, tmp_path: Path) -> None:
     cell = Cell(graph, tmp_path, "trajectory")
     refused = cell.measure()
@@ -218,8 +210,14 @@ FAULTS = {
 }
 
 
-def test_faults_of_the_moving_cell_are_refused_in_their_words(graph: Any, tmp_path: Path) -> None:
+def test_the_robots_program_drives_what_is_announced_and_faults_are_refused_in_their_words(
+    graph: Any, tmp_path: Path
+) -> None:
     cell = Cell(graph, tmp_path, "program")
+    found(cell, cell.measure())
+    names = [s.name for s in cell.steps if s.kind]
+    assert names == ["low", "high", "upright", "plunge_1", "plunge_2"]
+    graph.spin_for(2.5)  # the program drives its motion to the end
     for fault, words in FAULTS.items():
         set_fault(graph.call, fault)
         result = cell.measure()
@@ -235,3 +233,4 @@ def test_faults_of_the_moving_cell_are_refused_in_their_words(graph: Any, tmp_pa
     graph.spin_until(ended.done, "the result", within_s=RUN_S)
     assert ended.result().result.status == Code.RESIDUAL_TOO_LARGE
     assert "apart from the other steps" in ended.result().result.message
+    assert cell.sent == []
