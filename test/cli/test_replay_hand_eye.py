@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +24,12 @@ def bag(tmp_path_factory) -> Path:
     return path
 
 
-def test_replay_equals_the_recording_bit_for_bit(bag):
-    document = robocal_json(SCHEMA, "replay", bag)
+@pytest.fixture(scope="module")
+def document(bag) -> dict[str, Any]:
+    return dict(robocal_json(SCHEMA, "replay", bag))
+
+
+def test_replay_equals_the_recording_bit_for_bit(bag, document):
     assert document["differs"] == []
     assert document["warnings"] == []
     names = [c["command"] for c in document["commands"]]
@@ -35,8 +40,7 @@ def test_replay_equals_the_recording_bit_for_bit(bag):
     assert "Every recorded result comes out equal" in robocal("replay", bag).stdout
 
 
-def test_the_document_tells_the_calibrations_and_what_is_in_force(bag):
-    document = robocal_json(SCHEMA, "replay", bag)
+def test_the_document_tells_the_calibrations_and_what_is_in_force(document):
     whole, part = document["calibrations"]
     assert len(whole["residual_mm"]["per_sample"]) == 10
     assert len(part["residual_mm"]["per_sample"]) == 8
@@ -56,7 +60,7 @@ def test_windows_are_for_thermal_recordings(bag):
 
 
 def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
-    robocal_json(SCHEMA, "replay", bag, "--state", tmp_path)
+    found = robocal_json(SCHEMA, "replay", bag, "--state", tmp_path)["final_sensor"]["xyz_mm"]
     listed = robocal_json("history.list.json", "history", "list", "--state", tmp_path)
     kinds = {entry["kind"] for entry in listed["calibrations"]}
     assert kinds == {f"hand_eye/{FRAME}"}
@@ -70,7 +74,6 @@ def test_the_history_of_the_replay_can_be_kept(bag, tmp_path):
     file.write_text(shown.stdout)
     export = robocal("hand-eye", "export", "--result", file, "--format", "urdf", "--child", FRAME)
     x, y, z = (float(v) for v in export.stdout.partition('xyz="')[2].partition('"')[0].split())
-    found = robocal_json(SCHEMA, "replay", bag)["final_sensor"]["xyz_mm"]
     assert 1e3 * np.array([x, y, z]) == pytest.approx(found, abs=1e-4)
     unknown = robocal("history", "rollback", "--kind", "hand_eye/", "--state", tmp_path)
     assert unknown.returncode == 2

@@ -236,8 +236,9 @@ class TestStep:
             frames.exp_rotation(1e-3 * rng.standard_normal(3)), 2e-4 * rng.standard_normal(3)
         )
         known = stairs_target(taught, user_sigma_m=2e-4, user_sigma_rad=1e-3)
-        found = solve_step(self.shots(8, 8), known, "best", SETTINGS)
-        exact = solve_step(self.shots(8, 8), stairs_target(), "best", SETTINGS)
+        shots = self.shots(8, 8)
+        found = solve_step(shots, known, "best", SETTINGS)
+        exact = solve_step(shots, stairs_target(), "best", SETTINGS)
         assert chi_square(found, TRUE) < FAR_OFF
         assert np.trace(found.covariance[:3, :3]) > 2.0 * np.trace(exact.covariance[:3, :3])
 
