@@ -1,4 +1,4 @@
-"""The table of codes, the enumeration and the message must say the same."""
+"""The tables of codes, states and refusals must say what enumerations and messages say."""
 
 import re
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.joint_correction.refusals import Reason
 
 ROOT = Path(__file__).parents[1]
 CODES = {code.name: int(code) for code in Code}
@@ -18,6 +19,16 @@ def rows_of(page, first):
     return [
         [cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]
     ]
+
+
+def constants_of(message):
+    """Constants of a message's first enumeration: those from NONE on to the next empty line."""
+    text = (ROOT / "msg_defs" / "msg" / f"{message}.msg").read_text()
+    first = text[text.index("uint8 NONE=0") :].split("\n\n")[0]
+    return {
+        name: int(number)
+        for name, number in re.findall(r"^uint8\s+([A-Z_]+)\s*=\s*(\d+)", first, re.M)
+    }
 
 
 def test_documented_table():
@@ -43,9 +54,28 @@ def test_a_code_of_a_node_says_what_to_do_there_and_in_the_table(page, first, gi
 
 
 def test_message_constants():
-    text = (ROOT / "msg_defs" / "msg" / "CalibrationQuality.msg").read_text()
-    constants = re.findall(r"^uint8\s+([A-Z_]+)\s*=\s*(\d+)", text, re.M)
-    assert {name: int(number) for name, number in constants} == CODES
+    assert constants_of("CalibrationQuality") == CODES
+
+
+@pytest.mark.parametrize(
+    ("page", "first", "message"),
+    [
+        ("codes.md", "maintenance", "MaintenanceStatus"),
+        ("codes.md", "correction", "CorrectionStatus"),
+        ("plc.md", "state", "AccuracyState"),
+    ],
+)
+def test_each_state_has_its_number_and_what_to_do(page, first, message):
+    rows = rows_of(page, first)
+    sent = {name: number for name, number in constants_of(message).items() if name != "NONE"}
+    assert {row[0]: int(row[1]) for row in rows} == sent
+    assert all(len(row) == 4 and all(row) for row in rows)
+
+
+def test_each_refusal_of_the_correction_says_what_to_do():
+    rows = rows_of("codes.md", "reason")
+    assert [row[0] for row in rows] == [reason.value for reason in Reason]
+    assert all(len(row) == 2 and all(row) for row in rows)
 
 
 def test_numbers_are_never_reused():
