@@ -1,6 +1,7 @@
 """The files of whole cells give each node values that it takes."""
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +20,43 @@ from robocal_ros.nodes.thermal_settings import session_config
 from robocal_ros.sim.kr150_cell import SPIN_RAD, TAUGHT, poses
 from robocal_ros.storage.robots import load_robot
 
-CELLS = sorted((Path(__file__).parents[2] / "config" / "cells").glob("*.yaml"))
+ROOT = Path(__file__).parents[2]
+CELLS = sorted((ROOT / "config" / "cells").glob("*.yaml"))
 SHARED = "/**"
 NODES = {
     f"/**/{n.NAME}": n
     for n in (CellSimNode, ThermalNode, TcfNode, MaintenanceNode, JointCorrectionNode)
 }
+REAL = (ThermalNode, TcfNode, HandEyeNode, MaintenanceNode, JointCorrectionNode, RecorderNode)
+COUNTS = Counter(s.name for n in REAL for s in n.SETTINGS)
+OWN = {"target", "method"}  # another thing in each node
+OFTEN = {name for name, count in COUNTS.items() if count > 1} - OWN
+
+PAGE = (ROOT / "docs" / "cell_launch.md").read_text()
+FILES = {path.name: path.read_text() for path in (ROOT / "config" / "cell.yaml", *CELLS)}
+FILES["cell_launch.md"] = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0]
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "cell_launch.md").read_text()
+@pytest.mark.parametrize("text", FILES.values(), ids=FILES)
+def test_what_several_nodes_need_is_given_once_and_is_the_same_for_all(text):
+    sections = yaml.safe_load(text)
+    shared = sections[SHARED]["ros__parameters"]
+    known = {SERIAL.name} | {s.name for n in NODES.values() for s in n.SETTINGS}
+    assert shared.keys() <= known
+    simulated = {s.name for s in CellSimNode.SETTINGS}
+    assert shared.keys() & simulated <= {"robot"}  # else it would change the true cell
+    found = {}
+    for node in REAL:
+        own = sections.get(f"/**/{node.NAME}", {}).get("ros__parameters", {})
+        assert own.keys().isdisjoint(OFTEN | shared.keys()), node.NAME
+        kept = yaml.safe_load((ROOT / "config" / f"{node.NAME}.yaml").read_text())
+        given = kept[f"/**/{node.NAME}"]["ros__parameters"] | own | shared
+        for name in OFTEN & {s.name for s in node.SETTINGS}:
+            assert found.setdefault(name, given[name]) == given[name], (node.NAME, name)
 
 
 def test_the_file_on_the_page_has_values_for_all_nodes():
-    sections = yaml.safe_load(re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)[0])
+    sections = yaml.safe_load(FILES["cell_launch.md"])
     shared = sections.pop(SHARED)["ros__parameters"]
     nodes = NODES | {f"/**/{n.NAME}": n for n in (HandEyeNode, RecorderNode)}
     assert set(sections) == set(nodes) - {"/**/cell_sim_node"}
@@ -39,7 +64,8 @@ def test_the_file_on_the_page_has_values_for_all_nodes():
         settings = {s.name: s for s in (AUTOSTART, SERIAL, *nodes[name].SETTINGS)}
         for parameter, value in given["ros__parameters"].items():
             assert settings[parameter].accept(value) == value
-        assert settings["serial"].accept(shared["serial"])
+        for parameter in shared.keys() & settings.keys():
+            assert settings[parameter].accept(shared[parameter]) == shared[parameter]
 
 
 def test_there_is_one():
@@ -54,7 +80,8 @@ def test_each_node_takes_its_values(path):
     for name, given in sections.items():
         settings = {s.name: s for s in (AUTOSTART, SERIAL, *NODES[name].SETTINGS)}
         for parameter, value in (shared | given["ros__parameters"]).items():
-            assert settings[parameter].accept(value) == value
+            if parameter not in shared or parameter in settings:
+                assert settings[parameter].accept(value) == value
 
 
 def test_accuracy_is_judged_where_the_robot_works():
@@ -71,9 +98,8 @@ def test_accuracy_is_judged_where_the_robot_works():
 
 def test_tool_and_poses_are_the_cells():
     sections = yaml.safe_load(CELLS[0].read_text())
-    for name in ("/**/tcf_node", "/**/maintenance_node"):
-        given = sections[name]["ros__parameters"]
-        assert given["taught_xyz_mm"] == pytest.approx((1e3 * TAUGHT[:3, 3]).tolist())
+    given = sections[SHARED]["ros__parameters"]
+    assert given["taught_xyz_mm"] == pytest.approx((1e3 * TAUGHT[:3, 3]).tolist())
     given = sections["/**/tcf_node"]["ros__parameters"]
     assert given["spin_deg"] == pytest.approx(SPIN_RAD * 57.29577951308232)
     tool = sections["/**/joint_correction_node"]["ros__parameters"]["taught_tool"]
