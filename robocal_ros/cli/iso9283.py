@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from robocal_ros.core.iso9283 import Repeated
 
 NAME = "iso9283"
-HELP = "position accuracy and repeatability (AP, RP) as ISO 9283 defines them"
+HELP = (
+    "position accuracy and repeatability (AP, RP) of single poses as ISO 9283, 7.2, defines them; "
+    "no whole test"
+)
 
 EVERY = ""  # stands for every target that has no commanded position of its own
 Point = tuple[float, ...]
@@ -39,8 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="[TARGET=]X,Y,Z",
-        help="commanded position in mm, in the frame of the table; TARGET=X,Y,Z, repeated, where "
-        "there are several targets. Without it AP is not known",
+        help="commanded position in mm, in the frame of the table, which must come from other "
+        "points than these; TARGET=X,Y,Z, repeated, where there are several targets. Without it "
+        "AP is not known",
     )
 
 
@@ -134,7 +138,7 @@ def _show(console: "Console", document: Document) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    title = "Position accuracy and repeatability, ISO 9283, in mm"
+    title = "Position accuracy and repeatability as in ISO 9283, 7.2, in mm"
     table = Table(title=title, title_justify="left", box=None)
     table.add_column("target")
     for head in ("cycles", "AP", "AP x", "AP y", "AP z", "RP", "mean distance", "S"):
