@@ -19,7 +19,7 @@ from bench.tables import Goal, Table
 ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = ROOT / "install" / "robocal_ros" / "lib" / "robocal_ros"
 NODES = ("thermal_node", "joint_correction_node", "replay_node")
-PROMISED_S = 1.5
+PROMISED_MEDIAN_S = 1.5
 ROUNDS = 7
 GIVE_UP_S, ASK_AGAIN_S = 20.0, 1.0
 BARE = "import rclpy; rclpy.init(); n = rclpy.create_node('bare'); rclpy.spin(n)"
@@ -38,8 +38,9 @@ def start_times() -> Table:
     table = Table(
         "startup",
         "Start of the executables: first service answered, s",
-        ("executable", "median", "longest", "promised"),
-        f"{ROUNDS} starts each; in the first row a node of rclpy alone.",
+        ("executable", "median", "longest", "promised median"),
+        f"{ROUNDS} starts each; in the first row a node of rclpy alone. The promise is of the "
+        "median: one start among them may take longer.",
     )
     done = subprocess.run(
         [ROOT / "tools" / "with_ros", "python", "-m", "bench.startup"],
@@ -51,7 +52,7 @@ def start_times() -> Table:
     )
     for name, times in json.loads(done.stdout).items():
         middle = statistics.median(times)
-        table.add(name, middle, max(times), Goal(middle, PROMISED_S))
+        table.add(name, middle, max(times), Goal(middle, PROMISED_MEDIAN_S))
     return table
 
 
