@@ -12,7 +12,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, StaleError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.heat import Heat, HeatGains
+from robocal_ros.core.thermal.heat import Heat, HeatGains, joints_of
 from robocal_ros.core.thermal.priors import drift_prior
 from robocal_ros.core.thermal.process import DriftProcess
 from robocal_ros.core.thermal.spots import ColdSpots
@@ -286,6 +286,44 @@ def test_a_warming_that_nobody_read_is_no_step(arm):
         tracker.read_temperatures(np.zeros(6), 60.0 if silent else 3660.0)
         assert tracker.take(warm, 3660.0).applied == silent
         assert np.trace(tracker.expected_drift()) > 100.0 * np.trace(process.covariance)
+
+
+@pytest.mark.parametrize("silent_h", [0.25, 2.0, 6.0])
+def test_links_that_lag_stay_within_the_bound_while_motors_are_silent(arm, silent_h):
+    """Motors warm or cool unread, links follow them and their next motors with the lag.
+
+    The courses are drawn as the doubt has them: towards a normal 20 K, within an hour. 95 % of the
+    parameters' errors lie in 1.96 sigmas, less four standard errors of 200 runs of six motors; a
+    cycle afterwards is no step.
+    """
+    cell, k, n = cell_of(arm), len(arm.parameters), 6
+    rng = np.random.default_rng(8)
+    size = np.where(arm.parameters.is_length, 12e-6, 1e-5)[:, None]
+    known = size * rng.uniform(0.2, 1.0, (k, 3))  # all follow motors: directly, and with the lag
+    gains = HeatGains(known.ravel(), 1e-30 * np.eye(3 * k), 3600.0)
+    spots = ColdSpots.of(cell, visit(cell, postures(6)))
+    process = DriftProcess(1e-18 * np.eye(k))
+    tracker = DriftTracker(spots, process, SIGMA, gains=gains)
+    joint = joints_of(arm)
+    warm = Heat.cold(n, 0.0, 3600.0)
+    for time_s in np.arange(PERIOD_S, 7200.0 + PERIOD_S, PERIOD_S):
+        warm = warm.read(np.full(n, 15.0), time_s)
+        tracker.read_temperatures(warm.motor, time_s)
+    end_s = 7200.0 + 3600.0 * silent_h
+    expected, covariance = tracker.drift(end_s)
+    inside, applied = [], 0
+    for _ in range(200):
+        swing, heat = 20.0 * rng.standard_normal(n), warm
+        for time_s in np.linspace(7200.0, end_s, 100)[1:]:
+            gone = 1.0 - np.exp(-(time_s - 7200.0) / 3600.0)
+            heat = heat.read(warm.motor + gone * swing, time_s)
+        true = heat.rows(joint) @ known.ravel()
+        inside.append(np.abs(true - expected) < 1.96 * np.sqrt(np.diag(covariance)))
+        found = tracker._examine(visit(drifted(cell, true), postures(6), rng), end_s)[0]
+        applied += found.applied
+    assert np.mean(inside) > 0.95 - 4.0 * np.sqrt(0.95 * 0.05 / (200 * n))
+    assert np.mean(inside) < 0.99  # and the bound is no wider than it need be
+    assert applied >= 198
 
 
 def test_a_process_that_forgets_too_soon_is_refused(arm):

@@ -168,13 +168,19 @@ class DriftTracker:
         return rows @ state.mean, covariance
 
     def _swing(self, time_s: float) -> Array:
-        """Covariance (k, k) of what the motors may have done since they were last read."""
-        if self.heat is None:
-            return np.zeros((self.count, self.count))
-        gain = self.state.mean[self._gains].reshape(self.count, SOURCES)[:, 0]
-        sigma = swing_k(time_s - self.heat.time_s) * gain
-        same = self._joint[:, None] == self._joint
-        return np.asarray(same * np.outer(sigma, sigma))
+        """Covariance (k, k) of what the motors may have done since they were last read.
+
+        The links follow as if a motor had gone there at once: no course leaves them further off.
+        """
+        total, heat = np.zeros((self.count, self.count)), self.heat
+        if heat is None:
+            return total
+        silent_s, gains = time_s - heat.time_s, self.state.mean[self._gains]
+        for warm in swing_k(silent_s) * np.eye(len(heat.motor)):
+            gone = Heat(0.0, warm, np.zeros_like(warm), heat.lag_s).held(silent_s)
+            drift = gone.rows(self._joint) @ gains
+            total += np.outer(drift, drift)
+        return total
 
     def expected_drift(self) -> Array:
         """Covariance (k, k) of the drift that a shift may bring, SI: by all motors' warmth too."""
