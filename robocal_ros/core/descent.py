@@ -6,6 +6,8 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.freedom import Freedom, require_told
+
 Array = NDArray[np.float64]
 S = TypeVar("S")
 
@@ -87,8 +89,9 @@ class Descent(Generic[S]):
         """
         k = run.jacobian.shape[2]
         state, residual, jacobian = run.state, run.residual, run.jacobian
+        left = self._left(jacobian, keep)  # hardly changes on the way
         for iterations in range(run.iterations + 1, run.iterations + MOST_ITERATIONS + 1):
-            scale = self._scale(residual, keep, huber)
+            scale = self._scale(residual, keep, left, huber)
             normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
             step = _damped_step(normal, gradient, 0.0)
             to_go = float(step @ normal @ step)
@@ -108,39 +111,62 @@ class Descent(Generic[S]):
             state, residual, jacobian = trial, new_residual, new_jacobian
         return Run(state, residual, jacobian, iterations, False)
 
-    def _scale(self, residual: Array, keep: NDArray[np.bool_], huber: Array | None) -> float:
-        return (
-            self.plain_scale(residual, keep) if huber is None else self.robust_scale(residual, keep)
-        )
-
-    def plain_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
-        """Standard deviation of the kept residuals, unknowns counted; 1 where it is known."""
-        if not self.scale_components:
-            return 1.0
-        used = residual[keep, : self.scale_components]
-        freedom = max(used.size - len(self.problem.names), 1)
-        return max(float(np.sqrt(np.sum(used**2) / freedom)), SMALLEST_SCALE)
-
-    def robust_scale(self, residual: Array, keep: NDArray[np.bool_]) -> float:
-        """The same from the median, which outliers cannot inflate."""
-        if not self.scale_components:
-            return 1.0
-        used = residual[keep, : self.scale_components]
-        spread = np.median(np.sum(used**2, axis=1)) / chi2_quantile(0.5, self.scale_components)
-        spread *= used.size / max(used.size - len(self.problem.names), 1)
-        return max(float(np.sqrt(spread)), SMALLEST_SCALE)
-
-    def final_scale(self, residual: Array, keep: NDArray[np.bool_], information: Array) -> float:
-        """The estimated scale; with given sigmas 1, or the misfit where chi-square rejects 1."""
-        if self.scale_components:
-            return self.plain_scale(residual, keep)
+    def _scale(
+        self, residual: Array, keep: NDArray[np.bool_], left: Freedom | None, huber: Array | None
+    ) -> float:
         used = residual[keep]
+        return self._plain_scale(used, left) if huber is None else self._robust_scale(used, left)
+
+    def _left(
+        self, jacobian: Array, keep: NDArray[np.bool_], information: Array | None = None
+    ) -> Freedom | None:
+        """What the unknowns leave of the numbers that tell the noise; None where it is known.
+
+        ``information`` (k, k): of the samples in use, where it is known already.
+        """
+        c, k = jacobian.shape[1:]
+        count = int(np.sum(keep)) * self.scale_components
+        if not count:
+            return None
+        all_tell = c == self.scale_components
+        if all_tell and not np.any(self.prior):
+            return Freedom.flat(count, k)
+        data = information_of(jacobian, keep) if information is None else information
+        told = data if all_tell else information_of(jacobian[:, : self.scale_components], keep)
+        return Freedom.of(count, told, data, self.prior)
+
+    def _plain_scale(self, used: Array, left: Freedom | None) -> float:
+        """Standard deviation of residuals in use, unknowns counted; 1 where it is known."""
+        if left is None:
+            return 1.0
+        total = float(np.sum(used[:, : self.scale_components] ** 2))
+        return _found(left, total)
+
+    def _robust_scale(self, used: Array, left: Freedom | None) -> float:
+        """The same from the median, which outliers cannot inflate."""
+        if left is None:
+            return 1.0
+        squared = np.sum(used[:, : self.scale_components] ** 2, axis=1)
+        middle = float(np.median(squared)) / chi2_quantile(0.5, self.scale_components)
+        return _found(left, middle * left.count)
+
+    def final_scale(
+        self, run: Run[S], keep: NDArray[np.bool_], information: Array
+    ) -> tuple[float, float]:
+        """The estimated scale; with given sigmas 1, or the misfit where chi-square rejects 1.
+
+        And how many numbers tell it.
+        """
+        used, left = run.residual[keep], self._left(run.jacobian, keep, information)
+        if left is not None:
+            scale = self._plain_scale(used, left)
+            return scale, left.at(scale**2)
         explained = float(np.trace(information @ self.posterior(information, 1.0)))
         freedom = float(np.sum(self.sizes[keep])) - explained
         misfit = float(np.sum(used**2))
         if freedom < 1.0 or misfit <= chi2_quantile(SOUND_FIT, freedom):
-            return 1.0
-        return float(np.sqrt(misfit / freedom))
+            return 1.0, freedom
+        return float(np.sqrt(misfit / freedom)), freedom
 
     def _stretch(self, squared: Array, keep: NDArray[np.bool_]) -> float:
         """Factor by which studentised distances (m,) are larger than given sigmas explain.
@@ -208,11 +234,9 @@ class Descent(Generic[S]):
     def inliers(self, run: Run[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Samples whose residual fits its own predicted covariance (studentised, chi-square)."""
         m, c, _ = run.jacobian.shape
-        scale = self.robust_scale(run.residual, keep)
-        J = run.jacobian
-        JC = (J.reshape(m * c, -1) @ self.posterior(information_of(J, keep), scale)).reshape(
-            J.shape
-        )
+        J, information = run.jacobian, information_of(run.jacobian, keep)
+        scale = self._robust_scale(run.residual[keep], self._left(J, keep, information))
+        JC = (J.reshape(m * c, -1) @ self.posterior(information, scale)).reshape(J.shape)
         spread = JC @ np.swapaxes(J, 1, 2)
         sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
         expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
@@ -222,6 +246,18 @@ class Descent(Generic[S]):
         inlier = squared < limit
         enough = 2 * np.sum(inlier) > m
         return np.asarray(inlier) if enough else keep
+
+
+def _found(left: Freedom, total: float) -> float:
+    """Scale of residuals with this sum of squares.
+
+    Under a prior that is wider than the noise, unknowns without end explain few data ever better:
+    refused before the scale goes to zero.
+    """
+    scale = max(left.scale(total), SMALLEST_SCALE)
+    if left.by_prior:
+        require_told(left.at(scale**2))
+    return scale
 
 
 def rows_of(jacobian: Array, keep: NDArray[np.bool_]) -> Array:

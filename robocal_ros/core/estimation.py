@@ -39,6 +39,8 @@ class Estimate(Generic[S]):
     covariance : (k, k) of the increments at the estimate, in the problem's units.
     scale : standard deviation of the whitened residual: 1 where sigmas were given, unless the
         residuals are clearly larger; then covariances are widened by it.
+    freedom : how many numbers tell the scale: those of the residuals less those that the unknowns
+        take up. What the prior holds takes up none.
     residual : (m, c) whitened; ``rejected`` (m,) marks samples not used.
     """
 
@@ -46,6 +48,7 @@ class Estimate(Generic[S]):
     names: tuple[str, ...]
     covariance: Array
     scale: float
+    freedom: float
     residual: Array
     rejected: NDArray[np.bool_]
     observability: Observability
@@ -121,7 +124,7 @@ def solve(
     seen = observability(rows_of(run.jacobian, keep), information)
     if flat:
         _require_full_rank(seen, problem.names)
-    scale = descent.final_scale(run.residual, keep, information)
+    scale, left = descent.final_scale(run, keep, information)
     covariance = descent.posterior(information, scale)
     if not np.all(np.diag(covariance) > 0.0):
         raise _not_determined(seen, problem.names)
@@ -130,6 +133,7 @@ def solve(
         names=problem.names,
         covariance=covariance,
         scale=scale,
+        freedom=left,
         residual=run.residual,
         rejected=~keep,
         observability=seen,

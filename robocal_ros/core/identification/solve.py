@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core import estimation
 from robocal_ros.core.errors import RankDeficientError
+from robocal_ros.core.freedom import require_told
 from robocal_ros.core.identification.cell import CellModel, CellProblem, Layout, make_layout
 from robocal_ros.core.identification.priors import default_prior, fitted_prior
 from robocal_ros.core.identification.start import linear_start
@@ -273,6 +274,8 @@ def _report(
     held: tuple[str, ...],
     lever: float,
 ) -> Identification:
+    if data.sigma is None:
+        require_told(estimate.freedom)
     seen = estimate.observability
     if held:
         sigma = np.ones(len(data)) if data.sigma is None else data.sigma
