@@ -1,0 +1,62 @@
+"""What the pages quote of docs/figures is what stands there, rounded as the page has it."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+NUMBER = re.compile(r"(?<![\w.])\d+(?:\.(\d+))?(?![\w.])")
+# First cell of a table of accuracy.md; part and table of docs/figures; how many rows make one of
+# the page's.
+QUOTED = [
+    ("campaign", "real_data", "ur10_campaigns", 2),
+    ("used in", "real_data", "ur10_later", 1),
+    ("poses", "real_data", "ur10_few_poses", 1),
+    ("unknown", "monte_carlo", "efficiency", 1),
+    ("true robot", "monte_carlo", "unmodelled", 1),
+]
+CLOSED_FORMS = [
+    ("accuracy.md", r"closed\s+forms\s+are\s+at\s+([\d.]+)\s+to\s+([\d.]+\d)"),
+    ("hand_eye_camera.md", r"the\s+closed\s+forms\s+([\d.]+)\s+to\s+([\d.]+\d)"),
+]
+
+
+def figures(part, name):
+    """Numbers of each row of a kept table, cells with a goal by their value."""
+    document = json.loads((DOCS / "figures" / f"{part}.json").read_text())
+    (table,) = (t for t in document["tables"] if t["name"] == name)
+    values = [[c["value"] if isinstance(c, dict) else c for c in row] for row in table["rows"]]
+    return [[v for v in row if isinstance(v, int | float)] for row in values], table["rows"]
+
+
+def rows_quoted(first):
+    page = (DOCS / "accuracy.md").read_text()
+    table = page[page.index(f"| {first} |") :].split("\n\n")[0]
+    return [line.strip("|").split("|") for line in table.splitlines()[2:]]
+
+
+def shown(text, kept):
+    """Whether a number as a page has it is one of those kept, rounded."""
+    decimals = len(NUMBER.fullmatch(text)[1] or "")
+    return any(f"{value:.{decimals}f}" == text for value in kept)
+
+
+@pytest.mark.parametrize(("first", "part", "name", "rows"), QUOTED, ids=[q[0] for q in QUOTED])
+def test_a_table_has_the_kept_figures(first, part, name, rows):
+    kept, _ = figures(part, name)
+    for place, cells in enumerate(rows_quoted(first)):
+        numbers = [n for row in kept[rows * place : rows * (place + 1)] for n in row]
+        quoted = [found[0] for cell in cells[1:] for found in NUMBER.finditer(cell)]
+        assert quoted, cells
+        assert [text for text in quoted if not shown(text, numbers)] == [], (cells[0], numbers)
+
+
+@pytest.mark.parametrize(("page", "words"), CLOSED_FORMS, ids=[page for page, _ in CLOSED_FORMS])
+def test_a_sentence_has_the_range_of_the_closed_forms(page, words):
+    numbers, rows = figures("hand_eye_camera", "hand_eye_camera_bound")
+    found = [n for row, told in zip(rows, numbers, strict=True) if "OpenCV" in row[1] for n in told]
+    least, most = re.search(words, (DOCS / page).read_text()).groups()
+    assert shown(least, [min(found)])
+    assert shown(most, [max(found)])
