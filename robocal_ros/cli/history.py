@@ -10,12 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import count, text
-from robocal_ros.cli.history_view import (
-    show_corrections,
-    show_decision,
-    show_entry,
-    show_list,
-)
+from robocal_ros.cli.history_view import show_corrections, show_decision, show_entry, show_list
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import (
@@ -184,12 +179,15 @@ def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Ans
 
 
 def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    from robocal_ros.sessions.decisions import measured_with
+
     head = history.accept(
         args.id,
         by=_by(args),
         reason=args.reason,
         expected_head=args.expect_revision,
         wall_ns=time.time_ns(),
+        with_heads=measured_with(history, history.get(args.id)),
     )
     said = f"calibration {args.id} is in force as {head.kind} revision {head.revision}"
     return _decided(args, head.kind, args.id, head.revision, said), show_decision

@@ -3,12 +3,13 @@
 Sessions make proposals, the history keeps them, nodes and commands show them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import StaleError
 
 if TYPE_CHECKING:  # the history is listed without loading NumPy
     from numpy.typing import NDArray
@@ -141,3 +142,22 @@ class Entry(Candidate):
     state: State
     revision: int
     decisions: tuple[Decision, ...]
+
+
+def require_measured_with(
+    what: str, needed: Mapping[str, int], revision: Callable[[str], int]
+) -> None:
+    """Refuse a calibration that was measured with other revisions than those in force.
+
+    ``needed`` and ``revision`` are revisions by kind.
+
+    Raises
+    ------
+    StaleError
+    """
+    for kind, measured in needed.items():
+        if (found := revision(kind)) != measured:
+            raise StaleError(
+                f"{what} was measured with {kind} revision {measured}, in force is {found}: "
+                "measure it again"
+            )

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, RobocalError, StaleError
+from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import BEFORE_ANY, THERMAL, TOOL, Entry
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
@@ -39,9 +39,13 @@ def decide(
             history.reject(chosen, by=by, reason=why, wall_ns=wall_ns)
             return Outcome(command, Code.ACCEPT, f"calibration {chosen} rejected", None, chosen)
         if command.name == events.ACCEPT:
-            require_thermal(history, history.get(chosen))
             head = history.accept(
-                chosen, by=by, reason=why, expected_head=expected, wall_ns=wall_ns
+                chosen,
+                by=by,
+                reason=why,
+                expected_head=expected,
+                wall_ns=wall_ns,
+                with_heads=measured_with(history, history.get(chosen)),
             )
         else:
             head = history.rollback(
@@ -60,23 +64,15 @@ def decide(
     return Outcome(command, Code.ACCEPT, message, None, chosen, head.revision)
 
 
-def require_thermal(history: History, entry: Entry) -> None:
-    """Refuse a tool whose flange poses came from another thermal model than the one in force.
+def measured_with(history: History, entry: Entry) -> dict[str, int]:
+    """Revisions, by kind, beside which alone a calibration may come into force.
 
-    What the drift did to the flange would stay in it, and be corrected a second time.
-
-    Raises
-    ------
-    StaleError
+    A tool's flange poses came from a thermal model: with another one, what the drift did to the
+    flange would stay in the tool, and be corrected a second time.
     """
     if entry.kind != TOOL:
-        return
-    measured = history.model(entry.id)["thermal_revision"]
-    if measured != (revision := history.head(THERMAL).revision):
-        raise StaleError(
-            f"tool {entry.id} was measured with thermal revision {measured}, in force is "
-            f"{revision}: measure it again"
-        )
+        return {}
+    return {THERMAL: int(history.model(entry.id)["thermal_revision"])}
 
 
 def named(history: History, command: Command, kind: str) -> Command:

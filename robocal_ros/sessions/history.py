@@ -1,6 +1,6 @@
 """What a session needs of a calibration history, whoever keeps it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -17,9 +17,16 @@ class History(Protocol):
         """Keep a candidate and return its id."""
 
     def accept(
-        self, calibration_id: int, *, by: str, reason: str, expected_head: int | None, wall_ns: int
+        self,
+        calibration_id: int,
+        *,
+        by: str,
+        reason: str,
+        expected_head: int | None,
+        wall_ns: int,
+        with_heads: Mapping[str, int] | None = ...,
     ) -> Head:
-        """Bring a candidate into force."""
+        """Bring a candidate into force; ``with_heads``: only beside these revisions, by kind."""
 
     def reject(self, calibration_id: int, *, by: str, reason: str, wall_ns: int) -> None:
         """Refuse a candidate for good."""

@@ -2,11 +2,12 @@
 
 A change is one SQLite transaction: a process killed at any moment leaves the state before it or
 the state after it. Accept and rollback compare the revision in force before they set the new one,
-under the write lock, so that of two at once one wins and the other gets a `ConflictError`.
+under the write lock, so that of two at once one wins and the other gets a `ConflictError`; so
+are revisions of other kinds that a calibration needs beside it.
 """
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from robocal_ros.core.correction_record import CorrectionRecord
@@ -60,11 +61,13 @@ class CalibrationHistory(HistoryReader):
         reason: str,
         wall_ns: int,
         expected_head: int | None = None,
+        with_heads: Mapping[str, int] | None = None,
     ) -> Head:
         """Bring a pending calibration into force.
 
         ``expected_head`` is the revision that the caller believes in force; None stands for
-        whatever is in force when the change is made.
+        whatever is in force when the change is made. ``with_heads``: revisions, by kind, that
+        must be in force beside it.
 
         Raises
         ------
@@ -75,13 +78,14 @@ class CalibrationHistory(HistoryReader):
         VerdictError
             Its own verdict refuses it; carries that code.
         StaleError
-            Solved against a revision that is no longer in force.
+            Solved against a revision that is no longer in force, or measured with another one
+            of ``with_heads``.
         WrongRobotError
             Made for another nominal model.
         """
         with self._changing() as connection:
             candidate = read_candidate(connection, calibration_id)
-            self._ledger.check_accept(calibration_id, candidate, expected_head)
+            self._ledger.check_accept(calibration_id, candidate, expected_head, with_heads or {})
             self._require_hash(candidate.model_hash, f"calibration {calibration_id}")
             self._require_hash_in_force(candidate)
             return self._decide(Action.ACCEPT, candidate.kind, calibration_id, by, reason, wall_ns)

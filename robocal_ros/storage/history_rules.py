@@ -3,12 +3,18 @@
 The log alone says what is in force: there is no second place that could disagree with it.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, RobocalError, StaleError
-from robocal_ros.core.proposals import Action, Candidate, Decision, State
+from robocal_ros.core.proposals import (
+    Action,
+    Candidate,
+    Decision,
+    State,
+    require_measured_with,
+)
 from robocal_ros.storage.history_schema import DamagedError
 
 NOMINAL = 0
@@ -145,7 +151,13 @@ class Ledger:
                 "first; look at the list and decide again"
             )
 
-    def check_accept(self, calibration_id: int, candidate: Candidate, expected: int | None) -> None:
+    def check_accept(
+        self,
+        calibration_id: int,
+        candidate: Candidate,
+        expected: int | None,
+        with_heads: Mapping[str, int],
+    ) -> None:
         """Refuse what must not come into force.
 
         Raises
@@ -166,6 +178,8 @@ class Ledger:
                 f"calibration {calibration_id} was solved against {candidate.kind} revision "
                 f"{candidate.based_on}, but {revision} is in force; measure again"
             )
+        what = f"{candidate.kind} {calibration_id}"
+        require_measured_with(what, with_heads, lambda kind: self.head(kind)[0])
 
     def rollback_target(self, kind: str, to: int | None) -> int | None:
         """Calibration that a rollback returns to (None = nominal).

@@ -216,6 +216,19 @@ class TestDeciding:
         assert document["error"]["code"] == document["verdict"]["code"] == code
         assert head(state) == (1, 1)
 
+    def test_a_tool_of_another_thermal_model(self, state):
+        with CalibrationHistory.open(SERIAL, state_dir=state) as history:
+            tools = [
+                history.propose(proposal(kind="tool", model={"thermal_revision": revision}))
+                for revision in (0, 1)
+            ]
+        given = ("history", "accept", tools[0], "--state", state)
+        document = robocal_json("error.json", *given, status=3)
+        assert document["error"]["code"] == "STALE"
+        assert "thermal revision 0, in force is 1: measure it again" in document["error"]["message"]
+        done = robocal("history", "accept", tools[1], "--state", state)
+        assert done.stdout == f"Calibration {tools[1]} is in force as tool revision 1\n"
+
     def test_rollbacks(self, state):
         def rollback(*more):
             return robocal_json(

@@ -1,9 +1,12 @@
 """What may come into force without a person."""
 
 import sqlite3
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,14 +35,16 @@ from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError
-from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.proposals import THERMAL, TOOL, Action, Decision, Head
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions.events import ACCEPT, WITHHOLD
+from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.events import ACCEPT, WITHHOLD, Command, Outcome
 from robocal_ros.sessions.gap import STALL_S
 from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.tool_config import rows_of
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.history_records import insert_decision
 
 UNSOUND = (AccuracyLevel.FAULT, None)  # None: silent
 BESIDE = np.eye(4) + 1e-5 * np.eye(4, k=3)  # a hundredth of a millimetre
@@ -145,6 +150,39 @@ def test_a_tool_of_another_thermal_revision_is_stale(cell):
     cell.run("c2", LONG_S)  # it waits for nobody
     cell.finish()
     assert modes(cell) == ["full"]
+
+
+class Waiting(CalibrationHistory):
+    """Tells when all that is read before an acceptance was read."""
+
+    def accept(self, *given: Any, **more: Any) -> Head:
+        self.read.set()
+        return super().accept(*given, **more)
+
+
+def test_a_tool_does_not_come_into_force_beside_a_model_that_is_just_accepted(history):
+    """The PLC accepts it while thermal_node is committing; the drift would be corrected twice."""
+    thermal, tool = thermal_proposed(history, 1.0), proposed(history)
+    read = threading.Event()
+
+    def accept_tool() -> Outcome:
+        with Waiting.open(history.serial, state_dir=history.path.parent) as waiting:
+            waiting.read = read
+            return decide(waiting, Command(ACCEPT, {"id": tool}), 0, 1, TOOL)
+
+    with (
+        closing(sqlite3.connect(history.path, isolation_level=None)) as node,
+        ThreadPoolExecutor(1) as plc,
+    ):
+        node.execute("BEGIN IMMEDIATE")
+        insert_decision(node, Decision(0, THERMAL, Action.ACCEPT, thermal, "", "", 1, 0, 1))
+        answer = plc.submit(accept_tool)
+        assert read.wait(10.0)
+        node.execute("COMMIT")
+        outcome = answer.result(10.0)
+    assert outcome.status is Code.STALE, outcome.message
+    assert "thermal revision 0, in force is 1: measure it again" in outcome.message
+    assert (history.head(THERMAL).revision, history.head(TOOL).revision) == (1, 0)
 
 
 def copied(history: CalibrationHistory, calibration_id: int, count: int) -> None:

@@ -218,6 +218,16 @@ class TestDecisions:
             State.IN_FORCE,
         ]
 
+    def test_what_needs_another_kind_beside_it(self, history: CalibrationHistory) -> None:
+        thermal = history.propose(proposal())
+        tool = history.propose(proposal(kind="tool"))
+        history.accept(thermal, **BY)
+        words = f"tool {tool} was measured with thermal revision 0, in force is 1: measure it again"
+        with pytest.raises(StaleError, match=words):
+            history.accept(tool, with_heads={"thermal": 0}, **BY)
+        assert history.get(tool).state is State.PENDING
+        assert history.accept(tool, with_heads={"thermal": 1}, **BY).revision == 1
+
     def test_kinds_have_revisions_of_their_own(self, history: CalibrationHistory) -> None:
         thermal = history.propose(proposal())
         tool = history.propose(proposal(kind="tool"))

@@ -10,10 +10,19 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of, reference_of
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, TOOL, Action, Decision, Entry, Head, State
+from robocal_ros.core.proposals import (
+    THERMAL,
+    TOOL,
+    Action,
+    Decision,
+    Entry,
+    Head,
+    State,
+    require_measured_with,
+)
 from robocal_ros.core.tool.judging import KnownTool, change_between
 from robocal_ros.core.tool.laser_frame import LaserFrame
-from robocal_ros.sessions.decisions import decide, require_thermal
+from robocal_ros.sessions.decisions import decide, measured_with
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
@@ -54,10 +63,14 @@ class Decider:
     def _outdated(self, entry: Entry) -> str:
         """Why it is STALE although its own kind's revision is in force; else empty."""
         try:
-            require_thermal(self._history, entry)
+            self._require_beside(entry)
         except StaleError as error:
             return str(error)
         return ""
+
+    def _require_beside(self, entry: Entry) -> None:
+        needed = measured_with(self._history, entry)
+        require_measured_with(f"{entry.kind} {entry.id}", needed, self.revision)
 
     def head(self, kind: str) -> Head:
         """What is in force."""
@@ -107,7 +120,7 @@ class Decider:
                 f"force is {head.revision}: measure again"
             )
         if name == ACCEPT:
-            require_thermal(self._history, entry)
+            self._require_beside(entry)
         return self._carried_out(command, entry.kind, head.revision, wall_ns)
 
     def roll_back(self, kind: str, revision: int, by: str, why: str, wall_ns: int) -> Outcome:
