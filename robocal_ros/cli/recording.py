@@ -13,6 +13,7 @@ from robocal_ros.sessions.hand_eye_shots import SHOTS
 from robocal_ros.sessions.observations import JOINTS, MEASURING
 from robocal_ros.sessions.replay import (
     EVENTS,
+    first_configuration,
     input_topics,
     needed_inputs,
     read_events,
@@ -22,6 +23,7 @@ from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.storage.bags import BagMessage, BagReader
 
 MEASURED = (*MEASURING, EDGES, *SHOTS)
+UNASKED = "while this was recorded nobody gave its node a command"
 INPUTS = (JOINTS, *MEASURED, TEMPERATURES)
 
 
@@ -104,13 +106,14 @@ def open_recording(reader: BagReader, given: Mapping[str, str]) -> Recording:
     info = reader.info
     _require_topics(given, info.topics, info.path)
     event_topic = given.get(EVENTS) or _event_topic(info.topics, info.path)
-    configured, _ = _events(reader, event_topic, 0)
+    told = [] if event_topic is None else [event_topic]
+    configured = first_configuration(reader.messages(told))
     inputs = {topic: kind for kind, topic in given.items() if kind != EVENTS}
     others = [topic for topic in info.topics if topic not in inputs]
     found = input_topics(others, configured)
     inputs |= {t: kind for t, kind in found.items() if kind not in given and t in info.topics}
     start_ns = _first_joint_stamp(reader, inputs)
-    configured, commands = _events(reader, event_topic, start_ns)
+    configured, commands = read_events(reader.messages(told), start_ns)
     return Recording(reader, event_topic, inputs, configured, commands, start_ns)
 
 
@@ -138,10 +141,15 @@ def _event_topic(topics: Mapping[str, Any], path: str) -> str | None:
     return found[0] if found else None
 
 
-def _events(
-    reader: BagReader, topic: str | None, from_ns: int
-) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
-    return (None, []) if topic is None else read_events(reader.messages([topic]), from_ns)
+def begin_ns(reader: BagReader) -> int:
+    """When a bag begins, by its log or by the joint states' clock, whichever is earlier.
+
+    What is stamped before is in the bag only because its topic is latched.
+    """
+    topics = reader.info.topics.items()
+    joints = {t: JOINTS for t, found in topics if topic_kind(t) == JOINTS and found.messages}
+    begin = [reader.info.start_ns or 0]
+    return min(begin + ([_first_joint_stamp(reader, joints)] if joints else []))
 
 
 def _first_joint_stamp(reader: BagReader, inputs: Mapping[str, str]) -> int:

@@ -10,7 +10,7 @@ from typing import Any
 from robocal_ros import __version__
 from robocal_ros.cli.hand_eye_replaying import replay_hand_eye
 from robocal_ros.cli.output import Document, refusal
-from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.cli.recording import UNASKED, Recording, open_recording
 from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
 from robocal_ros.cli.tool_replaying import replay_tool
 from robocal_ros.core.documents import model_document
@@ -22,6 +22,7 @@ from robocal_ros.sessions.found_cycles import accepting, automatic_commands, win
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.maintenance.session import RUN as MAINTAIN
+from robocal_ros.sessions.records import is_thermal_session
 from robocal_ros.sessions.replay import (
     ReplayReport,
     feed,
@@ -112,8 +113,9 @@ def replay_bag(request: Request, watch: Watch) -> Document:
             return document
 
 
-_NO_COMMANDS = (
-    "the bag holds no commands (session_events): say when the robot was measured with --warm T0:T1 "
+_NO_COMMANDS = "the bag holds no commands (session_events)"
+_WINDOWS = (
+    ": say when the robot was measured with --warm T0:T1 "
     "(repeat it for more cycles; --cold T0:T1 for a cold reference), in seconds from the first "
     "joint reading, or let --auto find the cycles"
 )
@@ -130,7 +132,10 @@ _GOES_ON = "{} already holds calibrations: the replay went on from there"
 def _require_commands(request: Request, recording: Recording) -> None:
     """Refuse a recording without commands that can be obeyed."""
     if not recording.commands:
-        words = _NO_COMMANDS if request.robot_named else _NO_COMMANDS + _NO_ROBOT
+        configured = recording.configured
+        words = _NO_COMMANDS if configured is None else f"{recording.events}: {UNASKED}"
+        words += _WINDOWS if configured is None or is_thermal_session(configured) else ""
+        words += "" if request.robot_named or configured is not None else _NO_ROBOT
         raise InputError(words, file=str(request.bag))
     if any(command.name == MAINTAIN for command, _ in recording.commands):
         raise InputError(_NOT_REPLAYED, file=str(request.bag))

@@ -222,6 +222,8 @@ def _show(console: "Console", document: Document) -> None:
 def _cells(row: dict[str, Any]) -> list[str]:
     if "error" in row:
         return [f"not validated: {row['error']['code']}"]
+    if "skipped" in row:
+        return [f"not replayed: {row['node']}"]
     errors = [row.get(f"rms_{name}_mm") for name in ("without", "in_force", "after", "candidate")]
     if row["kind"] == "hand_eye":
         errors[-1] = row["predicted_rms_mm"]

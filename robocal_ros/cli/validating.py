@@ -12,7 +12,7 @@ from pathlib import Path
 from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth, above, is_simulated
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
-from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.cli.recording import UNASKED, Recording, begin_ns, open_recording
 from robocal_ros.cli.replaying import Request, replay_bag
 from robocal_ros.cli.validating_cell import cell_courses
 from robocal_ros.cli.validating_cycles import shift_errors, thermal_document
@@ -32,7 +32,7 @@ from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.records import is_thermal_session
-from robocal_ros.sessions.replay import EVENTS, read_events, topic_kind
+from robocal_ros.sessions.replay import EVENTS, first_configuration, read_events, topic_kind
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.tool_recorded import is_tool_session
 from robocal_ros.storage.bags import BagMessage, BagReader
@@ -69,12 +69,14 @@ def validate_bag(job: Job) -> Validated:
     try:
         with BagReader(job.path) as reader:
             head |= _about(reader)
-            replayable, others = _event_topics(reader)
-            topics: list[str | None] = [*replayable] or [None]
+            recordings, skipped, others = _events_of(reader)
+            if not recordings and not skipped:
+                recordings = [open_recording(reader, {})]
             truth = BagTruth(reader)
-            sessions = [_Session(job, reader, topic, truth).judged() for topic in topics]
+            sessions = [_Session(job, recording, truth).judged() for recording in recordings]
             courses = cell_courses(reader, truth)
         told = {"sessions": [document for document, _ in sessions], "other_decisions": others}
+        told["skipped"] = skipped
         told["cells"] = [course.document() for course in courses]
         require_finite(told, job.path)
     except RobocalError as error:
@@ -102,36 +104,45 @@ def _utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns * 1e-9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def _event_topics(reader: BagReader) -> tuple[list[str], dict[str, list[Document]]]:
-    """Sessions that were commanded and can be replayed, and what other nodes' events decided.
+def _events_of(
+    reader: BagReader,
+) -> tuple[list[Recording], dict[str, str], dict[str, list[Document]]]:
+    """Sessions that can be replayed, others with why not, and what other nodes decided.
 
     Raises
     ------
     InputError
-        When an event cannot be read.
+        When an event cannot be read, or a session's joint states.
     """
-    replayable: list[str] = []
+    sessions: list[Recording] = []
+    skipped: dict[str, str] = {}
     others: dict[str, list[Document]] = {}
+    begin = begin_ns(reader)
     for topic in (topic for topic in reader.info.topics if topic_kind(topic) == EVENTS):
-        configured, commands = read_events(reader.messages([topic]))
-        if not commands:
-            continue
-        if any(is_of(configured) for is_of in _SESSIONS):
-            replayable.append(topic)
-        else:
-            others[topic] = [as_recorded(*event) for event in commands]
-    return replayable, others
+        told_by = first_configuration(reader.messages([topic]))
+        if any(is_of(told_by) for is_of in _SESSIONS):
+            recording = open_recording(reader, {EVENTS: topic})
+            if not recording.commands:
+                skipped[topic] = UNASKED
+                continue
+            if recording.configured is not None:
+                sessions.append(recording)
+                continue
+            skipped[topic] = "the state that its commands began from was not recorded"
+        if commands := read_events(reader.messages([topic]), begin)[1]:
+            others[topic] = [as_recorded(*event) for event in commands if event[1]]
+    return sessions, skipped, others
 
 
 class _Session:
-    """One node's session in a bag; the whole bag where ``topic`` is None."""
+    """One node's session in a bag; the whole bag where nobody told events."""
 
-    def __init__(self, job: Job, reader: BagReader, topic: str | None, truth: BagTruth) -> None:
-        self._job, self._topic, self._truth = job, topic, truth
+    def __init__(self, job: Job, recording: Recording, truth: BagTruth) -> None:
+        self._job, self._recording, self._truth = job, recording, truth
+        self._topic = topic = recording.events
         self._namespace = above(above(topic or ""))  # of the node that told its events
         self._given = {} if topic is None else {EVENTS: topic}
-        self._recording = open_recording(reader, self._given)
-        self._mark = " (simulated)" if is_simulated(reader) else ""
+        self._mark = " (simulated)" if is_simulated(recording.reader) else ""
         self._forecasts = Forecasts()
         self._warnings: list[str] = []
         self._arm: SerialArm | None = None

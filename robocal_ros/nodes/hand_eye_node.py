@@ -190,7 +190,7 @@ class HandEyeNode(HouseNode):
         if session is None:
             return
         self._last = outcome
-        self._publish(name, lambda: self._outputs.event(outcome.command, outcome))
+        self._publish(name, lambda: self._outputs.events.tell(outcome.command, outcome))
         if name == CALIBRATE:
             self._publish(name, lambda: self._files.keep(outcome))
             self._publish(name, lambda: self._show_quality(outcome))
@@ -218,9 +218,9 @@ class HandEyeNode(HouseNode):
         if session is None:
             return
         shown = session.in_force.revision, session.current.thermal.revision
-        if self._shown != shown:
+        if self._shown != shown or self._outputs.events.need_configuration:
             self._shown = shown
-            self._outputs.event(configuration(session, self._topics), None)
+            self._outputs.events.tell(configuration(session, self._topics), None)
             self._outputs.status(session, self._last)
         self._show_transform(session.in_force)
 

@@ -6,14 +6,14 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.qos import QoSProfile
-from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus, SessionEvent
+from robocal_msgs.msg import CalibrationQuality, HandEyeSample, HandEyeStatus
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import Head
 from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.session_events import SessionEvents
 from robocal_ros.nodes.static_tf import StaticTf
-from robocal_ros.nodes.thermal_outputs import EVENTS
-from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_data import IN_HAND, TO_HAND, Capture
 
@@ -46,10 +46,9 @@ class HandEyeOutputs:
 
     def __init__(self, add: AddOutput, robot: str, serial: str) -> None:
         self._robot, self._serial = robot, serial
-        self._sequence = 0
         self._status = add(HandEyeStatus, "~/status", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
-        self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self.events = SessionEvents(add)
         self.transforms: list[TransformStamped] = []
         self._tf = StaticTf(add)
         self.missing = self._tf.missing
@@ -86,11 +85,6 @@ class HandEyeOutputs:
             errors = {f"{name}_mm": value for name, value in left_out.items()}
             conversions.set_errors(message, "candidate", errors)
         self._quality.publish(message)
-
-    def event(self, command: Command, outcome: Outcome | None) -> None:
-        """Record a command and what came of it, None for the configuration."""
-        self._sequence += 1
-        self._events.publish(conversions.event_message(command, outcome, self._sequence))
 
 
 def status_message(session: HandEyeSession, last: Outcome | None) -> HandEyeStatus:

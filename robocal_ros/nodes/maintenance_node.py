@@ -209,7 +209,7 @@ class MaintenanceNode(HouseNode):
         else:
             self.get_logger().warning(words)
         stamped = replace(command, stamp_ns=self.now_ns())
-        self._outputs.event(stamped, replace(outcome, command=stamped))
+        self._outputs.events.tell(stamped, replace(outcome, command=stamped))
 
     def _show(self) -> None:
         """Say what changed; tell the callers of the action."""

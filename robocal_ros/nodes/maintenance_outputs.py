@@ -4,13 +4,12 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.qos import QoSProfile
-from robocal_msgs.msg import AccuracyState, MaintenanceResult, MaintenanceStatus, SessionEvent
+from robocal_msgs.msg import AccuracyState, MaintenanceResult, MaintenanceStatus
 
 from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.session_events import SessionEvents
 from robocal_ros.nodes.tcf_services import ANSWERS
-from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.accuracy import Accuracy
-from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import CycleResult, Status
 
 AddOutput = Callable[[type, str, QoSProfile], Any]
@@ -41,10 +40,9 @@ class MaintenanceOutputs:
 
     def __init__(self, add: AddOutput, robot: str, serial: str, base_frame: str) -> None:
         self._robot, self._serial, self._base = robot, serial, base_frame
-        self._sequence = 0
         self._status = add(MaintenanceStatus, "~/status", qos.LATCHED)
         self._accuracy = add(AccuracyState, "accuracy_state", qos.LATCHED)
-        self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self.events = SessionEvents(add)
 
     def status_message(self, status: Status, now_ns: int) -> MaintenanceStatus:
         """A status."""
@@ -80,8 +78,3 @@ class MaintenanceOutputs:
                 stamp=conversions.header(now_ns, self._base),
             )
         )
-
-    def event(self, command: Command, outcome: Outcome) -> None:
-        """Record a command and what came of it."""
-        self._sequence += 1
-        self._events.publish(conversions.event_message(command, outcome, self._sequence))

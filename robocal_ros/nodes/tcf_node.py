@@ -36,6 +36,7 @@ from robocal_ros.sessions.events import (
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.silence import Silence
 from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import configuration
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -193,7 +194,7 @@ class TcfNode(HouseNode):
         try:
             if name == MEASURE_TOOL:  # a run goes by the thermal model of its begin
                 self._show_in_force()
-            self._outputs.event(outcome.command, outcome)
+            self._outputs.events.tell(outcome.command, outcome)
             if name == MEASURE_TOOL and outcome.done:
                 self._run_end, self._last = Future(), None
             if name in (MEASURE_TOOL, TOOL_STEP, BREAK_OFF):
@@ -240,15 +241,19 @@ class TcfNode(HouseNode):
         if session is None or history is None:
             return
         current = session.current
-        head = current.head
-        shown = head.revision, current.thermal.revision, current.healthy.revision
-        if self._shown == shown:
+        shown = current.head.revision, current.thermal.revision, current.healthy.revision
+        if self._shown == shown and not self._outputs.events.need_configuration:
             return
+        if self._shown != shown:
+            self._show_tool(history, current)
+        self._shown = shown
+        self._outputs.events.tell(configuration(session, self._topics), None)
+
+    def _show_tool(self, history: CalibrationHistory, current: ToolInForce) -> None:
+        head = current.head
         stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
         thermal = 0 if head.model is None else int(head.model["thermal_revision"])
         self._outputs.tool(current.tool, head.revision, thermal, stamp)
-        self._shown = shown
-        self._outputs.event(configuration(session, self._topics), None)
 
     def health(self) -> Health:
         """Tell what is in force, what is awaited, what was lost or ignored, what is wrong."""

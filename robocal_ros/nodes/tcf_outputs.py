@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.qos import QoSProfile
-from robocal_msgs.msg import CalibrationQuality, SessionEvent, ToolFrame, ToolStep
+from robocal_msgs.msg import CalibrationQuality, ToolFrame, ToolStep
 
 from robocal_ros.core.documents import Document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.session_events import SessionEvents
 from robocal_ros.nodes.static_tf import StaticTf
-from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.nodes.tool_messages import ToolMessages, step_message
-from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.events import Outcome
 
 AddOutput = Callable[[type, str, QoSProfile], Any]
 
@@ -44,13 +44,12 @@ class TcfOutputs:
         self._base, flange, tool = frames
         self._nominal, self._serial = nominal, serial
         self._messages = ToolMessages(nominal, serial, flange, tool)
-        self._sequence = 0
         self._step = add(ToolStep, "~/next_step", qos.LATCHED)
         self._candidate = add(ToolFrame, "~/candidate", qos.LATCHED)
         self._tool = add(ToolFrame, "~/tool", qos.LATCHED)
         self._frame = add(TransformStamped, "~/tool_frame", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
-        self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self.events = SessionEvents(add)
         self._tf = StaticTf(add)
         self.missing = self._tf.missing
 
@@ -97,8 +96,3 @@ class TcfOutputs:
         if "sigma_mm" in document:
             message.predicted_rms_mm = float(np.max(document["sigma_mm"]))
         self._quality.publish(message)
-
-    def event(self, command: Command, outcome: Outcome | None) -> None:
-        """Record a command and what came of it."""
-        self._sequence += 1
-        self._events.publish(conversions.event_message(command, outcome, self._sequence))

@@ -152,7 +152,7 @@ class ThermalNode(HouseNode):
             self.get_logger().warning(words)
         try:
             if not outcome.repeated:
-                self._outputs.event(outcome.command, outcome)
+                self._outputs.events.tell(outcome.command, outcome)
                 if outcome.command.name in CYCLE:
                     self._show_candidate(outcome)
             self._show_in_force()
@@ -176,7 +176,7 @@ class ThermalNode(HouseNode):
         cycles = 0 if follower is None else follower.state.cycles
         sensor = history.head(SENSOR)
         shown = (head.revision, session.reference_id, cycles, sensor.revision)
-        if self._shown == shown:
+        if self._shown == shown and not self._outputs.events.need_configuration:
             return
         if self._shown[:1] != shown[:1]:
             stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
@@ -187,7 +187,7 @@ class ThermalNode(HouseNode):
             stamp = history.get(sensor.calibration_id).stamp_ns
             self._outputs.sensor(frames.invert(T_sensor_base), sensor.model["frame"], stamp)
         self._shown = shown
-        self._outputs.event(configuration(session, self._topics), None)
+        self._outputs.events.tell(configuration(session, self._topics), None)
 
     def _show_accuracy(self) -> None:
         if self._session is None:

@@ -6,21 +6,14 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel, SessionEvent
+from rclpy.qos import QoSProfile
+from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes import conversions, qos
+from robocal_ros.nodes.session_events import SessionEvents
 from robocal_ros.sessions.accuracy import Accuracy
-from robocal_ros.sessions.events import Command, Outcome
-
-# A recorder that comes later still gets the events.
-EVENTS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=100,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+from robocal_ros.sessions.events import Outcome
 
 Array = NDArray[np.float64]
 AddOutput = Callable[[type, str, QoSProfile], Any]
@@ -37,13 +30,12 @@ class ThermalOutputs:
 
     def __init__(self, add: AddOutput, nominal: SerialArm, serial: str, base_frame: str) -> None:
         self._nominal, self._serial, self._base_frame = nominal, serial, base_frame
-        self._sequence = 0
         self._candidate = add(KinematicModel, "~/candidate", qos.LATCHED)
         self._model = add(KinematicModel, "~/model", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
         self._accuracy = add(AccuracyState, "~/accuracy", qos.LATCHED)
         self._sensor = add(TransformStamped, "~/sensor", qos.LATCHED)
-        self._events = add(SessionEvent, "~/session_events", EVENTS)
+        self.events = SessionEvents(add)
 
     def model(self, model: Mapping[str, Any], revision: int, stamp_ns: int) -> None:
         """Say what is in force."""
@@ -83,11 +75,6 @@ class ThermalOutputs:
                 transform=conversions.transform_message(T_base_sensor),
             )
         )
-
-    def event(self, command: Command, outcome: Outcome | None) -> None:
-        """Record a command and what came of it, None for the configuration."""
-        self._sequence += 1
-        self._events.publish(conversions.event_message(command, outcome, self._sequence))
 
     def _message(
         self, model: Mapping[str, Any], revision: int, state: int, stamp_ns: int

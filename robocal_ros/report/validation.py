@@ -22,12 +22,19 @@ HOUR = (
 
 
 def summary_rows(bags: Sequence[Document]) -> list[Document]:
-    """A row for each session of each bag; one with ``error`` for a bag that gave none."""
+    """A row for each session of each bag; one with ``error`` for a bag that gave none.
+
+    One with ``skipped``, which says why, for a session that could not be replayed.
+    """
     rows = []
     for bag in bags:
         if "error" in bag:
             rows.append({"bag": bag["bag"], "kind": None, "error": bag["error"]})
         rows += [_row(bag, session) for session in bag.get("sessions", [])]
+        rows += [
+            {"bag": bag["bag"], "kind": None, "node": node, "skipped": why}
+            for node, why in bag.get("skipped", {}).items()
+        ]
     return rows
 
 

@@ -157,6 +157,8 @@ def _bag(bag: Document, figures: Sequence[Sequence[Drawn]]) -> list[str]:
         parts.append(f"<h3>{TITLES[session['kind']]}</h3>")
         parts += [figure(drawn.svg, drawn.caption) for drawn in shown]
         parts += _session(session)
+    if bag["skipped"]:
+        parts += ["<h3>Not replayed</h3>", listed([*bag["skipped"].items()])]
     for node, decisions in bag["other_decisions"].items():
         parts += [f"<h3>Decisions of {escape(node)}</h3>", _decisions(decisions)]
     return parts
@@ -269,8 +271,8 @@ def _calibrations(session: Document) -> str:
 
 def _decisions(decisions: Sequence[Document]) -> str:
     body = [
-        [datetime.fromtimestamp(one["stamp"], UTC).strftime("%H:%M:%S"), one["command"],
-         one["code"], one["message"]]
+        [datetime.fromtimestamp(one["stamp"], UTC).strftime("%Y-%m-%d %H:%M:%S"),
+         one["command"], one["code"], one["message"]]
         for one in decisions
     ]  # fmt: skip
     return table(["time (UTC)", "command", "code", "reason"], body, words=(1, 2, 3))

@@ -70,6 +70,20 @@ def topic_kind(topic: str) -> str:
     return topic.rsplit("/", 1)[-1]
 
 
+def first_configuration(messages: Iterable[Recorded]) -> Command | None:
+    """The first configuration among the events: whose they are, and the names of the inputs.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    for recorded in messages:
+        if (event := recorded.message).command == events.CONFIGURE:
+            return read_command(event.command, stamp_ns(event.stamp), event.arguments)
+    return None
+
+
 def read_events(
     messages: Iterable[Recorded], from_ns: int = 0
 ) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
@@ -89,19 +103,21 @@ def read_events(
     """
     configured: Command | None = None
     model: Any = None
+    before = 0  # jumps of the clock
     found: list[tuple[Command, dict[str, Any]]] = []
     for recorded in messages:
         event = recorded.message
         command = read_command(event.command, stamp_ns(event.stamp), event.arguments)
         if command.name == events.CONFIGURE:
             if not found:
-                configured = command
+                configured, before = command, _jumps(command)
             elif _takes_over(command, model):
                 found.append((command, {}))
             model = command.arguments.get("model")
         elif (command.stamp_ns or 0) >= from_ns:
             found.append((command, json.loads(event.outcome)))
-    before = _jumps(configured)
+        elif not found:
+            before = _jumps(command)
     return configured, [
         (_counted_from(before, from_ns, command), outcome) for command, outcome in found
     ]
@@ -113,8 +129,8 @@ def _takes_over(configured: Command, model: Any) -> bool:
     return not own and configured.arguments.get("model") != model
 
 
-def _jumps(command: Command | None) -> int:
-    return 0 if command is None or command.marks is None else command.marks.get(JUMPS, 0)
+def _jumps(command: Command) -> int:
+    return 0 if command.marks is None else command.marks.get(JUMPS, 0)
 
 
 def _counted_from(before: int, from_ns: int, command: Command) -> Command:

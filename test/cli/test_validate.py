@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ from robocal_ros.storage.bags import BagWriter, read_bag
 
 TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
 EXCERPT = ROOT / "bags/golden_excerpt.mcap"
+TOOL_EVENTS = "/tcf_node/session_events"
 SPHERE = ROOT / "bags/hand_eye_sphere.mcap"
 CHECK = postures(true_arm(), 20, 77)
 
@@ -153,33 +155,48 @@ class TestRecordedSession:
         assert second["forecast"]["bound_mm"] > second["forecast"]["rms_mm"] > 0.0
 
     def test_a_recording_that_begins_late(self, bags, validate, tmp_path) -> None:
-        """In mid-shift; another node's events, which nothing can replay, are told as recorded."""
+        """In mid-shift: latched topics send anew what is older, a command first, of all nodes.
+
+        Another node's events, which nothing can replay, are told as recorded.
+        """
         late_ns = START_NS + 2 * BETWEEN_S * NS + NS // 7
-        path, before = tmp_path / "late.mcap", None
+        path = tmp_path / "late.mcap"
         with BagWriter(path, latched=[EVENTS]) as bag:
+            again = [r for r in read_bag(bags / "live.mcap") if r.topic == EVENTS][1:]
+            again += [r for r in read_bag(TOOL_RUNS) if r.topic == TOOL_EVENTS]
+            for recorded in again:
+                if recorded.topic == TOOL_EVENTS:
+                    recorded.message.stamp.sec = START_NS // NS  # of a run before
+                elif recorded.log_time_ns >= late_ns:
+                    continue
+                bag.write(recorded.topic, recorded.msgtype, recorded.message, late_ns)
+            for stamp_ns, words in ((START_NS, "before"), (late_ns + NS, "too short")):
+                command = Command("run", {}, stamp_ns)
+                event = {
+                    "stamp": ros_time(stamp_ns),
+                    "command": command.name,
+                    "arguments": arguments_text(command),
+                    "outcome": outcome_text(Outcome(command, Code.LIMIT_EXCEEDED, words)),
+                }
+                log_ns = max(late_ns, stamp_ns)
+                bag.write("/plc/session_events", TYPES[EVENTS], event, log_ns)
             for recorded in read_bag(bags / "live.mcap"):
                 given = recorded.topic, recorded.msgtype, recorded.message
-                if recorded.log_time_ns < late_ns:
-                    before = given if recorded.topic == EVENTS else before
-                    continue
-                if before is not None:
-                    bag.write(*before, late_ns)
-                    before = None
-                bag.write(*given, recorded.log_time_ns)
-            command = Command("run", {}, recorded.log_time_ns)
-            event = {
-                "stamp": ros_time(recorded.log_time_ns),
-                "command": command.name,
-                "arguments": arguments_text(command),
-                "outcome": outcome_text(Outcome(command, Code.LIMIT_EXCEEDED, "too short")),
-            }
-            bag.write("/plc/session_events", TYPES[EVENTS], event, recorded.log_time_ns)
-        _, document, _, report = validate(path)
-        (row,) = document["bags"]
+                if recorded.log_time_ns >= late_ns:
+                    bag.write(*given, recorded.log_time_ns)
+        status, document, out, report = validate(path)
+        assert status == 0
+        row, skipped = document["bags"]
         assert (row["cycles"], row["accepted"], row["differs"]) == (1, 0, 0)
+        assert skipped["node"] == TOOL_EVENTS
+        assert "nobody gave its node a command" in skipped["skipped"]
         (told,) = report["bags"]
         (decision,) = told["other_decisions"]["/plc/session_events"]
         assert (decision["code"], decision["message"]) == ("LIMIT_EXCEEDED", "too short")
+        page = (out / "report.html").read_text()
+        told_at = datetime.fromtimestamp(late_ns / NS + 1, UTC)
+        for words in (f"{told_at:%Y-%m-%d %H:%M:%S}", skipped["skipped"]):
+            assert words in page
         _, _, _, whole = validate(bags / "live.mcap")
         (late,), (_, second) = (r["bags"][0]["sessions"][0]["cycles"] for r in (report, whole))
         for name in ("in_force", "candidate", "measured", "drift", "sigma", "verdict"):

@@ -27,7 +27,7 @@ from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.travel import joint_way
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.motion_settings import trajectory_message
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.storage.robots import load_robot
 
 START_DEG = [2.3, -124.4, -70.9, 107.7, -91.1, 91.8]  # of cell_sim_node, over its station

@@ -22,8 +22,8 @@ from tool_cell_live import STREAM
 
 from robocal_ros import __version__
 from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions import events, replay
 from robocal_ros.sessions.decisions import ONLY
 from robocal_ros.sessions.events import Command

@@ -31,7 +31,7 @@ from robocal_ros.cli.recording import Recording, open_recording
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL, Proposal
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.sessions import events, replay
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.inputs import take_message

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 from robocal_msgs.msg import SessionEvent
 
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.sessions.events import (
     ACCEPT,
     BREAK_OFF,

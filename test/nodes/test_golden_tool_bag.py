@@ -11,8 +11,8 @@ from robocal_msgs.msg import SessionEvent
 from tool_cell_live import STREAM
 
 from robocal_ros.core.codes import Code
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.sessions.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.sessions.tool_config import ToolConfig
 from robocal_ros.storage.bags import BagReader, BagWriter

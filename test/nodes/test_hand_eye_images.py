@@ -14,7 +14,7 @@ from robocal_msgs.srv import HandEyeFile
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.storage.bags import BagWriter, read_bag
 
 COUNT = 8

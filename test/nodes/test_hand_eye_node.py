@@ -31,7 +31,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.diagnostics import ERROR
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tool_messages import pose_message
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_data import Capture

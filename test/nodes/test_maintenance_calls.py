@@ -24,7 +24,7 @@ from robocal_ros.core.documents import model_document
 from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.maintenance_node import ACCURACY, MaintenanceNode
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot

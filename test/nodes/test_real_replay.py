@@ -17,7 +17,7 @@ from std_msgs.msg import String
 from bench import ur10_campaigns
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.storage.bags import BagReader, BagWriter
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot

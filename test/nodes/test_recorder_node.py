@@ -12,9 +12,9 @@ from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.nodes.thermal_outputs import EVENTS
 from robocal_ros.storage.bag_recording import KEEP, recordings
 from robocal_ros.storage.bags import BagReader
 

@@ -31,7 +31,7 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.diagnostics import Health
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.replay import input_topics, read_events, replay

@@ -67,7 +67,7 @@ def bag(name, *sessions, simulated=False):
     return {
         "bag": name, "path": f"/x/{name}", "from": "a", "to": "b", "duration_s": 7200.0,
         "topics": {}, "simulated": simulated, "sessions": list(sessions), "other_decisions": OTHER,
-        "cells": [],
+        "cells": [], "skipped": {},
     }  # fmt: skip
 
 
