@@ -14,11 +14,19 @@ from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.nodes.recorded_topics import Recorded, RecordedTopics
 from robocal_ros.nodes.run import run
-from robocal_ros.storage.bag_recording import MB, BagRecording, delete_oldest, keep, next_folder
+from robocal_ros.storage.bag_recording import (
+    MB,
+    BagRecording,
+    delete_oldest,
+    keep,
+    next_folder,
+    size_bytes,
+)
 from robocal_ros.storage.history_paths import state_folder
 
 LOOK_S = 0.5
 ROOM_S = 5.0
+SHARES = 4  # a recording takes so much of the room at the most: three before it are kept
 AGAIN_S = 10.0  # after a recording broke off
 HOUR_S = 3600.0
 
@@ -66,7 +74,7 @@ SETTINGS = (
     Setting("topics", list(TOPICS), "What is recorded; relative names are in the namespace"),
     Setting("folder", "", "Where recordings are kept; empty: recordings/ in the state folder"),
     Setting("file_mb", 50.0, "A file is this large", unit="MB", low=0.1, high=10000.0),
-    Setting("hours", 8.0, "A recording is this long", unit="h", low=1e-3, high=168.0),
+    Setting("hours", 8.0, "A recording is no longer than this", unit="h", low=1e-3, high=168.0),
     Setting("keep_mb", 20000.0, "All recordings together", unit="MB", low=1.0, high=1e7),
     Setting("flush_s", 1.0, "A crash loses no more than this", unit="s", low=0.1, high=60.0),
 )
@@ -155,10 +163,13 @@ class RecorderNode(HouseNode):
             self._next()
 
     def _make_room(self) -> None:
-        spared = None if self._recording is None else self._recording.folder
-        most = round(self.settings["keep_mb"] * MB)
+        recording, most = self._recording, round(self.settings["keep_mb"] * MB)
         try:
-            self._deleted += len(delete_oldest(self._folder, most, spared))
+            if recording is not None and size_bytes(recording.folder) >= most // SHARES:
+                self._next()
+            self._deleted += len(delete_oldest(self._folder, most))
+        except FileNotFoundError:  # another recorder of this folder was faster
+            return
         except OSError as error:
             self.get_logger().error(f"no room is made: {error}")
 

@@ -4,9 +4,11 @@ Each file has an index once it is full; of one that a crash left behind, `BagRea
 everything up to the last flush.
 """
 
+import fcntl
 import shutil
 import time
 from collections.abc import Collection
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
@@ -19,6 +21,7 @@ from robocal_ros.storage.files import write_text
 
 PREFIX = "robocal_"
 KEEP = "KEEP"  # a file of this name in a recording's folder: it is never deleted
+OPEN = "OPEN"  # of this name, locked by the process that writes it; gone with its end
 MB = 1_000_000
 
 
@@ -30,7 +33,7 @@ class BagRecording:
 
     Parameters
     ----------
-    folder : made anew.
+    folder : made where it is not there; see `next_folder`.
     latched : topics that are published latched; may grow.
     file_bytes : size of a file.
 
@@ -47,7 +50,9 @@ class BagRecording:
         self._files: list[dict[str, Any]] = []
         self._writer: BagWriter | None = None
         try:
-            folder.mkdir(parents=True)
+            folder.mkdir(parents=True, exist_ok=True)
+            self._open = (folder / OPEN).open("w", encoding="utf-8")
+            fcntl.flock(self._open, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise StorageError(f"{folder}: cannot be made: {error.strerror or error}") from error
 
@@ -96,18 +101,24 @@ class BagRecording:
             raise self._broken(error) from error
 
     def close(self) -> None:
-        """Complete the last file."""
+        """Complete the last file, and let go of the folder."""
         try:
             self._finish()
         except OSError as error:
             raise self._broken(error) from error
+        self._let_go()
+
+    def _let_go(self) -> None:
+        with suppress(OSError):
+            (self.folder / OPEN).unlink()
+        self._open.close()
 
     def _begin(self, log_time_ns: int) -> BagWriter:
         name = f"{self.folder.name}_{len(self._files)}.mcap"
         try:
             self._writer = BagWriter(self.folder / name, latched=self._latched)
         except InputError as error:
-            raise StorageError(str(error)) from error
+            raise self._broken(error) from error
         self._files.append(
             {"path": name, "start_ns": log_time_ns, "end_ns": log_time_ns, "count": 0}
         )
@@ -120,15 +131,18 @@ class BagRecording:
             writer.close()
             self._describe()
 
-    def _broken(self, error: OSError) -> StorageError:
+    def _broken(self, error: OSError | InputError) -> StorageError:
         self._writer = None
+        self._let_go()
+        if isinstance(error, InputError):  # which names the file
+            return StorageError(str(error))
         return StorageError(f"{self.folder}: recording broke off: {error.strerror or error}")
 
     def _describe(self) -> None:
         try:
             write_text(self.folder / "metadata.yaml", yaml.safe_dump(self._metadata()))
         except InputError as error:
-            raise StorageError(str(error)) from error
+            raise self._broken(error) from error
 
     def _metadata(self) -> dict[str, Any]:
         files = self._files
@@ -172,14 +186,26 @@ def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:
 
 
 def next_folder(parent: Path, wall_ns: int | None = None) -> Path:
-    """A folder for a recording that begins now: named by UTC, never one that exists."""
+    """Make the folder for a recording that begins now: named by UTC, nobody else's.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be made.
+    """
     wall_ns = time.time_ns() if wall_ns is None else wall_ns
     stamp = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
     folder, number = parent / f"{PREFIX}{stamp}", 1
-    while folder.exists():
-        number += 1
-        folder = parent / f"{PREFIX}{stamp}_{number}"
-    return folder
+    while True:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+            folder = parent / f"{PREFIX}{stamp}_{number}"
+        except OSError as error:
+            raise StorageError(f"{folder}: cannot be made: {error.strerror or error}") from error
+        else:
+            return folder
 
 
 def recordings(parent: Path) -> list[Path]:
@@ -193,22 +219,39 @@ def size_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
 
 
-def delete_oldest(parent: Path, most_bytes: int, spared: Path | None) -> list[Path]:
+def delete_oldest(parent: Path, most_bytes: int) -> list[Path]:
     """Delete whole recordings, the oldest first, until the rest fits; those that were deleted.
 
-    ``spared`` and recordings that are marked by `keep` stay.
+    Recordings that a process writes, and those that are marked by `keep`, stay.
+
+    Raises
+    ------
+    OSError
+        When one cannot be deleted; FileNotFoundError where another process deletes here now.
     """
     sizes = {folder: size_bytes(folder) for folder in recordings(parent)}
     left, deleted = sum(sizes.values()), []
     for folder, size in sizes.items():
         if left <= most_bytes:
             break
-        if folder == spared or (folder / KEEP).exists():
+        if (folder / KEEP).exists() or _is_open(folder):
             continue
         shutil.rmtree(folder)
         deleted.append(folder)
         left -= size
     return deleted
+
+
+def _is_open(folder: Path) -> bool:
+    """Whether a process writes it; one that a crash left behind is not."""
+    try:
+        with (folder / OPEN).open("r+", encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        return True
+    return False
 
 
 def keep(folder: Path, why: str) -> None:

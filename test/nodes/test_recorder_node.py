@@ -1,5 +1,7 @@
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
+import os
+
 import pytest
 from robocal_msgs.msg import SessionEvent
 from std_msgs.msg import Bool, String
@@ -7,15 +9,15 @@ from std_srvs.srv import Trigger
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
-from robocal_ros.nodes import qos
+from robocal_ros.nodes import qos, recorder_node
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS
+from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.storage.bag_recording import KEEP, recordings
+from robocal_ros.storage.bag_recording import KEEP, MB, recordings, size_bytes
 from robocal_ros.storage.bags import BagReader
 
 NODE = "recorder_node"
@@ -122,6 +124,43 @@ def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_
     assert set(words(folder, "/words")) <= {"again"}
     with BagReader(folder) as bag:
         assert [m.message.command for m in bag.messages(["/events"])] == commands
+
+
+KEEP_MB = 2.0
+
+
+def test_all_recordings_together_stay_in_their_room(graph, monkeypatch):
+    """Two robots' recorders of one folder, each with more than it may keep: 4 MB a second."""
+    monkeypatch.setattr(recorder_node, "ROOM_S", 0.1)
+    folder = graph.state / "rec"
+    given = {"topics": ["words"], "folder": str(folder), "keep_mb": KEEP_MB, "file_mb": 0.1}
+    names = "left", "right"
+    nodes = [graph.add(RecorderNode, given | {"flush_s": 0.1}, namespace=name) for name in names]
+    robots = [graph.publisher(String, f"/{name}/words") for name in names]
+    largest, sent = 0.0, 0
+    while sent < 120:
+        for publisher in robots:
+            said(graph, publisher, String, f"{sent} {os.urandom(50_000).hex()}")
+        sent += 1
+        largest = max(largest, sum(size_bytes(found) for found in recordings(folder)) / MB)
+    told = [f"/{name}/words recorded" for name in names]
+    graph.spin_until(
+        lambda: all(
+            node.health().values[key] == sent for node, key in zip(nodes, told, strict=True)
+        ),
+        "all is recorded",
+    )
+    graph.spin_for(0.5)  # five times as long as between two flushes
+    # what comes between two looks is beside it
+    assert KEEP_MB / 2 < largest < KEEP_MB * 1.5
+    last = {name: [] for name in names}
+    for found in recordings(folder):
+        with BagReader(found) as bag:
+            for message in bag.messages():
+                last[message.topic.split("/")[1]].append(int(message.message.data.split()[0]))
+    for numbers in last.values():  # nothing of the newest is missing
+        assert numbers == list(range(numbers[0], sent))
+        assert len(numbers) > 1
 
 
 def test_the_type_is_the_one_that_is_offered(graph):
