@@ -132,7 +132,7 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
     uninformative : why the measured poses do not carry over to other ones; empty if they do.
 
     The gain in squared error must be positive at 5 % significance (one-sided t over groups) to
-    be accepted, and negative at 5 % to be called worse.
+    be accepted, and negative at 5 % to be called worse. What is not a number is refused.
     """
     before, after = summarise(current), summarise(candidate)
     what = (
@@ -147,7 +147,7 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
             Code.TOO_FEW_SAMPLES,
             f"{len(gain)} held-out poses cannot judge: at least {FEWEST_GROUPS} are needed; {what}",
         )
-    if min(before.rms_m, after.rms_m) > LARGEST_RMS_M:
+    if not np.minimum(before.rms_m, after.rms_m) <= LARGEST_RMS_M:
         return Verdict(
             Code.RESIDUAL_TOO_LARGE,
             f"{what}; more than {LARGEST_RMS_M * 1e3:.0f} mm is no calibration error: check the "
@@ -158,10 +158,10 @@ def judge(current: Array, candidate: Array, groups: Index, uninformative: str = 
         return Verdict(Code.WORSE_THAN_CURRENT, what)
     if uninformative:
         return Verdict(Code.POSES_NOT_INFORMATIVE, f"{uninformative}; {what}")
-    if after.rms_m >= before.rms_m or after.mean_m >= before.mean_m:
+    if not (after.rms_m < before.rms_m and after.mean_m < before.mean_m):
         return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{what}; no better, and not clearly worse")
     p = _one_sided_p(gain)
-    if p > SIGNIFICANCE:
+    if not p <= SIGNIFICANCE:
         return Verdict(
             Code.NO_SIGNIFICANT_GAIN, f"{what}; chance alone would give this in {p:.0%} of cases"
         )

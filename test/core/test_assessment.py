@@ -130,6 +130,18 @@ def test_doubt_about_the_poses_is_a_refusal_only_of_what_seemed_good():
     assert judge(good, bad, apart(30), "the wrist never turned").code is Code.WORSE_THAN_CURRENT
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+@pytest.mark.parametrize("which", ["current", "candidate", "both"])
+@pytest.mark.parametrize("where", [slice(1), slice(None)])
+def test_what_is_no_number_is_refused(which, wrong, where):
+    current, candidate = np.linspace(0.9e-3, 1.1e-3, 20), np.linspace(0.1e-3, 0.2e-3, 20)
+    for name, errors in (("current", current), ("candidate", candidate)):
+        if which in (name, "both"):
+            errors[where] = wrong
+    with np.errstate(invalid="ignore"):
+        assert not judge(current, candidate, apart(20)).accept
+
+
 def test_too_few_poses_to_judge():
     before, after = np.full(40, 1e-3), np.full(40, 1e-4)
     groups = np.arange(40) % (FEWEST_GROUPS - 1)
