@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from robocal_ros.cli.bag_truth import CheckPoints
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.core.documents import arm_of, reference_of
+from robocal_ros.core.documents import arm_of, holds_drift, reference_of
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Action, Entry
 from robocal_ros.core.samples import Measurements, stamp_ns
@@ -122,7 +122,7 @@ class ThermalHistory:
 
     def _reference(self, model: Document) -> ColdReference | None:
         """The cold reference that a model counts from; None for one that counts from none."""
-        for entry in reversed(self._references if "reference_mdh" in model else []):
+        for entry in reversed(self._references if holds_drift(model) else []):
             reference = reference_of(self._history.model(entry.id), self._nominal)
             if reference.data.middle_ns == model["reference_stamp_ns"]:
                 return reference

@@ -15,6 +15,8 @@ from robocal_ros.core.thermal.reference import ColdReference
 Array = NDArray[np.float64]
 Document = dict[str, Any]
 
+COMMISSIONED = "commissioned_mdh"  # of a reference's model: the arm without any drift
+
 
 def transform_document(T: Array) -> Document:
     """A pose (4, 4) as ``xyz_mm`` and ``quat_xyzw``."""
@@ -81,6 +83,16 @@ def identified_model_document(result: Identification) -> Document:
 def arm_of(model: Document, nominal: SerialArm) -> SerialArm:
     """The nominal arm with the parameters of a model document."""
     return nominal.with_mdh(np.array(model["mdh"], dtype=np.float64))
+
+
+def holds_drift(model: Document | None) -> bool:
+    """Whether a model document holds a drift since a cold reference; None: the nominal model."""
+    return "reference_mdh" in (model or {})
+
+
+def commissioned_of(reference: Document, nominal: SerialArm) -> SerialArm:
+    """The arm without any drift, also where the reference was captured with the robot warm."""
+    return nominal.with_mdh(np.array(reference.get(COMMISSIONED, reference["mdh"])))
 
 
 def cell_document(cell: CellModel) -> Document:

@@ -102,7 +102,7 @@ SETTINGS = (
     length(
         "accept_thermal_mm",
         1.0,
-        "Largest shift of the tip from the cold reference at home and measuring poses",
+        "Largest shift of the tip since commissioning at home and measuring poses",
         0.001,
         100.0,
     ),

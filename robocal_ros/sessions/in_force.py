@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import arm_of, reference_of
+from robocal_ros.core.documents import arm_of, commissioned_of, holds_drift, reference_of
+from robocal_ros.core.errors import ConflictError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Decision
 from robocal_ros.core.thermal.reference import ColdReference
@@ -41,6 +42,29 @@ class InForce(Followed):
         """The arm with the model in force."""
         model = self.head.model
         return self._nominal if model is None else arm_of(model, self._nominal)
+
+    @property
+    def drifted(self) -> bool:
+        """Whether the model in force holds a drift since a cold reference."""
+        return holds_drift(self.head.model)
+
+    @property
+    def commissioned(self) -> SerialArm:
+        """The arm without any drift: what is in force while none is, else what the reference keeps.
+
+        Raises
+        ------
+        ConflictError
+            When a drift is in force and no cold reference.
+        """
+        if not self.drifted:
+            return self.arm
+        if self.reference_model is None:
+            raise ConflictError(
+                "the model in force holds a drift, but there is no cold reference any more: roll "
+                "the thermal model back to the one without it"
+            )
+        return commissioned_of(self.reference_model, self._nominal)
 
     @property
     def nominal(self) -> SerialArm:

@@ -3,20 +3,23 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from robocal_ros.core.assessment import Verdict, summarise
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import reference_document
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.documents import COMMISSIONED, reference_document
+from robocal_ros.core.errors import ConflictError, InputError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.documents import sensor_document
 from robocal_ros.core.thermal.process_documents import process_document
-from robocal_ros.core.thermal.reference import capture_reference
+from robocal_ros.core.thermal.reference import ColdReference, capture_reference
 from robocal_ros.core.thermal.sensor_calibration import (
     SensorMethod,
     calibrate_sensor,
     sensor_verdict,
 )
+from robocal_ros.core.thermal.warmth import drift_share, drift_size_m
 from robocal_ros.sessions.drift_following import EXPECTED, default_process
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.expectation import expected_drift
@@ -49,16 +52,16 @@ class SetUp:
     ) -> Outcome:
         """Make the cold reference of these measurements and bring it into force.
 
+        The model in force stays: where it holds a drift that a cold robot has not, the forecast
+        says so until a cycle is accepted.
+
         Raises
         ------
         RobocalError
             When they cannot be one, or the history refuses.
         """
-        reference = replace(
-            capture_reference(self._current.arm, data),
-            fixed=beside.fixed,
-            temperature=beside.temperature,
-        )
+        visit, told = self._visit(data)
+        reference = replace(visit, fixed=beside.fixed, temperature=beside.temperature)
         rms_mm = summarise(reference.cell.residual(reference.used)).rms_m * 1e3
         message = (
             f"cold reference of {len(data)} measurements captured, residual {rms_mm:.3f} mm rms"
@@ -68,16 +71,59 @@ class SetUp:
                 f" of the {len(reference.used)} that fit; not fitting: "
                 f"{', '.join(reference.rejected)}"
             )
-        command, expected, told = self._expected(command)
-        message += told
+        command, expected, from_what = self._expected(command)
+        message += told + from_what
         document = {"residual_rms_mm": rms_mm, "rejected": list(reference.rejected)}
         verdict = Verdict(Code.ACCEPT, message)
-        model = reference_document(reference) | {EXPECTED: expected}
+        model = reference_document(reference) | {
+            EXPECTED: expected,
+            COMMISSIONED: self._current.commissioned.mdh.tolist(),
+        }
         chosen = self._keeper.propose(
             REFERENCE, command, wall_ns, "lsq", verdict, document, model, data.arrays()
         )
         self._keeper.accept(chosen, command, "captured", wall_ns)
         return Outcome(command, Code.ACCEPT, message, calibration_id=chosen, samples=len(data))
+
+    def _visit(self, data: Measurements) -> tuple[ColdReference, str]:
+        """The measurements with the arm that they were made with, and words that tell which.
+
+        A robot that has cooled is the commissioned one; after a knock of the sensor it is as warm
+        as before, and with the cold arm its drift would be lost.
+        """
+        current = self._current
+        visit, reference = capture_reference(current.commissioned, data), current.reference
+        if reference is None or not current.drifted:
+            return visit, ""
+        sigma_m = self._config.sigma_m
+        if (size_m := drift_size_m(visit, current.arm)) <= sigma_m:
+            return visit, f"; the drift in force is within the noise ({size_m * 1e3:.3f} mm)"
+        found = drift_share(reference, visit, current.arm, sigma_m)
+        shown = f"{found.share:.0%} of the drift in force"
+        if not found.told:
+            raise TooFewSamplesError(
+                "these poses do not tell whether the robot is cold or as warm as the model in "
+                f"force: if it is cold, {self._back()} and capture again; if it is warm, measure "
+                "the poses of the cold reference in three rounds, or capture when it is cold"
+            )
+        if found.between:
+            raise ConflictError(
+                f"the measurements show {shown}: the robot is neither cold nor as warm as the "
+                f"model in force; capture when it has cooled, or {self._back()} if it is cold"
+            )
+        if found.warm:
+            visit = capture_reference(current.arm, data)
+            return visit, f"; the robot is as warm as the model in force ({shown})"
+        return visit, (
+            f"; the robot is cold ({shown}), and the model in force still holds that drift: "
+            f"measure a cycle and accept its model, or {self._back()}"
+        )
+
+    def _back(self) -> str:
+        """What rids the model in force of its drift."""
+        nominal = np.array_equal(self._current.commissioned.mdh, self._nominal.mdh)
+        which = "id 0, the nominal model" if nominal else "the id of the calibration before it"
+        return f"roll the drift back (~/rollback, {which})"
 
     def _expected(self, command: Command) -> tuple[Command, dict[str, Any], str]:
         """The drift to expect from now on; the command carries it for replay."""

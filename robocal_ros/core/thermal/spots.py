@@ -81,6 +81,12 @@ class ColdSpots:
         near = np.argmin(away, axis=1)[np.min(away, axis=1) < SAME_VISIT_RAD]
         return tuple(np.unique(self._pose[near]).tolist())
 
+    def common(self, warm: Measurements) -> Measurements:
+        """Those of the measurements that `match` finds a spot for."""
+        away = np.max(np.abs(warm.q[:, None] - self.q), axis=2)
+        same = np.array(warm.target)[:, None] == np.array(self.cell.targets)[self.target]
+        return warm.take(np.any(same & (away < SAME_VISIT_RAD), axis=1))
+
     def match(self, warm: Measurements) -> Index:
         """The spot (m,) that each warm measurement visits again: all joints within 0.5 deg.
 

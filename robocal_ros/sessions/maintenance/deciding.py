@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import arm_of, reference_of
+from robocal_ros.core.documents import arm_of, commissioned_of
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import (
@@ -261,11 +261,11 @@ class Decider:
         return ""
 
     def thermal_shift_m(self, calibration_id: int) -> float:
-        """Largest shift of the tip from the cold reference's model at home and measuring poses."""
+        """Largest shift of the tip since commissioning at home and measuring poses."""
         reference = self._history.head(REFERENCE).model
         cold = self._nominal
         if reference is not None:
-            cold = reference_of(reference, self._nominal).cell.arm
+            cold = commissioned_of(reference, self._nominal)
         arm = arm_of(self._history.model(calibration_id), self._nominal)
         q = np.vstack([self._config.home, self._config.poses])
         tip = np.append(self._config.T_flange_tool[:3, 3], 1.0)

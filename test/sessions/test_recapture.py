@@ -1,0 +1,193 @@
+"""A new cold reference while a drift is in force: of a robot that has cooled, or one still warm."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from maintenance_cell import config_of
+from shift import BALL, KNOCK, NOISE_M, Shift, built, knocked, postures, warmed
+
+from robocal_ros.core.codes import Code
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.sessions import events
+from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.maintenance.deciding import Decider
+from robocal_ros.sessions.records import configuration
+from robocal_ros.sessions.seeding import session_as_recorded
+from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
+from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
+
+POSES, KELVIN, NIGHT_H = 8, 15.0, 12.0
+STILL = np.eye(4)
+TAUGHT = np.eye(4)
+TAUGHT[:3, 3] = BALL[:3]
+
+
+class Robot:
+    """Visits the same poses, at any warmth; ``T_sensor``: how the sensor was moved by now."""
+
+    def __init__(self, folder: Path) -> None:
+        self.nominal = load_robot("kr150_r3100")
+        self.history = CalibrationHistory.open(
+            "s1", model_hash=self.nominal.model_hash, state_dir=folder
+        )
+        self.cold, self.q = built(self.nominal), postures(self.nominal, POSES)
+        self.check = postures(self.nominal, 40, seed=9)
+        work = {"work_poses": tuple(map(tuple, self.check.tolist())), "tip_m": tuple(BALL[:3])}
+        config = ThermalConfig(sigma_m=NOISE_M, **work)
+        self.session = ThermalSession(self.nominal, self.history, config, "test")
+        self.shift, self.T_sensor = Shift(self.nominal.joint_names), STILL
+        bounds = config_of(home=self.q[0], poses=self.q[1:], T_flange_tool=TAUGHT)
+        self.decider = Decider(self.nominal, self.history, bounds)
+
+    def visit(self, command: str, kelvin: float, after_h: float, q=None, rounds=1) -> Outcome:
+        q = np.tile(self.q if q is None else q, (rounds, 1))
+        samples = self.shift.visit(warmed(self.cold, kelvin), q, after_h)
+        self.visited = knocked(samples, self.T_sensor)
+        for sample in self.visited:
+            self.session.add(sample)
+        return self.ask(command)
+
+    def ask(self, command: str, **arguments) -> Outcome:
+        self.session.submit(Command(command, arguments))
+        return self.session.advance(wall_ns=1, force=True)[-1]
+
+    def work(self, kelvin: float = KELVIN, after_h: float = 2.0) -> Outcome:
+        """A cycle of the warm robot whose model is accepted."""
+        found = self.visit(events.IDENTIFY, kelvin, after_h)
+        assert found.status is Code.ACCEPT, found.message
+        assert self.ask(events.ACCEPT, id=found.calibration_id).done
+        return found
+
+    def capture(self, kelvin: float, after_h: float, **more) -> Outcome:
+        return self.visit(events.CAPTURE_REFERENCE, kelvin, after_h, **more)
+
+    def off_m(self, kelvin: float) -> float:
+        """Rms distance over the workspace of the model in force's drift from the true one."""
+        true = self._ball(warmed(self.cold, kelvin)) - self._ball(self.cold)
+        found = self._ball(self.session.arm) - self._ball(self.nominal)
+        return float(np.sqrt(np.mean(np.sum((found - true) ** 2, axis=1))))
+
+    def _ball(self, arm):
+        return (arm.fk(self.check) @ BALL)[:, :3]
+
+    def shift_m(self, kelvin: float) -> float:
+        """The true shift at home and measuring poses that a bound is about."""
+        moved = warmed(self.nominal, kelvin).fk(self.q) @ BALL - self.nominal.fk(self.q) @ BALL
+        return float(np.max(np.linalg.norm(moved[:, :3], axis=1)))
+
+
+@pytest.fixture
+def robot(tmp_path) -> Robot:
+    """After a shift: its model is in force."""
+    made = Robot(tmp_path)
+    assert made.capture(0.0, 0.0, rounds=3).done
+    made.work()
+    return made
+
+
+def known_m(found: Outcome) -> float:
+    """What the covariance leaves open over the workspace, at 99.7 %."""
+    return 3e-3 * found.document["calibrated"]["predicted"]["workspace_rms_mm"]
+
+
+@pytest.mark.parametrize("T_sensor", [STILL, KNOCK], ids=["still", "knocked"])
+def test_a_robot_that_cooled_has_not_yesterdays_drift(robot, T_sensor):
+    drift_m = robot.off_m(0.0)
+    robot.T_sensor = T_sensor
+    captured = robot.capture(0.0, NIGHT_H, rounds=3)
+    assert captured.done, captured.message
+    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.nominal.mdh)
+    assert "the robot is cold" in captured.message
+    told = robot.session.accuracy(robot.session.newest_joints_ns)
+    assert told.level is AccuracyLevel.DEGRADED
+    assert told.error.rms_m == pytest.approx(drift_m, rel=0.05)
+    found = robot.work(0.0, 0.1)
+    assert robot.off_m(0.0) < known_m(found)
+    told = robot.session.accuracy(robot.session.newest_joints_ns)
+    assert told.error.rms_m < 0.5 * drift_m
+
+
+def test_a_warm_robot_keeps_its_drift_when_the_sensor_was_knocked(robot):
+    drift_m = robot.off_m(0.0)
+    robot.T_sensor = KNOCK
+    assert robot.visit(events.IDENTIFY, KELVIN, 0.1).status is Code.SENSOR_OR_ROBOT_MOVED
+    captured = robot.capture(KELVIN, 0.1, rounds=3)
+    assert captured.done, captured.message
+    assert "as warm as the model in force" in captured.message
+    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.session.arm.mdh)
+    found = robot.visit(events.IDENTIFY, KELVIN, 0.5)
+    assert found.status is Code.NO_SIGNIFICANT_GAIN, found.message
+    assert robot.off_m(KELVIN) < 0.2 * drift_m
+    captured = robot.capture(0.0, NIGHT_H, rounds=3)  # against the warm reference
+    assert "the robot is cold" in captured.message
+    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.nominal.mdh)
+
+
+def test_what_cannot_be_told_is_refused_with_what_to_do(robot):
+    """After the rollback of a person who knows, the same measurements do."""
+    other = postures(robot.nominal, 3 * POSES)[POSES:]
+    refused = robot.capture(0.0, NIGHT_H, q=other)
+    assert refused.status is Code.TOO_FEW_SAMPLES
+    assert "cold or as warm as the model in force" in refused.message
+    assert "roll the drift back (~/rollback, id 0, the nominal model)" in refused.message
+    assert robot.ask(events.ROLLBACK, id=0).done
+    captured = robot.ask(events.CAPTURE_REFERENCE)
+    assert captured.samples == len(other)
+    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.nominal.mdh)
+
+
+def test_a_drift_within_the_noise_hinders_no_capture(robot):
+    """After a cold cycle was accepted; the poses are new and the sensor was moved."""
+    assert robot.capture(0.0, NIGHT_H, rounds=3).done
+    robot.work(0.0, 0.1)
+    robot.T_sensor = KNOCK
+    captured = robot.capture(0.0, 0.1, q=postures(robot.nominal, 2 * POSES)[POSES:])
+    assert captured.done, captured.message
+    assert "the drift in force is within the noise" in captured.message
+    assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.nominal.mdh)
+
+
+def test_a_robot_that_is_cooling_is_no_reference(robot):
+    before = robot.session.reference_id
+    refused = robot.capture(0.35 * KELVIN, 1.0, rounds=3)
+    assert refused.status is Code.CONFLICT, refused.message
+    assert "neither cold nor as warm as the model in force" in refused.message
+    assert robot.session.reference_id == before
+
+
+def test_the_bound_does_not_creep_over_five_mornings(robot):
+    for _ in range(5):
+        assert robot.capture(0.0, NIGHT_H, rounds=3).done
+        robot.work(0.0, 0.1)
+        found = robot.work(KELVIN, 2.0)
+        shift_m = robot.decider.thermal_shift_m(found.calibration_id)
+        assert shift_m == pytest.approx(robot.shift_m(KELVIN), rel=0.2)
+        assert robot.off_m(KELVIN) < known_m(found)
+
+
+def test_the_bound_counts_what_a_warm_reference_holds(robot):
+    for kelvin in (20.0, 25.0, 30.0):
+        robot.T_sensor = KNOCK @ robot.T_sensor
+        assert robot.capture(kelvin - 5.0, 0.1, rounds=3).done
+        found = robot.work(kelvin, 1.0)
+        shift_m = robot.decider.thermal_shift_m(found.calibration_id)
+        assert shift_m == pytest.approx(robot.shift_m(kelvin), rel=0.2)
+
+
+@pytest.mark.parametrize(("kelvin", "after_h"), [(0.0, NIGHT_H), (KELVIN, 0.1)])
+def test_a_replay_decides_the_same(robot, tmp_path, kelvin, after_h):
+    """Of a recording that began when the drift was in force already."""
+    configured = configuration(robot.session)
+    captured = robot.capture(kelvin, after_h, rounds=3)
+    history = CalibrationHistory.open(
+        "s1", model_hash=robot.nominal.model_hash, state_dir=tmp_path / "again"
+    )
+    again = session_as_recorded(robot.nominal, history, configured, "test")
+    for sample in robot.visited:
+        again.add(sample)
+    again.submit(captured.command)
+    (outcome,) = again.advance(wall_ns=1, force=True)
+    assert outcome.message == captured.message
+    assert again.reference_model == robot.session.reference_model
