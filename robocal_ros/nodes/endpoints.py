@@ -15,10 +15,12 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
+from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.nodes import qos
+from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.sessions.ignored import MOST_REASONS, kind_of
 
 LOG_EVERY_S = 5.0
@@ -161,9 +163,10 @@ class EndpointNode(LifecycleNode):
         """Serve until cleanup; ``callback(request, response)`` may be ``async``.
 
         While inactive, and when the callback raises a `RobocalError`, the answer is
-        ``success = False`` with the reason in ``message`` and its code in ``status``. A defect in
-        the callback is logged and answered too: it does not end the node. An async callback may
-        await other services; the node must then run in the plain executor.
+        ``success = False`` with the reason in ``message`` and its code in ``status``; of a Trigger
+        ``message`` is `trigger_text`. A defect in the callback is logged and answered too: it does
+        not end the node. An async callback may await other services; the node must then run in the
+        plain executor.
 
         ``inactive``: the callback answers while inactive too.
         """
@@ -228,7 +231,9 @@ class EndpointNode(LifecycleNode):
         else:
             self.get_logger().error(f"{name}:\n{''.join(traceback.format_exception(error))}")
         response.success = False
-        response.message = str(error) if isinstance(error, RobocalError) else _defect(error)
+        words = str(error) if isinstance(error, RobocalError) else _defect(error)
+        trigger = isinstance(response, Trigger.Response)
+        response.message = trigger_text(0, code, words) if trigger else words
         if hasattr(response, "status"):
             response.status = int(code)
         return response

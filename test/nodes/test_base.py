@@ -40,6 +40,7 @@ class Doubler(HouseNode):
         self.add_input(Float64, "number", self.on_number, qos.RELIABLE)
         self.add_service(Decide, "~/decide", self.on_decide)
         self.add_service(Trigger, "~/decide_trigger", self.on_trigger)
+        self.add_service(Trigger, "~/defect_trigger", self.on_defect)
         self.decide = self.create_client(Decide, "~/decide")
         if self.settings["start_fails"] == "badly":
             raise KeyError("a bug")
@@ -69,6 +70,9 @@ class Doubler(HouseNode):
         answer = await self.decide.call_async(Decide.Request(id=7))
         response.success = answer.success
         return response
+
+    def on_defect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        raise KeyError("a bug")
 
     def health(self) -> Health:
         health = Health(values={"factor": self.factor})
@@ -115,6 +119,11 @@ def test_waits_for_commands_without_autostart_and_ignores_inputs_while_inactive(
     answer = graph.call(Decide, "/doubler/decide", id=1)
     assert (answer.success, answer.status) == (False, Code.CONFLICT)
     assert "inactive" in answer.message
+    twin = graph.call(Trigger, "/doubler/decide_trigger")  # has no status: its words carry the code
+    assert (twin.success, twin.message) == (
+        False,
+        "0 CONFLICT doubler is inactive: activate it to use ~/decide_trigger",
+    )
     assert change_state(graph, Transition.TRANSITION_ACTIVATE)
     number.publish(Float64(data=2.0))
     graph.spin_until(lambda: doubled, "a doubled number")
@@ -201,6 +210,9 @@ def test_services_answer_errors_with_their_code_and_may_wait_for_others(graph: A
     answer = graph.call(Decide, "/doubler/decide", id=0)
     assert (answer.success, answer.status, answer.message) == (False, Code.STALE, "too old")
     assert graph.call(Trigger, "/doubler/decide_trigger").success
+    defect = graph.call(Trigger, "/doubler/defect_trigger")
+    assert not defect.success
+    assert defect.message.startswith("0 BAD_INPUT a defect of this software, please report it")
 
 
 def test_diagnostics_tell_the_health_of_an_active_node_once_a_second(graph: Any) -> None:

@@ -329,6 +329,10 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     assert plc.statuses[-1].last.code == Code.CONFLICT
     graph.spin_until(lambda: plc.states[-1].state == AccuracyState.FAULT, "the line is told")
     assert "deactivated" in plc.states[-1].reason
+    for twin in ("run", "status", "cancel", "accept", "reject", "rollback", "acknowledge"):
+        refused = graph.call(Trigger, f"{NODE}/{twin}_trigger")
+        assert not refused.success
+        assert refused.message.startswith("0 CONFLICT maintenance_node is inactive: activate it")
 
 
 MINE = {"robot": "UR10", "serial": "unset"}
