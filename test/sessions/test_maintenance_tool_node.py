@@ -253,6 +253,23 @@ def test_a_node_that_ends_stops_what_the_tool_node_moves_at_once(cell):
     assert "the node ends" in cell.session.status(cell.now_s).fault
 
 
+def test_a_node_that_ends_just_after_a_fault_stops_what_a_deaf_tool_node_moves(cell):
+    """Nobody would be there to send the stop when it is due."""
+    until_moving(cell, "tool")
+    cell.services |= {"disarm": SILENT, "cancel": SILENT}
+    cell.is_open = False
+    while cell.state is not State.FAULT:
+        cell.step()
+    assert cell.moved_s == cell.now_s
+    assert "Stop" not in kinds(cell)
+    asked = cell.session.give_up("the node ends", cell.now_s)
+    assert [type(request).__name__ for request in asked] == ["Stop"]
+    assert cell.session.give_up("the node ends", cell.now_s) == []  # sent once
+    cell.session.close()
+    cell.restart()
+    assert cell.state is State.FAULT
+
+
 def test_a_tool_node_that_turns_deaf_at_the_station_is_a_fault(cell):
     until_moving(cell, "tool")
     cell.services["disarm"] = SILENT

@@ -102,11 +102,15 @@ class Conductor:
             self._save()
 
     def give_up(self, why: str, at_once: bool = False) -> None:
-        """End the run now: at home and disarmed it just ends, anywhere else it is a `fault`."""
+        """End the run now: at home and disarmed it just ends, anywhere else it is a `fault`.
+
+        ``at_once``: a stop that is still due after a fault goes out too, see `Hands.halt`.
+        """
         hands = self._hands
         if self.run is None:
-            return
-        if hands.not_handed_over():
+            if at_once and hands.stopping:
+                hands.halt(at_once)
+        elif hands.not_handed_over():
             words = f"{why}, and the robot is not handed over at home"
             self.fault(Code.CONFLICT, words, at_once)
         else:
