@@ -85,6 +85,8 @@ class Conductor:
         """
         self._close_script()
         hands, run = self._hands, self.run
+        if run is not None and run.owes not in reason:
+            reason = f"{reason}; {run.owes}"
         try:
             hands.halt(at_once)
         except Exception as error:  # without a stop of ours it must still be disarmed, and told
@@ -142,7 +144,13 @@ class Conductor:
 
     def _end(self, code: Code, message: str) -> None:
         self._close_script()
-        run, self.run = self.run, None
+        run = self.run
+        if run is not None and run.owes:
+            message = f"{message}; {run.take_back()}"
+            if run.owes:
+                self.fault(Code.CONFLICT, message)
+                return
+        self.run = None
         self._hands.doing = ""
         self._note(run, code, message)
         self._save()

@@ -78,10 +78,11 @@ class ToolRecord:
     Attributes
     ----------
     answer : "pass", "recalibrate" or "cannot tell"; "failed": the last run found something wrong
-        and has no result; empty: never measured.
+        and has no result for the tool in force; empty: never measured.
     revision : of the tool that was in force in the last run.
     thermal_id : thermal model that was in force in it; 0: the nominal one.
     candidate : calibration that a full measurement proposes in its place; 0: none.
+    postponed : only the time for its check was missing to accept it without a person.
     wall_ns, full_ns : of its last result, and of the last full one; 0: none.
     drift_rms_m, drift_bound_m : error of the thermal model through which a tool was last measured.
     """
@@ -93,6 +94,7 @@ class ToolRecord:
     revision: int = 0
     thermal_id: int = 0
     candidate: int = 0
+    postponed: bool = False
     wall_ns: int = 0
     full_ns: int = 0
     drift_rms_m: float = 0.0
@@ -180,9 +182,8 @@ class Memory:
             self.fault_code, self.fault = fault_code, fault
 
     def note_tool(self, **known: Any) -> None:
-        """The tool was measured."""
+        """The tool was measured; `save` keeps it."""
         self.tool = replace(self.tool, **known)
-        self.save()
 
     def set_fault(self, code: Code, words: str) -> None:
         """A fault; `save` keeps it."""

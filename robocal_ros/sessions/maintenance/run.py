@@ -61,7 +61,18 @@ class Run:
 
     def at(self, wall_ns: int) -> None:
         """Tell the time, for what is kept."""
-        self.wall_ns = self._tool.wall_ns = wall_ns
+        self.wall_ns = wall_ns
+        self._tool.at(wall_ns)
+
+    @property
+    def owes(self) -> str:
+        """An accepted tool that failed its check is still in force, in words; empty: none is."""
+        return self._tool.outcome.fault
+
+    def take_back(self) -> str:
+        """Do it where the script did not come to it, at home; in words what came of it."""
+        self._tool.take_back()
+        return self.owes or self._tool.outcome.told
 
     def ended(self, code: Code, message: str) -> CycleResult:
         """The result, at its end."""

@@ -28,7 +28,7 @@ from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status, status_of
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
-from robocal_ros.sessions.maintenance.tool_part import worst_s
+from robocal_ros.sessions.maintenance.tool_measuring import worst_s
 from robocal_ros.sessions.maintenance.ways import Ways
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
