@@ -62,10 +62,14 @@ class Carrier:
     def thermal_ended(self, outcome: Outcome) -> None:
         """Tell the maintenance, where it waits for this."""
         if (number := self._ending.pop(outcome.command.name, 0)) != 0:
-            document = outcome.document or {}
-            missing = tuple(document.get("poses", {}).get("missing", ()))
-            code, words = outcome.status, outcome.message
-            answer = Answer(code, words, outcome.calibration_id, missing)
+            poses = (outcome.document or {}).get("poses", {})
+            answer = Answer(
+                outcome.status,
+                outcome.message,
+                outcome.calibration_id,
+                tuple(poses.get("missing", ())),
+                visited=poses.get("visited"),
+            )
             self._maintenance.answered(number, answer)
 
     def tool_ended(self, outcome: Outcome) -> None:

@@ -146,5 +146,10 @@ def _status(response: Any) -> Answer:
 
 
 def _cycle(response: Any) -> Answer:
-    missing = tuple(response.missing)
-    return Answer(_code(response.status), response.message, response.candidate_id, missing)
+    return Answer(
+        _code(response.status),
+        response.message,
+        response.candidate_id,
+        tuple(response.missing),
+        visited=response.visited if response.success else None,
+    )

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from maintained_cell import POSES, MaintainedCell
+from maintained_cell import POSES, TOLERANCE_M, MaintainedCell
 from tool_driver import TAUGHT, TRUTH, Driver
 
 from robocal_ros.core.codes import Code
@@ -17,6 +17,7 @@ from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.sessions.maintenance import AcceptBounds
+from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 
@@ -170,6 +171,23 @@ def test_a_full_measurement_of_a_healthy_tool_leaves_all_as_it_is(history):
     assert history.get(result.tool_id).code is Code.NO_SIGNIFICANT_GAIN
     assert history.pending(TOOL) == ()
     assert cell.accuracy().level is not AccuracyLevel.DEGRADED
+
+
+def test_a_thermal_node_that_is_started_anew_between_two_gaps_has_lost_poses(warm):
+    """The cycle's name is open again, but what was measured before is gone."""
+    cell = warm()
+    session = cell.maintenance
+    session.run("c1", GAP_S, cell.now_s, cell.wall_ns)
+    cell.run(GAP_S, until=lambda: "way to measuring pose 2" in session.status(cell.now_s).doing)
+    session.cancel("the line wants the robot")
+    cell.run(GAP_S, until=lambda: session.running is None)
+    cell.thermal = ThermalSession(
+        cell.arm, cell.history, ThermalConfig(tolerance_m=TOLERANCE_M), "test"
+    )
+    result = cell.maintain("c2", GAP_S)
+    words = "thermal measurement at 6 poses, of which the thermal node has 5"
+    assert (result.complete, result.left) == (False, (words,)), result.message
+    assert "thermal measurement" not in str(cell.maintain("c3", GAP_S).left)
 
 
 def test_small_steps_do_not_creep_past_the_bounds(history):

@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
-from maintenance_cell import LONG_S, REFUSED, SILENT, Cell, config_of, opened
+from maintenance_cell import LONG_S, POSES, REFUSED, SILENT, Cell, config_of, kinds, opened
 
 from robocal_ros.core.codes import Code
 from robocal_ros.sessions.maintenance import State
+from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.requests import Answer
 
 UNKNOWN = set(Code) - {
@@ -73,6 +75,35 @@ def test_cold_poses_that_were_not_measured_are_named(cell):
     cell.thermal = replace(cell.thermal, missing=(2, 7))
     cell.run("c1", LONG_S)
     assert "without pose 2, 7 of the cold reference" in cell.finish().message
+
+
+def test_poses_that_the_thermal_node_lost_are_left(cell):
+    """Started anew between two gaps it opens the same cycle, without what was measured before."""
+    cell.run("c1", 15.0)
+    assert "poses" in cell.finish().left[0]
+    first = kinds(cell).count("Move") - 1
+    cell.open_gap()
+    cell.thermal = replace(cell.thermal, visited=len(POSES) - first)
+    cell.run("c2", LONG_S)
+    result = cell.finish()
+    words = f"thermal measurement at 3 poses, of which the thermal node has {len(POSES) - first}"
+    assert (result.complete, result.left) == (False, (words,))
+    cell.open_gap()
+    cell.thermal = replace(cell.thermal, visited=len(POSES))
+    cell.log.clear()
+    cell.run("c3", LONG_S)
+    assert cell.finish().complete
+    assert [each.cycle_id for each in cell.log if isinstance(each, ask.BeginCycle)] == ["c3"]
+
+
+def test_a_pose_that_was_taught_twice_is_one_to_the_thermal_node(history):
+    """Past an obstacle, there and back."""
+    config = config_of(poses=np.vstack([POSES, POSES[1]]), T_base_laser=None)
+    cell = Cell(history, config=config)
+    cell.open_gap()
+    cell.thermal = replace(cell.thermal, visited=len(POSES))
+    cell.run("c1", LONG_S)
+    assert cell.finish().complete
 
 
 @pytest.mark.parametrize("every", [1, 2])

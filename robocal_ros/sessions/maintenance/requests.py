@@ -77,6 +77,7 @@ class Answer:
     code : ACCEPT when done, else why not; a verdict where there is one.
     candidate_id : calibration in the history, else 0.
     missing : numbers, from 1, of the cold poses that were not measured.
+    visited : number of those that were; None where that is not told.
     has_result : whether a measurement reached one.
     answer : of a quick check: "pass", "recalibrate", "cannot tell".
     deviation_mm, sigma_mm : of the tip from the tool in force.
@@ -92,6 +93,7 @@ class Answer:
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
     absent: bool = False
+    visited: int | None = None
 
     @property
     def done(self) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.thermal.spots import SAME_VISIT_RAD
 from robocal_ros.sessions.maintenance.asking import Script, SilentError
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.requests import Answer, BeginCycle, EndCycle
@@ -81,11 +82,25 @@ class ThermalPart:
                 return None, f"{MEASUREMENT}, {left} poses"
         if not hands.fits(self._times.solve_s):
             return None, "end of the thermal cycle"
-        unmeasured = ", ".join(map(str, sorted(book.unmeasured)))
+        unmeasured, measured = ", ".join(map(str, sorted(book.unmeasured))), self._places()
         answer = yield from self._end()
         if answer.code not in FOUND:
             return answer, MEASUREMENT
-        return answer, f"{MEASUREMENT} at pose {unmeasured}" if unmeasured else ""
+        lacking = [f"{MEASUREMENT} at pose {unmeasured}"] if unmeasured else []
+        if answer.visited is not None and answer.visited < measured:
+            # it was started anew meanwhile, its clock jumped, or they are not of the cold reference
+            has = f"of which the thermal node has {answer.visited}"
+            lacking.append(f"{MEASUREMENT} at {measured} poses, {has}")
+        return answer, "; ".join(lacking)
+
+    def _places(self) -> int:
+        """At how many places this cycle measured; the thermal node takes near ones for one."""
+        found: list[Array] = []
+        for pose in sorted(self._book.visited - self._book.unmeasured):
+            q = self._hands.config.poses[pose - 1]
+            if all(np.max(np.abs(q - other)) >= SAME_VISIT_RAD for other in found):
+                found.append(q)
+        return len(found)
 
     def _begin(self, cycle_id: str) -> Script[Answer]:
         book, hands = self._book, self._hands
