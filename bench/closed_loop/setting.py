@@ -30,7 +30,7 @@ LIMITS = MotionLimits(tcp_speed_m_s=0.25)
 DRIVING = DrivingConfig(HOUSING, 0.1, 0.01, 0.06, LIMITS)  # pin, its radius with a bend, flange
 STALE_S = 0.5  # of the heartbeat gap_open
 TRAVEL_M_S = 1.0
-TIMES = Times(check_s=20.0, full_s=35.0, tool_home_s=8.0)
+TIMES = Times(check_s=20.0, full_s=35.0, tool_home_s=10.0)
 BOUNDS = AcceptBounds(automatic=True, tool_m=3e-3)
 HOME_NEAR_RAD = float(np.radians(2.0))  # the corrected home of a bent tool is as far from home
 

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from maintenance_cell import (
     CELL,
+    DOWN,
+    DRIVING,
     HOME,
+    HOUSING,
     LONG_S,
     POSES,
     REFUSED,
@@ -328,6 +331,31 @@ def test_a_time_that_is_too_short_for_the_way_home_is_refused(history):
     """From 100 mm above at 50 mm/s it takes more than two seconds."""
     with pytest.raises(InputError, match="tool_home_s = 2 s"):
         Cell(history, config_of(times=replace(TIMES, tool_home_s=2.0)))
+
+
+def test_a_time_that_is_too_short_is_refused_where_the_way_cannot_be_planned_from_home(history):
+    """Turned as at home the tool would cut into the housing."""
+    narrow = replace(DRIVING, housing=replace(HOUSING, clear_radius_m=0.009))
+    with pytest.raises(InputError, match=r"tool_home_s = 2 s: .* takes 2\.1 s"):
+        Cell(history, config_of(driving=narrow, times=replace(TIMES, tool_home_s=2.0)))
+
+
+def test_a_way_home_that_took_longer_than_was_set_counts_from_then_on(history):
+    """How the tool node turns the tool is seen only then."""
+    set_s, takes_s = 2.2, DOWN.duration_s
+    cell = opened(history, config=config_of(times=replace(TIMES, tool_home_s=set_s)))
+    before_s = cell.session.worst_cases()
+    cell.run("c1", LONG_S)
+    words = f"tool_home_s = 2.2 s: the way home from the beams takes {takes_s:.1f} s; set 3 s"
+    assert words in cell.finish().message
+    after_s = cell.session.worst_cases()
+    for mode in ("quick", "full"):
+        step = f"tool measurement ({mode})"
+        assert after_s[step] - before_s[step] == pytest.approx(takes_s - set_s, abs=0.02)
+    quick_s = before_s["tool measurement (quick)"] + TIMES.reserve_s
+    hands = cell.session._hands
+    hands.begin(quick_s + 0.01)
+    assert not hands.fits(hands.tool_worst_s("quick"))
 
 
 def test_without_a_station_only_the_drift_is_measured(history):

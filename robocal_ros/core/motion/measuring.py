@@ -1,5 +1,7 @@
 """The motions of a measuring step: the way to its start, and the circle or plunge itself."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -65,16 +67,18 @@ def along(cell: MotionCell, q: Array, corners: list[Array], name: str) -> JointP
     plans: list[JointPlan] = []
     here = cell.T_base_tip(q)
     for number, there in enumerate(corners, start=1):
-        ride = Ride.within(
-            _way(cell, here, there), cell.limits.tcp_speed_m_s, cell.limits.tcp_acceleration_m_s2
-        )
-        plan = cell.joints(tip_path.line(here, there, ride), q)
+        plan = cell.joints(tip_path.line(here, there, _ride(cell, here, there)), q)
         share, _ = cell.demand(plan, cell.limits.tcp_speed_m_s)
         plan = plan.slower(max(share, 1.0))
         cell.require_clear(plan, f"{name}, part {number}")
         plans.append(plan)
         q, here = plan.q[-1], there
     return joined(plans)
+
+
+def least_s(cell: MotionCell, corners: list[Array]) -> float:
+    """How long `along` takes at the least from pose to pose (4, 4): joints may need longer."""
+    return sum(_ride(cell, here, there).duration_s for here, there in pairwise(corners))
 
 
 def measuring(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPlan:
@@ -152,6 +156,12 @@ def _way(cell: MotionCell, here: Array, there: Array) -> float:
     turn = np.linalg.norm(frames.log_rotation(there[:3, :3] @ here[:3, :3].T))
     reach = np.max(np.linalg.norm(cell.tool.corners - cell.tool.p_tip, axis=1))
     return float(np.linalg.norm(there[:3, 3] - here[:3, 3]) + turn * reach)
+
+
+def _ride(cell: MotionCell, here: Array, there: Array) -> Ride:
+    """The fastest within the tip's limits."""
+    limits = cell.limits
+    return Ride.within(_way(cell, here, there), limits.tcp_speed_m_s, limits.tcp_acceleration_m_s2)
 
 
 def _turn(step: PlannedStep, limits: MotionLimits) -> Ride:

@@ -40,7 +40,7 @@ class Times:
     stay_s : the robot stays so long after the last measurement of a pose.
     measure_s : at a pose, from standstill on.
     check_s, full_s : a quick check and a full measurement of the tool, from home to its end.
-    tool_home_s : kept free for the way home from the beams.
+    tool_home_s : kept free for the way home from the beams; a longer one counts once it was driven.
     reserve_s : kept free before the end of a gap.
     rest_s : after a motion's end, until the robot rests where it ends.
     stale_s : ``gap_open`` may pause for so long.

@@ -14,6 +14,7 @@ from robocal_ros.sessions.maintenance.mover import FaultError, Mover
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
 from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
+from robocal_ros.sessions.tool_results import QUICK
 
 DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot
 
@@ -29,6 +30,7 @@ class Hands(Asking):
     left_home : whether something may have moved the robot since the run began.
     measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
     doing : what goes on, in words.
+    tool_home_s : for the way home from the beams; the longest so far where that took longer.
     """
 
     def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
@@ -40,6 +42,7 @@ class Hands(Asking):
         self.left_home = False
         self.measured: list[float] = []
         self.doing = ""
+        self.tool_home_s = config.times.tool_home_s
         self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
         self._told_s = -np.inf  # newest reading at the last confirmation, or stop in its place
         self._measuring = 0  # number of the measurement that the driver has not answered
@@ -49,6 +52,13 @@ class Hands(Asking):
     def fits(self, worst_s: float) -> bool:
         """Whether something that lasts so long at the most, way home included, fits the gap."""
         return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
+
+    def tool_worst_s(self, mode: str) -> float:
+        """A tool measurement from home and back, with everything that may go wrong."""
+        times = self.config.times
+        limit_s = times.check_s if mode == QUICK else times.full_s
+        # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
+        return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + self.tool_home_s
 
     def may_wait(self) -> bool:
         """Whether nothing moves, and a heartbeat from after the own pause is yet to come."""
@@ -243,12 +253,23 @@ class Hands(Asking):
         except LimitError as error:
             raise FaultError(error.code, f"no way home: {error}") from error
         duration_s, left_s = route.plan.duration_s, self.gap.left_s(self.now_s)
+        if robot.place == STATION:
+            self.tool_home_s = max(self.tool_home_s, duration_s)
         if duration_s >= left_s and near:
             return  # the next run begins from here
         if duration_s >= left_s:
             words = f"the way home takes {duration_s:.1f} s, {max(left_s, 0.0):.1f} s are left"
+            words = "; ".join(filter(None, (words, self.home_told())))
             raise FaultError(Code.LIMIT_EXCEEDED, words)
         yield from self.drive(route, duration_s)
+
+    def home_told(self) -> str:
+        """That the way home from the beams took longer than was set, and what to set; or empty."""
+        set_s = self.config.times.tool_home_s
+        if self.tool_home_s <= set_s:
+            return ""
+        took = f"the way home from the beams takes {self.tool_home_s:.1f} s"
+        return f"tool_home_s = {set_s:g} s: {took}; set {np.ceil(self.tool_home_s + 0.5):g} s"
 
     def after_break(self) -> Script[None]:
         """Stop everything, wait until it stands and is disarmed, then bring the robot home."""

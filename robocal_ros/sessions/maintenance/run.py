@@ -132,6 +132,8 @@ class Run:
             self._left(found.left)
         for words in found.words():
             self._tell(f"tool: {words}")
+        if told := self._hands.home_told():
+            self._tell(told)
         if found.fault:
             raise FaultError(Code.CONFLICT, found.fault)
 

@@ -28,7 +28,6 @@ from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
 from robocal_ros.sessions.maintenance.status import State, Status, status_of
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook, ThermalPart
-from robocal_ros.sessions.maintenance.tool_measuring import worst_s
 from robocal_ros.sessions.maintenance.ways import Ways
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
@@ -239,8 +238,8 @@ class MaintenanceSession:
         thermal = ThermalPart(self._hands, self._book)
         found = {"one measuring pose": thermal.worst_s()} if self.ways.count else {}
         if self.config.T_base_laser is not None:
-            times = self.config.times
-            found |= {f"tool measurement ({mode})": worst_s(times, mode) for mode in (QUICK, FULL)}
+            worst_s = self._hands.tool_worst_s
+            found |= {f"tool measurement ({mode})": worst_s(mode) for mode in (QUICK, FULL)}
         return found
 
     def result(self, cycle_id: str) -> CycleResult | None:

@@ -7,7 +7,6 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import ToolError
 from robocal_ros.sessions.maintenance.asking import Script, SilentError
-from robocal_ros.sessions.maintenance.config import Times
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import Memory, ToolRecord
@@ -62,13 +61,6 @@ class ToolOutcome:
         return [words for words in said if not any(words in o for o in said if o is not words)]
 
 
-def worst_s(times: Times, mode: str) -> float:
-    """From home and back, with everything that may go wrong."""
-    limit_s = times.check_s if mode == QUICK else times.full_s
-    # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
-    return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + times.tool_home_s
-
-
 class ToolMeasuring:
     """Measures the tool, from home and back.
 
@@ -104,7 +96,7 @@ class ToolMeasuring:
             outcome.left = f"tool measurement ({mode})"
             outcome.came(Answer(Code.CONFLICT, hands.tool.words(), absent=True))
             return None
-        if not hands.fits(worst_s(times, mode)):
+        if not hands.fits(hands.tool_worst_s(mode)):
             outcome.left = f"tool measurement ({mode})"
             return None
         hands.doing = f"tool measurement ({mode})"
@@ -138,8 +130,8 @@ class ToolMeasuring:
         elif answer.has_result:
             self._note(answer, answer.answer)
             if outcome.accepted and answer.answer == "recalibrate":
-                number = outcome.candidate_id
-                outcome.fault = f"tool {number} failed its check and is still in force: take it back"
+                failed = f"tool {outcome.candidate_id} failed its check and is still in force"
+                outcome.fault = f"{failed}: take it back"
         elif answer.code in FAILED:  # what an older check found of the tool holds no more
             self._memory.note_tool(
                 answer="failed",

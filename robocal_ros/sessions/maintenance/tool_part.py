@@ -13,7 +13,7 @@ from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import Memory
 from robocal_ros.sessions.maintenance.settling import is_accepted, patiently, settled
 from robocal_ros.sessions.maintenance.thermal_part import CycleBook
-from robocal_ros.sessions.maintenance.tool_measuring import ToolMeasuring, ToolOutcome, worst_s
+from robocal_ros.sessions.maintenance.tool_measuring import ToolMeasuring, ToolOutcome
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 NS = 1_000_000_000
@@ -88,7 +88,7 @@ class ToolPart:
             optional = self._memory.tool.answer == "pass"
             if optional and not self._full_is_due():
                 return
-        if optional and not self._hands.fits(worst_s(self._hands.config.times, FULL)):
+        if optional and not self._hands.fits(self._hands.tool_worst_s(FULL)):
             return  # only when time allows
         yield from self._full(cycle_id)
 
@@ -156,7 +156,7 @@ class ToolPart:
     def _doubt(self) -> str:
         """Why a candidate inside the bounds is not accepted now; empty: nothing is against it."""
         why = MOVED if self._book.moved else self._unsure()
-        self._late = not why and not self._hands.fits(worst_s(self._hands.config.times, QUICK))
+        self._late = not why and not self._hands.fits(self._hands.tool_worst_s(QUICK))
         return LATE if self._late else why
 
     def _verify(self, cycle_id: str) -> Script[None]:

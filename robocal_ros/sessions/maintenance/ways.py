@@ -15,7 +15,7 @@ from robocal_ros.core.errors import InputError, LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.motion.cell import MotionCell
 from robocal_ros.core.motion.housing import ToolBody
-from robocal_ros.core.motion.measuring import along, raised_way
+from robocal_ros.core.motion.measuring import along, least_s, raised_way
 from robocal_ros.core.motion.plan import JointPlan, joined
 from robocal_ros.core.motion.travel import departure, joint_way
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
@@ -131,15 +131,18 @@ class Ways:
         return Route(plan, ((STATION[0], HOME),), (plan.duration_s,))
 
     def _require_time(self, tool_home_s: float) -> None:
-        """Refuse a time for the way home from the beams that is surely too short."""
+        """Refuse a time for the way home from the beams that is surely too short.
+
+        How tcf_node turns the tool there is not known here: turned as at home it is the shortest.
+        """
         cell, here = self.station, self.station.T_base_tip(self._home)
         there = here.copy()
         there[:3, 3] = cell.T_base_laser[:3, 3]
         corners = raised_way(cell, here, there, cell.housing.retract_m)
         try:
             way_s = along(cell, self._home, corners, "way from home to the beams").duration_s
-        except LimitError:  # turned as at home it does not get there; tcf_node turns the tool
-            return
+        except LimitError:  # turned as at home it does not get there
+            way_s = least_s(cell, [here, *corners])
         if way_s > tool_home_s:
             raise InputError(
                 f"tool_home_s = {tool_home_s:g} s: the way between home and the beams alone takes "
