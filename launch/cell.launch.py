@@ -45,7 +45,7 @@ def cell_node(name, condition=None):
             (trajectories, LaunchConfiguration("controller")),
             (CONTROLLER, LaunchConfiguration("controller")),  # as recorder_node knows it
             ("kinematic_model", "thermal_node/model"),
-            ("tool_frame", "tcf_node/tool"),
+            ("tool", "tcf_node/tool"),
         ],
         output="screen",
         condition=condition,

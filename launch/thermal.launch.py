@@ -42,7 +42,7 @@ def generate_launch_description():
                 parameters=[LaunchConfiguration("correction_params")],
                 remappings=[
                     ("kinematic_model", "/thermal_node/model"),
-                    ("tool_frame", "/tcf_node/tool"),
+                    ("tool", "/tcf_node/tool"),
                 ],
                 output="screen",
             ),

@@ -124,7 +124,7 @@ def wiring() -> Mapping[str, Mapping[str, str]]:
     corrects = {
         "joint_trajectory": PROGRAM,
         "kinematic_model": "/thermal_node/model",
-        "tool_frame": "/tcf_node/tool",
+        "tool": "/tcf_node/tool",
     }
     return {
         "cell_sim_node": {"joint_trajectory": CONTROLLER, "~/truth/commanded": CONTROLLER},

@@ -49,7 +49,7 @@ COMMANDS = "joint_commands"
 STATES = "joint_states"
 ACTION = "follow_joint_trajectory"
 MODEL = "kinematic_model"
-TOOL = "tool_frame"
+TOOL = "tool"
 KINDS = {
     TRAJECTORY: JointTrajectory,
     TARGETS: JointState,

@@ -82,7 +82,7 @@ SETTINGS = (
         low=0.0,
         high=1e3,
     ),
-    Setting("flange_frame", "tool0", "Parent frame that tools of tool_frame must have"),
+    Setting("flange_frame", "tool0", "Parent frame that tools of the topic tool must have"),
     Setting("tool_child_frame", "", "Child frame that they must have; empty: any"),
     Setting(
         "follow_joint_trajectory",

@@ -129,7 +129,7 @@ def attacks(stream: str, on: bool) -> st.SearchStrategy[Any]:
         "joint_trajectory": GARBAGE_PATHS,
         "joint_states": GARBAGE_JOINTS,
         "kinematic_model": MODELS,
-        "tool_frame": TOOLS,
+        "tool": TOOLS,
     }
     one = st.one_of([st.tuples(st.just(what), values) for what, values in kinds.items()])
     return st.lists(one, min_size=1, max_size=8)

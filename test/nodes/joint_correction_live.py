@@ -99,7 +99,7 @@ class Line:
         self.to_path = graph.publisher(JointTrajectory, "joint_trajectory")
         self.to_states = graph.publisher(JointState, "joint_states")
         self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
-        self.to_tool = graph.publisher(ToolFrame, "tool_frame", qos.LATCHED)
+        self.to_tool = graph.publisher(ToolFrame, "tool", qos.LATCHED)
         outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
         graph.spin_until(
             lambda: all(output.get_subscription_count() for output in outputs), "the outputs"

@@ -103,7 +103,7 @@ def test_a_cell_of_one_robot_in_its_namespace(graph, tmp_path):
                 trajectories: CONTROLLER.removeprefix("/robot_1/"),
                 DEFAULT: CONTROLLER.removeprefix("/robot_1/"),
                 "kinematic_model": "thermal_node/model",
-                "tool_frame": "tcf_node/tool",
+                "tool": "tcf_node/tool",
             },
             "--ros-args", "--params-file", str(ROOT / "config" / f"{name}.yaml"),
             "--params-file", str(mine),

@@ -53,7 +53,7 @@ def test_each_change_is_kept_with_the_choice_of_the_reference(graph: Any) -> Non
     after(graph, 2)
     line.take(model_message(drifted(), 3), line.to_model, "kinematic_model")
     after(graph, 3)
-    line.take(tool_message(T, 5), line.to_tool, "tool_frame")
+    line.take(tool_message(T, 5), line.to_tool, "tool")
     after(graph, 4)
     line.enable(False)
     records = after(graph, 5)

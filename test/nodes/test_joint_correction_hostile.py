@@ -146,7 +146,7 @@ class Attacked(Line):
             "joint_trajectory": self.to_path,
             "joint_states": self.to_states,
             "kinematic_model": self.to_model,
-            "tool_frame": self.to_tool,
+            "tool": self.to_tool,
         }
         self.sent: set[str] = set()
         self.log = Log(mode.get("free_axis", False))

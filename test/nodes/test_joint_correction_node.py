@@ -92,15 +92,15 @@ def test_a_new_tool_and_a_taught_one(graph: Any) -> None:
     T[:3, 3] = tool[:3]
     new = T.copy()
     new[0, 3] = 0.012
-    line.take(tool_message(new), line.to_tool, "tool_frame")
+    line.take(tool_message(new), line.to_tool, "tool")
     q = line.settle()
     miss = NOMINAL.fk(np.array(q.position)) @ new - NOMINAL.fk(HOME) @ T
     assert np.abs(miss).max() < 1e-9
     turned = tool_message(new, 2)
     turned.tool.rotation.w = 0.5
-    line.refused(line.to_tool, turned, "tool_frame")
+    line.refused(line.to_tool, turned, "tool")
     for change in ({"serial": "s2"}, {"state": ToolFrame.CANDIDATE}, {"model_hash": "other"}):
-        line.refused(line.to_tool, tool_message(new, 2, **change), "tool_frame")
+        line.refused(line.to_tool, tool_message(new, 2, **change), "tool")
 
 
 def test_hostile_messages_are_refused_and_named(graph: Any) -> None:
@@ -265,9 +265,9 @@ def test_a_blend_that_waits_is_a_warning(graph: Any) -> None:
 def test_the_tool_of_another_frame_is_refused(graph: Any) -> None:
     line = Line(graph, tool_child_frame="gun")
     message = tool_message(np.eye(4), child_frame_id="gripper")
-    line.refused(line.to_tool, message, "tool_frame")
+    line.refused(line.to_tool, message, "tool")
     message.child_frame_id = "gun"
-    line.take(message, line.to_tool, "tool_frame")
+    line.take(message, line.to_tool, "tool")
     assert line.node._session.status().new_tool
 
 

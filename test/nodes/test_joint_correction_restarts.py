@@ -91,7 +91,7 @@ class Cell:
             "tcf_node": tool | {"laser": self._laser},
             "joint_correction_node": {"taught_tool": [*TAUGHT_M, 0.0, 0.0, 0.0, 1.0]},
         }[name]
-        remap = {"kinematic_model": "/thermal_node/model", "tool_frame": "/tcf_node/tool"}
+        remap = {"kinematic_model": "/thermal_node/model", "tool": "/tcf_node/tool"}
         mine = remap if name == "joint_correction_node" else None
         self.nodes[name] = self.graph.start(name, parameters, mine)
         if mine is not None:

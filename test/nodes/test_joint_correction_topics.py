@@ -2,6 +2,7 @@
 
 import time
 from array import array
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,14 @@ from joint_correction_live import (
 from robocal_msgs.msg import CorrectionStatus, JointOffset, KinematicModel, ToolFrame
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayout
+from tool_cell_live import written_laser
+from tool_driver import noisy_cell
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.joint_correction_settings import session_config
+from robocal_ros.nodes.tcf_node import TcfNode
 
 BLEND_RAD_S = np.radians(0.5)
 
@@ -59,7 +63,7 @@ def test_wired_by_remapping_before_a_forward_command_controller(graph: Any) -> N
         {"serial": "s1", "enable_on_start": "true", "command_joints": f"[{','.join(order)}]"},
         {
             "kinematic_model": "/thermal_node/model",
-            "tool_frame": "/tcf_node/tool",
+            "tool": "/tcf_node/tool",
             "joint_commands": "/servo/commands",
             "~/joint_commands": corrected,
         },
@@ -252,7 +256,7 @@ def test_a_measured_tool_waits_for_the_robot_to_stand(graph: Any) -> None:
     T = np.eye(4)
     T[:3, 3] = (0.002, 0.0, 0.25)
     line.target()
-    line.take(tool_message(T, 5), line.to_tool, "tool_frame")
+    line.take(tool_message(T, 5), line.to_tool, "tool")
     for _ in range(20):  # a stream under way is not changed
         assert list(line.target().position) == HOME.tolist()
     told = line.told(tool_waits=True, waiting_tool_revision=5)
@@ -269,7 +273,7 @@ def test_a_measured_tool_waits_for_the_robot_to_stand(graph: Any) -> None:
     assert np.abs(reached - taught).max() < 1e-9
     # rolled back: the taught tool again
     back = tool_message(np.eye(4), 6, state=ToolFrame.NONE)
-    line.take(back, line.to_tool, "tool_frame")
+    line.take(back, line.to_tool, "tool")
     graph.spin_until(lambda: adopted(6), "the taught tool is back")
     assert np.allclose(line.settle().position, HOME, rtol=0.0, atol=1e-12)
 
@@ -326,3 +330,22 @@ def test_parameters_become_the_sessions_configuration(graph: Any) -> None:
     line.told(policy=CorrectionStatus.CLAMP)
     out = line.target()
     assert isinstance(out, JointState)
+
+
+def test_an_input_has_the_type_of_the_output_that_is_called_like_it(graph: Any, tmp_path: Path):
+    """A remapping by the name alone joins what belongs together."""
+    graph.add(JointCorrectionNode)
+    graph.add(TcfNode, {"laser": written_laser(tmp_path, noisy_cell())})
+
+    def pairs() -> dict[str, tuple[list[str], list[str]]]:
+        found = graph.probe.get_subscriber_names_and_types_by_node("joint_correction_node", "/")
+        types = dict(graph.probe.get_topic_names_and_types())
+        named = {topic: (kinds, types.get(f"/tcf_node{topic}")) for topic, kinds in found}
+        return {topic: (kinds, other) for topic, (kinds, other) in named.items() if other}
+
+    graph.spin_until(
+        lambda: any("tool" in topic for topic in pairs()), f"the tool of both nodes: {pairs()}"
+    )
+    for topic, (wanted, offered) in pairs().items():
+        assert wanted == offered, topic
+    assert pairs()["/tool"][0] == ["robocal_msgs/msg/ToolFrame"]

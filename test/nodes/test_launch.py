@@ -62,7 +62,7 @@ def test_each_node_has_its_own_file_by_default(text):
 def test_the_correction_takes_model_and_tool_where_they_are_published(text):
     tuples = [n.elts for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Tuple)]
     pairs = [tuple(e.value for e in elements) for elements in tuples]
-    assert pairs == [("kinematic_model", MODEL), ("tool_frame", "/tcf_node/tool")]
+    assert pairs == [("kinematic_model", MODEL), ("tool", "/tcf_node/tool")]
 
 
 @pytest.mark.parametrize("name", NODES)

@@ -22,7 +22,7 @@ from robocal_ros.storage.bags import BagReader
 
 NODE = "recorder_node"
 LEFT_OUT = {"/image"}  # large
-WIRED = {"/kinematic_model": "/thermal_node/model", "/tool_frame": "/tcf_node/tool"}
+WIRED = {"/kinematic_model": "/thermal_node/model", "/tool": "/tcf_node/tool"}
 MOTION = {  # by what moves a robot
     "trajectory_msgs/msg/JointTrajectory",
     "std_msgs/msg/Float64MultiArray",
