@@ -81,8 +81,8 @@ SETTINGS = (
     _time("tool_home_s", 10.0, "Kept free for the way home from the beams", 600.0, 0.1),
     _time(
         "resume_within_s",
-        240.0,
-        "An unfinished thermal cycle goes on when its last pose is no older; shorter than "
+        600.0,
+        "An unfinished thermal cycle goes on when its last pose is no older; a minute shorter than "
         "thermal_node's cycle_timeout_s",
         86400.0,
     ),

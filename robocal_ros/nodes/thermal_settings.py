@@ -85,8 +85,9 @@ SETTINGS = (
     *STANDSTILL,
     Setting(
         "cycle_timeout_s",
-        300.0,
-        "A cycle ends when nothing was measured for so long",
+        660.0,
+        "A cycle ends when nothing was measured for so long; a minute longer than "
+        "maintenance_node's resume_within_s",
         unit="s",
         low=1.0,
         high=7200.0,

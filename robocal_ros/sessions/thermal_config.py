@@ -48,7 +48,7 @@ class ThermalConfig:
     drift_parameters: tuple[str, ...] = ()
     hold_out: float = 0.5
     seed: int = 0
-    cycle_timeout_s: float = 300.0
+    cycle_timeout_s: float = 660.0
     tolerance_m: float = 3e-4
     expires_after_s: float = 8.0 * 3600.0
     work_poses: tuple[tuple[float, ...], ...] = ()

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from maintained_cell import POSES, TOLERANCE_M, MaintainedCell
 from tool_driver import TAUGHT, TRUTH, Driver
 
@@ -14,16 +15,27 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.core.thermal.priors import drift_prior
+from robocal_ros.core.thermal.process import DriftProcess
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command
 from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sim import kr150_cell
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_robot
 
 GAP_S = 240.0
+EVERY_S, HALF_S = 300.0, 29.0
 KELVIN, HOT_KELVIN = 10.0, 40.0
 BEYOND = 16.3  # chi-square of 3 unknowns, one in a thousand
+
+
+def shipped(node: str) -> dict[str, Any]:
+    """A node's parameters as its file in config/ has them."""
+    file = Path(__file__).parents[2] / "config" / f"{node}.yaml"
+    return yaml.safe_load(file.read_text())[f"/**/{node}"]["ros__parameters"]
 
 
 @dataclass(frozen=True)
@@ -111,6 +123,42 @@ def test_one_call_makes_a_warm_robot_with_a_bent_tool_accurate(warm):
     said = cell.accuracy()
     assert said.level is AccuracyLevel.OK, said.reason
     assert np.all(after < said.error.bound_m), (after, said.error)
+
+
+def test_gaps_that_hold_half_of_the_poses_complete_a_cycle_as_all_is_set(history, captured):
+    """Gaps begin every five minutes; one that falls out does no harm."""
+    given = {name: shipped(name) for name in ("maintenance_node", "thermal_node")}
+    within_s = given["maintenance_node"]["resume_within_s"]
+    cell = MaintainedCell(
+        history,
+        from_s=captured.now_s,
+        T_base_laser=None,
+        measurements=20,  # of ten in a second
+        resume_within_s=within_s,
+    )
+    assert cell.thermal.config.cycle_timeout_s == given["thermal_node"]["cycle_timeout_s"]
+    cell.production(3.0, KELVIN)
+    for number, every_s in enumerate((EVERY_S, 2.0 * EVERY_S), start=1):
+        first = cell.maintain(f"{number}a", HALF_S)
+        assert first.left == ("thermal measurement, 3 poses",), first.message
+        cell.production((every_s - HALF_S) / 3600.0, KELVIN)
+        second = cell.maintain(f"{number}b", HALF_S)
+        assert second.complete, second.message
+        assert second.thermal_code in (Code.ACCEPT, Code.NO_SIGNIFICANT_GAIN), second.message
+        cell.production((EVERY_S - HALF_S) / 3600.0, KELVIN)
+
+
+def test_a_cycle_that_pauses_drifts_no_more_than_a_measurement_scatters():
+    """It counts as measured in its middle, half of the longest pause from its poses."""
+    arm, q = load_robot("kr150_r3100"), kr150_cell.poses("cycle")
+    process = DriftProcess(drift_prior(arm))
+    rows = arm.parameter_jacobian(q, kr150_cell.TAUGHT[:3, 3])[:, :3]
+    half_s = 0.5 * shipped("maintenance_node")["resume_within_s"]
+    F, noise = process.transition(half_s)
+    fastest = np.hypot(F[0, 1], np.sqrt(noise[0, 0]))  # of a cold robot that begins to work
+    steady = rows @ np.sqrt(process.covariance)  # which is diagonal
+    drift_mm = 1e3 * fastest * np.sqrt(np.mean(np.sum(steady**2, axis=-1)))
+    assert drift_mm <= shipped("thermal_node")["sigma_mm"]
 
 
 def test_without_leave_everything_is_proposed_and_nothing_changed(waiting):

@@ -1,5 +1,6 @@
 """A maintenance run in gaps of all lengths, with everything that may go wrong."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -112,7 +113,8 @@ def test_a_thermal_cycle_that_is_too_old_begins_anew(history):
     cell.pass_time(6.0)
     cell.log.clear()
     cell.run("c2", LONG_S)
-    cell.finish()
+    words = cell.finish().message
+    assert re.search(r"cycle 'c1' with 1 of 3 .* \d+ s old \(resume_within_s = 5 s\)", words)
     assert [r.cycle_id for r in cell.log if isinstance(r, ask.BeginCycle)] == ["c2"]
     assert kinds(cell)[: kinds(cell).index("EndCycle")].count("Move") == len(POSES) + 1
 

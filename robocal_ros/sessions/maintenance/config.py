@@ -79,7 +79,9 @@ class MaintenanceConfig:
     travel_speed_m_s : of the tip on the ways between taught poses.
     home_near : (n,), or one for all: the robot is at home with all joints so near, rad (m).
     measurements : so many make a pose measured.
-    resume_within_s : an unfinished thermal cycle goes on when its last pose is no older.
+    resume_within_s : an unfinished thermal cycle goes on when its last pose is no older. The
+        tracker takes all poses of a cycle for measured in its middle, half of a pause away: within
+        300 s a cold robot of this size drifts by as much as one measurement scatters, 0.03 mm.
     check_every_s, full_every_s : tool measurements that are due without a reason; 0: in each gap,
         and never.
     tool_due_s, tool_expires_s : age of a tool check at which it is due, and says nothing any more.
@@ -95,7 +97,7 @@ class MaintenanceConfig:
     travel_speed_m_s: float = 0.25
     home_near: ArrayLike = float(np.radians(0.5))
     measurements: int = 1
-    resume_within_s: float = 240.0
+    resume_within_s: float = 600.0
     check_every_s: float = 0.0
     full_every_s: float = 0.0
     tool_due_s: float = 2.0 * 3600.0

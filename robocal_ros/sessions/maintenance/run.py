@@ -95,6 +95,8 @@ class Run:
         )
 
     def _measure_thermal(self) -> Script[None]:
+        if dropped := self._thermal.drop_old():
+            self._tell(f"thermal: {dropped}")
         try:
             answer, left = yield from self._thermal.script(self.result.cycle_id)
         except SilentError as error:

@@ -58,6 +58,20 @@ class ThermalPart:
         homes = max((ways.home_s(i) for i in range(1, ways.count + 1)), default=0.0)
         return self._step_s(ways.longest_line_s(), homes)
 
+    def drop_old(self) -> str:
+        """Give up an open cycle whose last pose is too old, and say so; empty: there is none."""
+        book, within_s = self._book, self._hands.config.resume_within_s
+        age_s = self._hands.now_s - book.last_s
+        if not book.id or age_s <= within_s:
+            return ""
+        words = (
+            f"cycle '{book.id}' with {len(book.visited)} of {self._hands.ways.count} poses is "
+            f"dropped and begins anew: its last pose is {age_s:.0f} s old (resume_within_s = "
+            f"{within_s:g} s)"
+        )
+        book.forget()
+        return words
+
     def script(self, cycle_id: str) -> Script[tuple[Answer | None, str]]:
         """The answer of the cycle's end, None where it is not reached, and what is left.
 
@@ -67,8 +81,6 @@ class ThermalPart:
             The thermal node did not answer; the robot may be away from home.
         """
         hands, book = self._hands, self._book
-        if hands.now_s - book.last_s > hands.config.resume_within_s:
-            book.forget()
         todo = [i for i in range(1, hands.ways.count + 1) if i not in book.visited]
         if todo:
             if not hands.fits(2.0 * self._times.answer_s + self._first_s(todo[0])):
