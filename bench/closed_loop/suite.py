@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bench.closed_loop import setting
 from bench.closed_loop.carrying import Carrier
-from bench.closed_loop.words import drift_of, model_of, tool_of
+from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
 from robocal_ros import __version__
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
@@ -230,7 +230,9 @@ class Suite:
             self.correction.offer_model(model_of(self.thermal, self._clock.now_ns))
         if heads[1] != self._offered[1]:
             self.correction.offer_tool(tool_of(self.tool, self._clock.now_ns))
-        self._offered = heads
+        if heads != self._offered:
+            self._offered = heads
+            self.accuracy()  # the node looks each second
 
     def enable(self) -> None:
         """Correct from now on; the program was taught with the robot as the cold reference has it.
@@ -252,6 +254,8 @@ class Suite:
     def accuracy(self) -> Accuracy:
         """What the line reads now."""
         self._tell_drift()
+        if self.correction is not None:
+            self.maintenance.correction(told_by(self.correction), self._clock.now_s)
         return self.maintenance.accuracy(self._clock.now_s, self._clock.now_ns)
 
     def _tell_drift(self) -> None:

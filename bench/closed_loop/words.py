@@ -3,7 +3,8 @@
 import numpy as np
 
 from bench.closed_loop import setting
-from robocal_ros.sessions.correction import OfferedModel, OfferedTool
+from robocal_ros.core.correction_told import ToldCorrection
+from robocal_ros.sessions.correction import CorrectionSession, OfferedModel, OfferedTool
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.requests import Answer
@@ -63,3 +64,20 @@ def drift_of(session: ThermalSession, now_ns: int) -> Drift:
     """What the thermal session tells the maintenance of the robot's accuracy."""
     found = session.accuracy(now_ns)
     return Drift(found.level, found.reason, found.error, found.due_in_s)
+
+
+def told_by(session: CorrectionSession) -> ToldCorrection:
+    """What the joint correction tells the maintenance of itself."""
+    status = session.status()
+    return ToldCorrection(
+        state=status.state,
+        enabled=status.enabled,
+        shadow=status.shadow,
+        model_revision=status.revision or 0,
+        tool_revision=status.tool_revision or 0,
+        waiting_tool_revision=status.waiting_tool,
+        stale=status.stale,
+        blend_waits=status.waits,
+        mismatch=status.mismatch,
+        last_refusal=status.last_refusal,
+    )

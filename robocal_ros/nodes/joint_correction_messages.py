@@ -125,7 +125,7 @@ class CorrectionMessages:
         return StatusMessage(
             header=header(stamp_ns, ""),
             **self._own,
-            state=_state(status),
+            state=int(status.state),
             reason=in_words(status),
             reference=f"{self._name}: {status.reference}",
             enabled=status.enabled,
@@ -154,17 +154,6 @@ class CorrectionMessages:
 
 def _counts(what: str, counts: Mapping[Reason, int]) -> dict[str, Sequence[Any]]:
     return {f"{what}_reasons": [r.value for r in counts], what: list(counts.values())}
-
-
-def _state(status: CorrectionStatus) -> int:
-    if status.mismatch:
-        return StatusMessage.MISMATCH
-    if not status.settled:
-        return StatusMessage.BLENDING
-    if not status.enabled:
-        return StatusMessage.OFF
-    known = status.revision is not None or status.new_tool
-    return StatusMessage.ON if known else StatusMessage.WITHOUT_MODEL
 
 
 def in_words(status: CorrectionStatus) -> str:

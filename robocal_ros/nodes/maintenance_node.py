@@ -5,14 +5,14 @@ from dataclasses import replace
 from typing import Any
 
 from geometry_msgs.msg import PointStamped, PoseStamped
-from robocal_msgs.msg import AccuracyState
+from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from sensor_msgs.msg import JointState, PointCloud2
 from std_msgs.msg import Bool
 
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.motion.loading import load_motion
 from robocal_ros.core.samples import joint_sample, stamp_ns
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, Health
@@ -20,6 +20,7 @@ from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.gap_sources import GapSources
 from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
+from robocal_ros.nodes.maintenance_inputs import require_robot, told_correction, told_drift
 from robocal_ros.nodes.maintenance_outputs import MaintenanceOutputs
 from robocal_ros.nodes.maintenance_services import MaintenanceServices, Now
 from robocal_ros.nodes.maintenance_settings import SETTINGS, session_config
@@ -29,7 +30,6 @@ from robocal_ros.nodes.steady_clock import SteadyClock
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
-from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -41,10 +41,9 @@ SHOW_S = 0.2
 ACCURACY_S = 1.0
 HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks after the robot
 NS = 1_000_000_000
-MM = 1e-3
 ENDS = "the node was deactivated"
-LARGEST = 1e9  # mm, s: a figure beyond is a defect, and its square might be infinite
-GAP_OPEN, ACCURACY = "gap_open", "thermal_node/accuracy"
+GAP_OPEN = "gap_open"
+ACCURACY, CORRECTION = "thermal_node/accuracy", "joint_correction_node/status"
 MEASUREMENTS = {
     POINT: PointStamped,
     CENTRE: PointStamped,
@@ -89,6 +88,7 @@ class MaintenanceNode(HouseNode):
         heartbeat = self.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
         self._sources = GapSources(self, heartbeat)
         self.add_input(AccuracyState, ACCURACY, self._take_accuracy, qos.LATCHED)
+        self.add_input(CorrectionStatus, CORRECTION, self._take_correction, qos.LATCHED)
         for topic, kind in MEASUREMENTS.items():
             self.add_input(kind, topic, self._take_measurement, qos.STREAM)
         self.add_timer(TICK_S, self._tick, steady=True)
@@ -155,24 +155,14 @@ class MaintenanceNode(HouseNode):
             self._session.measured(stamp_ns(message.header.stamp) / NS)
 
     def _take_accuracy(self, message: Any) -> None:
-        if self._session is None:
-            return
-        told, mine = (message.robot, message.serial), (self._nominal.name, self._serial_in_use)
-        if told != mine:
-            raise InputError(
-                f"{ACCURACY} is of robot and serial {told}, this node keeps {mine}: "
-                "give both nodes the same, or mend the remapping"
-            )
-        try:
-            level = AccuracyLevel(message.state)
-        except ValueError as error:
-            raise InputError(f"accuracy state {message.state} is unknown") from error
-        rms_mm, bound_mm, due_in_s = message.predicted_error_mm, message.bound_mm, message.due_in_s
-        if not all(abs(figure) <= LARGEST for figure in (rms_mm, bound_mm, due_in_s)):
-            raise InputError(f"rms {rms_mm:g} mm, bound {bound_mm:g} mm, due in {due_in_s:g} s")
-        known = rms_mm >= 0.0 and bound_mm >= 0.0
-        found = ToolError(rms_mm * MM, bound_mm * MM) if known else None
-        self._session.drift(Drift(level, message.reason, found, due_in_s), self._steady.now_s())
+        if self._session is not None:
+            require_robot(ACCURACY, message, self._nominal.name, self._serial_in_use)
+            self._session.drift(told_drift(message), self._steady.now_s())
+
+    def _take_correction(self, message: Any) -> None:
+        if self._session is not None:
+            require_robot(CORRECTION, message, self._nominal.name, self._serial_in_use)
+            self._session.correction(told_correction(message), self._steady.now_s())
 
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:

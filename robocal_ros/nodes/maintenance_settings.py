@@ -16,9 +16,16 @@ from robocal_ros.nodes.pose_settings import given_pose, pose_settings
 from robocal_ros.sessions.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.storage.laser_files import read_laser_for
 
+SHORTEST_SILENCE_S = 2.0
+
 
 def _time(name: str, default: float, what: str, high: float, low: float = 0.01) -> Setting:
     return Setting(name, default, what, unit="s", low=low, high=high)
+
+
+def _silence_fault(silent_s: float) -> str | None:
+    told = 0.0 < silent_s < SHORTEST_SILENCE_S
+    return f"0, or {SHORTEST_SILENCE_S:g} s at least: it is told each second" if told else None
 
 
 SETTINGS = (
@@ -97,6 +104,16 @@ SETTINGS = (
     _time("tool_due_s", 7200.0, "Age of a tool check at which accuracy_state is DUE", 1e7),
     _time("tool_expires_s", 28800.0, "Age at which it is EXPIRED", 1e7),
     _time("thermal_silent_s", 5.0, "thermal_node's accuracy may pause for so long", 600.0, 1.0),
+    Setting(
+        "correction_silent_s",
+        5.0,
+        "joint_correction_node's status may pause for so long; 0: there is none, the robot's "
+        "controller takes model and tool itself",
+        unit="s",
+        low=0.0,
+        high=600.0,
+        check=_silence_fault,
+    ),
     length("tolerance_mm", 0.3, "Error of the tool that the process allows", 0.001, 100.0),
     Setting("auto_accept", False, "Accept inside the bounds without a person"),
     length(
@@ -146,6 +163,7 @@ def session_config(settings: Mapping[str, Any], arm: SerialArm) -> MaintenanceCo
         tool_due_s=settings["tool_due_s"],
         tool_expires_s=settings["tool_expires_s"],
         silent_s=settings["thermal_silent_s"],
+        correction_silent_s=settings["correction_silent_s"],
         tolerance_m=settings["tolerance_mm"] * MM,
         times=_times(settings),
         bounds=AcceptBounds(

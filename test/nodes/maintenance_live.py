@@ -125,6 +125,7 @@ class LiveCell:
             | {
                 "home_deg": yaml_list(HOME_DEG),
                 "measuring_poses_deg": f"[{poses}]",
+                "correction_silent_s": 0.0,  # nothing is produced
             }
         )
         out = {"~/joint_trajectory": ROBOT}

@@ -59,6 +59,7 @@ class MaintainedCell(Robot):
             "driving": driving,
             "T_base_laser": self.cell.laser.T_base_laser,
             "tolerance_m": TOLERANCE_M,
+            "correction_silent_s": 0.0,  # nothing is produced
         }
         config = MaintenanceConfig(**(settings | changes))
         self.maintenance = MaintenanceSession(self.arm, history, config, Shelf())

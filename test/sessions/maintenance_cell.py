@@ -76,6 +76,7 @@ def config_of(**changes: Any) -> MaintenanceConfig:
         "driving": DRIVING,
         "T_base_laser": CELL.laser.T_base_laser,
         "times": TIMES,
+        "correction_silent_s": 0.0,  # the controller takes model and tool itself
     }
     return MaintenanceConfig(**(settings | changes))
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.correction_told import CorrectionState
 from robocal_ros.core.joint_correction.bounds import Policy, Survey
 from robocal_ros.core.joint_correction.refusals import Reason
 
@@ -89,3 +90,15 @@ class CorrectionStatus:
     shadow: bool
     refused: dict[Reason, int]
     last_refusal: str
+
+    @property
+    def state(self) -> CorrectionState:
+        """All of it in one word."""
+        if self.mismatch:
+            return CorrectionState.MISMATCH
+        if not self.settled:
+            return CorrectionState.BLENDING
+        if not self.enabled:
+            return CorrectionState.OFF
+        known = self.revision is not None or self.new_tool
+        return CorrectionState.ON if known else CorrectionState.WITHOUT_MODEL

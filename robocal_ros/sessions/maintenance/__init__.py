@@ -14,7 +14,8 @@ ways            the ways that the robot may take
 deciding        accept, reject, roll back; what needs no person
 settling        what a run decides itself, with patience
 memory          what outlives a restart
-accuracy        drift, tool and faults in one state
+heard           what the thermal node and the joint correction say
+accuracy        drift, tool, correction and faults in one state
 status          what is said
 """
 

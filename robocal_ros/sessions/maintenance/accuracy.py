@@ -1,6 +1,8 @@
-"""How accurate the cell is believed to be: drift, tool and own faults in one state."""
+"""How accurate the cell is believed to be: drift, tool, correction and own faults in one state."""
 
 from dataclasses import dataclass
+
+import numpy as np
 
 from robocal_ros.core.combined_error import both_errors, offset_error
 from robocal_ros.core.proposals import Head
@@ -36,21 +38,27 @@ class _Finding:
 def accuracy_of(
     config: MaintenanceConfig,
     drift: Drift | None,
+    uncorrected: str,
     memory: Memory,
     tool: Head,
     thermal_id: int,
     wall_ns: int,
 ) -> Accuracy:
-    """Judge everything at once; ``drift`` None: the thermal node is silent.
+    """Judge everything at once; the worst part gives the level.
 
-    ``tool``, ``thermal_id``: tool and thermal model (0: nominal) in force. The worst part gives the
-    level.
+    Parameters
+    ----------
+    drift : None: the thermal node is silent.
+    uncorrected : why commands are not corrected with what is in force; empty: they are.
+    tool, thermal_id : tool and thermal model (0: nominal) in force.
     """
     parts = []
     if len(config.poses):
         parts.append(_thermal(drift))
     if config.T_base_laser is not None:
         parts.append(_tool(config, memory.tool, tool, thermal_id, wall_ns))
+    if parts and uncorrected:  # what is known of model and tool is not what the line makes
+        parts.append(_Finding(AccuracyLevel.DEGRADED, f"correction: {uncorrected}", None, np.inf))
     errors = [part.error for part in parts if part.error is not None]
     known = both_errors(*errors) if len(errors) == 2 else errors[0] if errors else None
     error = known if len(errors) == len(parts) else None

@@ -86,6 +86,8 @@ class MaintenanceConfig:
         and never.
     tool_due_s, tool_expires_s : age of a tool check at which it is due, and says nothing any more.
     silent_s : `~/accuracy` of the thermal node may pause for so long.
+    correction_silent_s : the same of the joint correction's status; 0: there is none, whatever is
+        in force is applied by the robot's controller.
     tolerance_m : error that the process allows.
     """
 
@@ -103,6 +105,7 @@ class MaintenanceConfig:
     tool_due_s: float = 2.0 * 3600.0
     tool_expires_s: float = 8.0 * 3600.0
     silent_s: float = 5.0
+    correction_silent_s: float = 5.0
     tolerance_m: float = 3e-4
     times: Times = field(default_factory=Times)
     bounds: AcceptBounds = field(default_factory=AcceptBounds)

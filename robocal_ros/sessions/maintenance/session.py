@@ -1,9 +1,9 @@
 """The maintenance of a cell, without clock and ROS: what the PLC asks in, requests to others out.
 
-Whoever drives it gives what happens (`gap`, `reading`, `measured`, `answered`, `drift`) and calls
-`tick` often, at least every 20 ms; `tick` gives the requests that are to be carried out at once, in
-their order. Times ``now_s`` are of one steady clock, which goes on while the host is suspended;
-``wall_ns`` is the wall clock, for records.
+Whoever drives it gives what happens (`gap`, `reading`, `measured`, `answered`, `drift`,
+`correction`) and calls `tick` often, at least every 20 ms; `tick` gives the requests that are to be
+carried out at once, in their order. Times ``now_s`` are of one steady clock, which goes on while
+the host is suspended; ``wall_ns`` is the wall clock, for records.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.correction_told import ToldCorrection
 from robocal_ros.core.errors import ConflictError, InputError, LimitError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import TOOL
+from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift, accuracy_of
@@ -23,6 +24,7 @@ from robocal_ros.sessions.maintenance.conductor import Conductor
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.hands import Hands
+from robocal_ros.sessions.maintenance.heard import Heard
 from robocal_ros.sessions.maintenance.memory import CycleResult, Keeper, Memory
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.maintenance.run import Run
@@ -65,7 +67,7 @@ class MaintenanceSession:
         self._book = CycleBook()
         self._record = record
         self._conductor = Conductor(self._hands, self._memory, self._tell)
-        self._drift: tuple[Drift, float] | None = None
+        self._heard = Heard(config)
 
     # ---- what happens ---------------------------------------------------------------------------
 
@@ -96,7 +98,11 @@ class MaintenanceSession:
 
     def drift(self, drift: Drift, now_s: float) -> None:
         """What the thermal part believes of the accuracy."""
-        self._drift = drift, now_s
+        self._heard.take_drift(drift, now_s)
+
+    def correction(self, told: ToldCorrection, now_s: float) -> None:
+        """What the joint correction says of itself."""
+        self._heard.take_correction(told, now_s)
 
     def answered(self, number: int, answer: Answer) -> None:
         """What came of a request."""
@@ -141,7 +147,7 @@ class MaintenanceSession:
             self._decider,
             memory,
             self._decided,
-            lambda: self._heard_drift(hands.now_s),
+            lambda: self._heard.drift(hands.now_s),
         )
         run.at(wall_ns)
         self._conductor.begin(run)
@@ -267,27 +273,21 @@ class MaintenanceSession:
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""
-        tool, thermal_id = self._decider.head(TOOL), self._decider.thermal_id()
-        drift = self._heard_drift(now_s)
-        return accuracy_of(self.config, drift, self._memory, tool, thermal_id, wall_ns)
+        thermal, tool, heard = self._decider.head(THERMAL), self._decider.head(TOOL), self._heard
+        told = heard.drift(now_s), heard.uncorrected(thermal, tool, now_s)
+        number = thermal.calibration_id or 0
+        return accuracy_of(self.config, *told, self._memory, tool, number, wall_ns)
 
     def _require_home(self) -> None:
         robot = self._hands.robot
         if robot.unheard:
             raise TooFewSamplesError(f"{robot.unheard}: nobody knows whether the robot is at home")
         if away := robot.beside_home():
-            words = f"robot is not at home: {away}: bring it home, then acknowledge"
-            raise LimitError(words)
-
-    def _heard_drift(self, now_s: float) -> Drift | None:
-        """None while the thermal part is silent."""
-        drift = self._drift
-        return drift[0] if drift is not None and now_s - drift[1] <= self.config.silent_s else None
+            raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
 
     def _known(self, cycle_id: str) -> CycleResult | None:
-        run = self._conductor.run
-        if run is not None and run.result.cycle_id == cycle_id:
-            return run.result
+        if (result := self.running) is not None and result.cycle_id == cycle_id:
+            return result
         return self._memory.cycles.get(cycle_id)
 
     def _decided(self, outcome: Outcome) -> None:
