@@ -123,7 +123,7 @@ SETTINGS = (
         low=0.0,
         high=100.0,
     ),
-    Setting("tool_tcp_deg", 3.0, "and in orientation", unit="deg", low=0.0, high=30.0),
+    Setting("tool_tcp_deg", 4.0, "and in orientation", unit="deg", low=0.0, high=30.0),
     Setting(
         "tool_joint_deg",
         5.0,

@@ -96,8 +96,22 @@ SETTINGS = (
     length("quick_limit_mm", 0.2, "Deviation of the tip that a quick check passes", 0.01, 10.0),
     length("lever_mm", 150.0, "From where a bent tool bends to its tip", 1.0, 2000.0),
     length("sigma_limit_mm", 0.2, "A tip that is known less well is refused", 0.01, 10.0),
-    length("change_limit_mm", 15.0, "Largest change of the tip from the taught one", 0.1, 100.0),
-    Setting("tilt_limit_deg", 10.0, "Largest change of the axis", unit="deg", low=0.1, high=45.0),
+    length(
+        "change_limit_mm",
+        10.0,
+        "Largest change of the tip from the taught one; no more than joint_correction_node's "
+        "tool_tcp_mm",
+        0.1,
+        100.0,
+    ),
+    Setting(
+        "tilt_limit_deg",
+        4.0,
+        "Largest change of the axis; no more than its tool_tcp_deg",
+        unit="deg",
+        low=0.1,
+        high=45.0,
+    ),
     length("trait_radius_mm", 0.05, "Change of its radius that is no fault yet; 0: any", 0.0, 5.0),
     Setting(
         "trait_latency_ms",

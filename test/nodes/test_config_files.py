@@ -2,7 +2,9 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from lifecycle_msgs.srv import GetState
@@ -10,9 +12,12 @@ from rclpy.qos import ReliabilityPolicy
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
+from robocal_ros.core.joint_correction.bounds import CorrectionConfig
+from robocal_ros.core.tool.judging import ToolLimits
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.motion_settings import MOTION
 from robocal_ros.nodes.recorder_node import RecorderNode
@@ -20,6 +25,7 @@ from robocal_ros.nodes.replay_node import ReplayNode
 from robocal_ros.nodes.tcf_node import INPUTS as TCF_INPUTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import INPUTS, ThermalNode
+from robocal_ros.sessions.thermal_config import ThermalConfig
 
 CONFIG = Path(__file__).parents[2] / "config"
 NODES = (
@@ -33,11 +39,39 @@ NODES = (
 )
 
 
+def shipped(node: type) -> dict[str, Any]:
+    """A node's parameters as its file has them."""
+    content = yaml.safe_load((CONFIG / f"{node.NAME}.yaml").read_text())
+    return content[f"/**/{node.NAME}"]["ros__parameters"]
+
+
 @pytest.mark.parametrize("node", NODES, ids=lambda node: node.NAME)
 def test_the_file_shows_every_parameter_with_its_default(node):
-    content = yaml.safe_load((CONFIG / f"{node.NAME}.yaml").read_text())
-    given = content[f"/**/{node.NAME}"]["ros__parameters"]
-    assert given == {s.name: s.default for s in (AUTOSTART, SERIAL, *node.SETTINGS)}
+    assert shipped(node) == {s.name: s.default for s in (AUTOSTART, SERIAL, *node.SETTINGS)}
+
+
+def test_each_node_takes_over_what_another_one_gives_as_all_is_set():
+    """A tool that may be accepted is corrected with; a cycle that is resumed is still open."""
+    tcf, correction, maintenance, thermal = map(
+        shipped, (TcfNode, JointCorrectionNode, MaintenanceNode, ThermalNode)
+    )
+    assert tcf["change_limit_mm"] <= correction["tool_tcp_mm"]
+    assert tcf["tilt_limit_deg"] <= correction["tool_tcp_deg"] <= correction["tool_joint_deg"]
+    assert maintenance["accept_tool_mm"] <= tcf["change_limit_mm"]
+    assert maintenance["accept_tool_deg"] <= tcf["tilt_limit_deg"]
+    assert maintenance["accept_thermal_mm"] <= correction["thermal_tcp_mm"]
+    assert maintenance["resume_within_s"] + 60.0 <= thermal["cycle_timeout_s"]
+    assert maintenance["correction_silent_s"] > 0.0  # cell.launch.py and the demo have one
+
+
+def test_what_is_judged_without_a_file_is_judged_as_with_it():
+    tcf, correction, thermal = map(shipped, (TcfNode, JointCorrectionNode, ThermalNode))
+    limits, tool = ToolLimits(), CorrectionConfig().tool
+    assert 1e3 * limits.change_m == pytest.approx(tcf["change_limit_mm"])
+    assert np.degrees(limits.tilt_rad) == pytest.approx(tcf["tilt_limit_deg"])
+    assert 1e3 * tool.tcp_m == pytest.approx(correction["tool_tcp_mm"])
+    assert np.degrees(tool.tcp_rad) == pytest.approx(correction["tool_tcp_deg"])
+    assert ThermalConfig().cycle_timeout_s == thermal["cycle_timeout_s"]
 
 
 def test_the_page_of_motions_names_them_as_the_parameters_do():

@@ -101,7 +101,7 @@ def test_where_the_bound_is_reached_the_blend_waits(robot: Robot) -> None:
 
 def test_a_tool_beyond_its_bound_is_not_taken_over(robot: Robot) -> None:
     refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(11e-3, 0.0))
-    refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(0.0, 3.1))
+    refused(Reason.TOOL_BOUND, robot.session.offer_tool, bent_tool(0.0, 4.1))
     robot.session.offer_tool(bent_tool(10e-3, 3.0))
     wrong = bent_tool(parent="flange")
     refused(Reason.BAD_TOOL, robot.session.offer_tool, wrong)

@@ -61,7 +61,8 @@ class CorrectionConfig:
 
     Attributes
     ----------
-    thermal, tool : bounds of the arm's drift and of the tool's change.
+    thermal, tool : bounds of the arm's drift and of the tool's change. The tool's tilt is that of
+        a tip 10 mm aside by a bend 150 mm above it.
     blend_rad_s, blend_m_s : fastest change of a joint's correction (prismatic: m/s).
     longest_step_s : a pause in a stream advances the blend by no more than this.
     stream_gap_s : after a pause that is longer than this, and than two of its periods, a stream
@@ -80,7 +81,7 @@ class CorrectionConfig:
         default_factory=lambda: ShiftBounds(1e-3, _degrees(0.1), _degrees(0.3))
     )
     tool: ShiftBounds = field(
-        default_factory=lambda: ShiftBounds(10e-3, _degrees(3.0), _degrees(5.0))
+        default_factory=lambda: ShiftBounds(10e-3, _degrees(4.0), _degrees(5.0))
     )
     blend_rad_s: float = field(default_factory=lambda: _degrees(0.5))
     blend_m_s: float = 1e-3

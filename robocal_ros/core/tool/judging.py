@@ -27,12 +27,13 @@ class ToolLimits:
     Attributes
     ----------
     sigma_m : largest standard deviation of the tip in any direction.
-    change_m, tilt_rad : largest change from the taught tool.
+    change_m, tilt_rad : largest change from the taught tool: what the joint correction makes up
+        for, so that no tool is proposed that it would not take over.
     """
 
     sigma_m: float = 2e-4
-    change_m: float = 1.5e-2
-    tilt_rad: float = float(np.radians(10.0))
+    change_m: float = 1e-2
+    tilt_rad: float = float(np.radians(4.0))
 
 
 @dataclass(frozen=True, eq=False)
