@@ -24,7 +24,7 @@ from bench.live.graph import CellController, LiveError
 from bench.startup import ROOT
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.thermal_outputs import EVENTS
+from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.sim.shift import REFERENCE
 from robocal_ros.storage.bags import BagReader, BagWriter
 
