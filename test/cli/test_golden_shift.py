@@ -24,7 +24,9 @@ from robocal_ros.storage.calibrations import CalibrationHistory
 BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "golden_excerpt.mcap"
 SCHEMAS = {"thermal_node": "replay.json", "tcf_node": "replay.tool.json"}
-BENT = ShiftPlan(hours=1.0 / 12.0, every_s=150.0, incidents=(Incident(0.0, "collision", 2.0),))
+BENT = ShiftPlan(
+    hours=0.1, first_s=60.0, every_s=150.0, incidents=(Incident(0.0, "collision", 2.0),)
+)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,7 @@ def script() -> Any:
 
 @pytest.fixture(scope="module")
 def shift(script, tmp_path_factory) -> tuple[ShiftRecord, Path]:
-    """Commissioning, a collision, two gaps with a pass of the programme after each."""
+    """Commissioning, a collision, a pass of the programme, and one after each of two gaps."""
     path = tmp_path_factory.mktemp("golden") / "made.mcap"
     with script.recorder(path, (-np.inf, np.inf)) as recorder:
         record = run_shift(BENT, seed=3, record=recorder.record, watch=recorder.watch)

@@ -1,5 +1,6 @@
 """The tool in the golden shift's ten minutes, live: what a replay gives, bit for bit."""
 
+import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -78,6 +79,8 @@ def tool_settings(config: Any, laser: Path) -> dict[str, Any]:
         "taught_xyz_mm": (config.T_flange_taught[:3, 3] * 1e3).tolist(),
         "spin_deg": -135.0,
         "joint_silence_s": 10.0,
+        "change_limit_mm": config.limits.change_m * 1e3,
+        "tilt_limit_deg": round(math.degrees(config.limits.tilt_rad), 9),
     }
 
 

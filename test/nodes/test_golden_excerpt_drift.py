@@ -142,7 +142,7 @@ def play_cycles(graph: Any, recording: Recording, bag: Path, live: list[SessionE
         for topic in INPUTS
         for policy, value in (("reliability", "reliable"), ("history", "keep_all"))
     }
-    graph.start("thermal_node", thermal_settings() | lossless)
+    graph.start("thermal_node", thermal_settings(recording) | lossless)
     wait = f"[{', '.join((*INPUTS, MARKS))}]"
     playing = {"bag": bag, "rate": RATE, "wait_for_subscribers": wait, "start_paused": True}
     graph.start("replay_node", playing | {"acknowledge_timeout_s": 60.0})
@@ -171,9 +171,10 @@ def ask(graph: Any, name: str, cycle_id: str) -> None:
     assert answer.success, answer.message
 
 
-def thermal_settings() -> dict[str, Any]:
+def thermal_settings(recording: Recording) -> dict[str, Any]:
     """The live node's parameters that give the recorded settings."""
-    config = setting.THERMAL
+    assert recording.configured is not None
+    config, recorded = setting.THERMAL, recording.configured.arguments["config"]
     work = np.round(np.degrees(config.work_poses), 9)
     return {
         "robot": ROBOT,
@@ -184,6 +185,7 @@ def thermal_settings() -> dict[str, Any]:
         "work_poses_deg": [" ".join(f"{q:g}" for q in pose) for pose in work],
         "tip_mm": [value * 1e3 for value in config.tip_m],
         "command_timeout_s": 0.1,
+        "cycle_timeout_s": recorded["cycle_timeout_s"],
     }
 
 

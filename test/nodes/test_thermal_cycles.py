@@ -13,6 +13,7 @@ from shift import NS, Shift, built, fixed_points, knocked, of_kind, postures, wa
 from robocal_ros.core.codes import Code
 from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes.conversions import time_message
+from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.storage.robots import load_robot
 
 POSES = 6
@@ -135,7 +136,7 @@ def test_a_cycle_broken_off(cell, robot):
 
 def test_a_cycle_that_nobody_ends(cell, robot):
     cell.play(robot.visit(WARM_K, after_h=2.0))
-    robot.shift.now_ns += 301 * NS
+    robot.shift.now_ns += round((ThermalConfig().cycle_timeout_s + 1.0) * NS)
     cell.play(of_kind(robot.visit(WARM_K, slice(1)), JointSample))
     cell.graph.spin_until(lambda: cell.qualities, "it ends by itself")
     assert (cell.qualities[-1].accept, cell.qualities[-1].samples) == (True, POSES)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from correction_robot import HOME, NAMES, NOMINAL, bent_tool, drifted, offer
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.core.joint_correction import plain
@@ -348,10 +348,12 @@ class Hostile(Both):
         """What went out comes back, as it was, rounded or reversed, marked or not."""
         if not isinstance(self.sent, bytes):
             return
-        back = positions(self.sent, NAMES)
+        command = JointWire().read(self.sent)
+        assert command is not None
+        names, back = command.names, command.position  # of a part of the joints, it may be
         ways = [back, back.astype(np.float32)]
-        echoes = [serialized(NAMES, [way, [], []], self.stamp) for way in ways]
-        echoes.append(serialized(NAMES[::-1], [back[::-1], [], []], self.stamp))
+        echoes = [serialized(names, [way, [], []], self.stamp) for way in ways]
+        echoes.append(serialized(names[::-1], [back[::-1], [], []], self.stamp))
         for echo in (*echoes, self.sent):
             self.now += DT
             self.target(echo)
@@ -400,6 +402,7 @@ EVENTS = st.lists(
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(Policy), st.booleans(), st.booleans(), EVENTS)
+@example(Policy.REFUSE, True, True, [("wrong", 1, 29), ("echo", 0, 1)])  # four joints come back
 def test_whatever_comes_both_ways_do_the_same(
     policy: Policy, limited: bool, begun: bool, events: list[tuple[str, int, int]]
 ) -> None:
