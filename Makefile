@@ -45,7 +45,7 @@ test: setup  ## all tests; TESTS="test/core -k tool" for some
 	trap 'kill $$others 2>/dev/null || true' EXIT
 	failed=0
 	$(PYTEST) -m cell test/nodes 2>&1 | tee out/test_cells.txt || failed=1
-	$(PYTEST) --reruns 1 -rR -m "not cell" -n 2 --dist worksteal test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
+	$(PYTEST) --reruns 1 -rR -m "not cell" -n 3 --dist worksteal test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"
 	cat out/test_others.txt
