@@ -18,6 +18,7 @@ from robocal_ros.core.tool.circle_edges import CircleMotion, label_edges
 from robocal_ros.core.tool.classic_run import classic_tool
 from robocal_ros.core.tool.crossed_beams import closed_form, fit_circle
 from robocal_ros.core.tool.crossed_model import Held
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.core.tool.quick_check import CheckRule, quick_check
 from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
@@ -319,7 +320,9 @@ def check_table(runs: int = 120) -> Table:
             run = cell.quick_run(RoundTool.cylinder(truth, TOOL_RADIUS), TAUGHT, rng)
             duration = run.duration_s
             rule = CheckRule(limit)
-            found = quick_check(cell.laser, run.path, run.steps, TAUGHT, rule, noise=cell.robot)
+            found = quick_check(
+                cell.laser, run.path, run.steps, KnownTool(TAUGHT), rule, noise=cell.robot
+            )
             answers.append(found.answer)
         share = {a: 100.0 * answers.count(a) / runs for a in ("pass", "recalibrate", "cannot tell")}
         wrong = share["pass"] if moved >= 1.0 else 0.0
@@ -349,7 +352,7 @@ def speed_table(runs: int = 50) -> Table:
     calls = {
         "full run": lambda: full.estimate(FREE),
         "quick check": lambda: quick_check(
-            cell.laser, quick.path, quick.steps, TAUGHT, CheckRule(), noise=cell.robot
+            cell.laser, quick.path, quick.steps, KnownTool(TAUGHT), CheckRule(), noise=cell.robot
         ),
         "one circle": lambda: fit_circle(motion, edges),
     }

@@ -169,7 +169,7 @@ class ToolSession(Commanded):
             raise ConflictError(f"no joint states yet: does the robot's driver publish {JOINTS}?")
         config, current = self.config, self._current
         quick = mode == QUICK
-        tool = self._results.expected() if quick else config.T_flange_taught
+        tool = self._results.expected().T_flange_tool if quick else config.T_flange_taught
         steps: Mode = "quick" if quick else "full"
         plan = MeasuringPlan(steps, self._laser, tool, config.motion, config.spin_rad)
         self._runs += 1

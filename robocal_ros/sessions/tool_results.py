@@ -2,10 +2,10 @@
 
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
@@ -95,13 +95,11 @@ class ToolResults:
     def _full(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
         estimate = run.estimate(Held())
         run.require_like_healthy(estimate)
-        found, in_force = KnownTool.measured(estimate), self._current.tool
+        found, in_force = KnownTool.measured(estimate), self._in_force()
         taught, healthy = self._config.T_flange_taught, self._current.measured_healthy
         absolute = healthy is None
         if healthy is not None:
             found = changed_tool(taught, healthy, found)
-            if self._current.head.model is None:
-                in_force = KnownTool.taught(taught, healthy)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits)
         document = run_document(found, estimate, run.circles, verdict) | {
             "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
@@ -147,10 +145,9 @@ class ToolResults:
             run.plan.laser,
             run.path,
             run.steps,
-            run.plan.T_flange_tool,
+            replace(self.expected(), T_flange_tool=run.plan.T_flange_tool),
             self._config.check,
             noise=run.config.noise,
-            stored_covariance=self._tip_covariance(),
         )
         run.require_like_healthy(found.measured)
         return found
@@ -160,17 +157,25 @@ class ToolResults:
         document = check_document(check, verdict)
         return Outcome(command, verdict.code, verdict.reason, document)
 
-    def _tip_covariance(self) -> NDArray[np.float64] | None:
-        covariance = self._current.tool.covariance
-        return None if covariance is None else covariance[:3, :3]
-
-    def expected(self) -> NDArray[np.float64]:
+    def expected(self) -> KnownTool:
         """How the tool in force measures: with the healthy tool's own deviation, where known."""
-        tool, healthy = self._current.tool, self._current.measured_healthy
+        tool, healthy = self._in_force(), self._current.measured_healthy
         if healthy is None:
-            return tool.T_flange_tool
+            return tool
         taught = KnownTool(self._config.T_flange_taught)
-        return changed_tool(healthy.T_flange_tool, taught, tool).T_flange_tool
+        measures = changed_tool(healthy.T_flange_tool, taught, tool).T_flange_tool
+        if tool.against is not None and np.array_equal(tool.against, healthy.T_flange_tool):
+            return replace(tool, T_flange_tool=measures)
+        if tool.covariance is None or healthy.covariance is None:
+            return KnownTool(measures)
+        return KnownTool(measures, tool.covariance + healthy.covariance)
+
+    def _in_force(self) -> KnownTool:
+        """The tool in force, the taught one as no change against the healthy tool's run."""
+        healthy = self._current.measured_healthy
+        if healthy is None or self._current.head.model is not None:
+            return self._current.tool
+        return KnownTool.taught(self._config.T_flange_taught, healthy)
 
     def _keep(
         self,

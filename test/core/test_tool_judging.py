@@ -11,24 +11,31 @@ from robocal_ros.core import frames
 from robocal_ros.core.tool.crossed_model import Held
 from robocal_ros.core.tool.judging import UNCHANGED, KnownTool, changed_tool, unchanged
 from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.core.tool.quick_check import CheckRule, QuickCheck, quick_check
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise
 from robocal_ros.sim.ur10_station import TAUGHT, laser_of
 
 LASER_M = 2.2e-5  # of each point of a frame that the same robot has calibrated
 ROBOT_M = np.array([4e-4, -2e-4, 3e-4])  # absolute error: the same in each run
+TOOL = RoundTool.cylinder(TAUGHT, 0.0025)
 TRIALS, ROOM = 2000, 4.0
 BY_CHANCE = 1.0 - UNCHANGED
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[KnownTool]:
-    """Of one tool at one station, whose laser frame is off by what its sigma says."""
+def cell():
+    """A station whose laser frame is off by what its sigma says."""
     source = TrueInput(latency_s=0.004, sample_period_s=0.002)
     cell = make_cell(exact=False, source=source, noise=TrueNoise(3e-5, 1e-5))
     points, random = laser_of(cell.station).points, np.random.default_rng(1)
     cell.laser = LaserFrame(points + LASER_M * random.standard_normal(points.shape), LASER_M)
-    tool = RoundTool.cylinder(TAUGHT, 0.0025)
-    measured = [cell.full_run(tool, TAUGHT, np.random.default_rng(i)) for i in range(60)]
+    return cell
+
+
+@pytest.fixture(scope="module")
+def runs(cell) -> list[KnownTool]:
+    """Of one tool at one station."""
+    measured = [cell.full_run(TOOL, TAUGHT, np.random.default_rng(i)) for i in range(60)]
     return [KnownTool.measured(run.estimate(Held())) for run in measured]
 
 
@@ -55,6 +62,30 @@ def test_two_runs_differ_by_what_is_their_own(runs):
     assert squared == pytest.approx(count, abs=ROOM * np.sqrt(2.0 * count))
     own, whole = (np.trace(c[:3, :3]) for c in (runs[0].own_covariance, runs[0].covariance))
     assert 0.5 * whole < own < 0.9 * whole  # of a frame as well known as the robot repeats
+
+
+def checked(cell, stored: KnownTool, seed: int) -> QuickCheck:
+    run = cell.quick_run(TOOL, stored.T_flange_tool, np.random.default_rng(seed))
+    return quick_check(cell.laser, run.path, run.steps, stored, CheckRule(), noise=cell.robot)
+
+
+def test_a_check_is_away_from_the_tool_in_force_by_what_its_covariance_says(cell, runs):
+    """Taught, as its healthy run measured it: that run's own noise counts, the laser's does not."""
+    squared = 0.0
+    for seed, healthy in enumerate(runs):
+        stored = KnownTool.taught(TAUGHT, healthy)
+        stored = replace(stored, T_flange_tool=healthy.T_flange_tool)
+        found = checked(cell, stored, 1000 + seed)
+        squared += found.deviation @ np.linalg.solve(found.covariance, found.deviation)
+    count = 3 * len(runs)
+    assert squared == pytest.approx(count, abs=ROOM * np.sqrt(2.0 * count))
+
+
+def test_a_check_knows_less_of_a_tool_from_an_older_history(cell, runs):
+    first, second = runs[:2]
+    kept = replace(changed_tool(TAUGHT, first, second), T_flange_tool=second.T_flange_tool)
+    sigma = [checked(cell, tool, 7).sigma_m for tool in (kept, replace(kept, own_covariance=None))]
+    assert sigma[0] < 0.9 * sigma[1]
 
 
 class Draws:

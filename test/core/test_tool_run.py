@@ -14,6 +14,7 @@ from robocal_ros.core.tool.crossed_beams import fit_circle
 from robocal_ros.core.tool.crossed_model import BeamStep, Held, RobotNoise
 from robocal_ros.core.tool.crossed_run import estimate_tool, run_problem
 from robocal_ros.core.tool.flange_path import JointPath
+from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.quick_check import CheckRule, quick_check
 from robocal_ros.core.tool.run_traits import RunTraits
@@ -321,9 +322,8 @@ def test_joint_states_that_stop_are_refused(exact):
 def checked(tool: np.ndarray, seed: int, limit_m: float = 2e-4):
     cell = noisy_cell()
     run = cell.quick_run(RoundTool.cylinder(tool, 0.0025), TAUGHT, rng(seed))
-    return quick_check(
-        cell.laser, run.path, run.steps, TAUGHT, CheckRule(limit_m), noise=RobotNoise(3e-5, 1e-5)
-    )
+    rule, noise = CheckRule(limit_m), RobotNoise(3e-5, 1e-5)
+    return quick_check(cell.laser, run.path, run.steps, KnownTool(TAUGHT), rule, noise=noise)
 
 
 def test_a_quick_check_measures_the_deviation():

@@ -177,7 +177,7 @@ def judge_tool(
 
 def unchanged(found: KnownTool, in_force: KnownTool) -> bool:
     """Whether two tools differ by no more than their noise (chi-square, 5 unknowns)."""
-    spread = _spread_between(found, in_force)
+    spread = spread_between(found, in_force)
     if spread is None:
         return False
     R = in_force.T_flange_tool[:3, :3]
@@ -186,7 +186,7 @@ def unchanged(found: KnownTool, in_force: KnownTool) -> bool:
     return float(d @ np.linalg.solve(spread, d)) <= chi2_quantile(UNCHANGED, len(d))
 
 
-def _spread_between(found: KnownTool, in_force: KnownTool) -> Array | None:
+def spread_between(found: KnownTool, in_force: KnownTool) -> Array | None:
     """Covariance (5, 5) of the difference of two tools; None where it is not known.
 
     In that of two changes against one run of the healthy tool its error cancels, and the laser

@@ -1,7 +1,7 @@
 """Has the tool moved since it was measured? One circle and one plunge against the stored frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.tool.crossed_model import BeamStep, Held, RobotNoise
 from robocal_ros.core.tool.crossed_run import DEFAULT_NOISE, ToolEstimate, estimate_tool
 from robocal_ros.core.tool.flange_path import FlangePath
+from robocal_ros.core.tool.judging import KnownTool, spread_between
 from robocal_ros.core.tool.laser_frame import LaserFrame
 
 Array = NDArray[np.float64]
@@ -61,15 +62,12 @@ def quick_check(
     laser: LaserFrame,
     path: FlangePath,
     steps: Sequence[BeamStep],
-    T_flange_tool: Array,
+    stored: KnownTool,
     rule: CheckRule,
     *,
     noise: RobotNoise = DEFAULT_NOISE,
-    stored_covariance: Array | None = None,
 ) -> QuickCheck:
-    """Compare one circle and one plunge with the stored tool.
-
-    ``stored_covariance`` (3, 3), flange axes, m^2: of the stored tip against this same laser frame.
+    """Compare one circle and one plunge with the stored tool, as these same beams measure it.
 
     Pass: a deviation at the limit would look as small as this in at most 5 % of cases;
     recalibrate: one at the limit would look as large in at most 5 %; else it cannot be told.
@@ -79,25 +77,22 @@ def quick_check(
     BeamError, RankDeficientError, ResidualError
         As `estimate_tool`: edges that are missing or make no sense also ask for a full run.
     """
-    beside = sideways_check(
-        laser, path, steps, T_flange_tool, rule, noise=noise, stored_covariance=stored_covariance
-    )
+    beside = sideways_check(laser, path, steps, stored, rule, noise=noise)
     if beside.answer == "recalibrate":
         return beside
     held = Held(tilt_rad=HELD_TILT_RAD)
-    both = estimate_tool(laser, path, steps, T_flange_tool, noise=noise, held=held)
-    return _compared(both, T_flange_tool, rule, stored_covariance, EVERY_WAY)
+    both = estimate_tool(laser, path, steps, stored.T_flange_tool, noise=noise, held=held)
+    return _compared(both, stored, rule, EVERY_WAY)
 
 
 def sideways_check(
     laser: LaserFrame,
     path: FlangePath,
     steps: Sequence[BeamStep],
-    T_flange_tool: Array,
+    stored: KnownTool,
     rule: CheckRule,
     *,
     noise: RobotNoise = DEFAULT_NOISE,
-    stored_covariance: Array | None = None,
 ) -> QuickCheck:
     """What the circle alone tells: a tool that it finds far off need not plunge.
 
@@ -106,8 +101,8 @@ def sideways_check(
     """
     circles = [step for step in steps if step.kind == "circle"]
     held = Held(tilt_rad=HELD_TILT_RAD, along_m=HELD_ALONG_M)
-    found = estimate_tool(laser, path, circles, T_flange_tool, noise=noise, held=held)
-    return _compared(found, T_flange_tool, rule, stored_covariance, SIDEWAYS)
+    found = estimate_tool(laser, path, circles, stored.T_flange_tool, noise=noise, held=held)
+    return _compared(found, stored, rule, SIDEWAYS)
 
 
 SIDEWAYS, EVERY_WAY = np.diag([1.0, 1.0, 0.0]), np.eye(3)  # what a comparison looks at, tool axes
@@ -115,17 +110,17 @@ SIDEWAYS, EVERY_WAY = np.diag([1.0, 1.0, 0.0]), np.eye(3)  # what a comparison l
 
 def _compared(
     found: ToolEstimate,
-    T_flange_tool: Array,
+    stored: KnownTool,
     rule: CheckRule,
-    stored_covariance: Array | None,
     ways: Array,
 ) -> QuickCheck:
-    R = T_flange_tool[:3, :3]
-    deviation = ways @ R.T @ (found.tip - T_flange_tool[:3, 3])
-    spread = found.covariance[:3, :3]
-    if stored_covariance is not None:
-        spread = spread + stored_covariance
-    covariance = R.T @ spread @ R
+    R = stored.T_flange_tool[:3, :3]
+    deviation = ways @ R.T @ (found.tip - stored.T_flange_tool[:3, 3])
+    measured = replace(KnownTool.measured(found), against=stored.against)
+    spread = spread_between(measured, stored)
+    if spread is None:  # the stored tool counts as exact
+        spread = found.covariance
+    covariance = R.T @ spread[:3, :3] @ R
     size = float(np.linalg.norm(deviation))
     along = deviation / size if size > 0.0 else np.array([1.0, 0.0, 0.0])
     sigma = float(np.sqrt(along @ covariance @ along))
