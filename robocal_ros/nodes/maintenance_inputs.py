@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from robocal_ros.core.correction_told import CorrectionState, ToldCorrection
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.sessions.correction_told import CorrectionState, ToldCorrection
 from robocal_ros.sessions.maintenance.accuracy import Drift
 
 MM = 1e-3

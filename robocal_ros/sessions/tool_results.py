@@ -20,6 +20,7 @@ from robocal_ros.core.tool.judging import (
     changed_tool,
     judge_healthy,
     judge_tool,
+    spread_between,
 )
 from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
 from robocal_ros.sessions.events import Command, Outcome
@@ -166,9 +167,7 @@ class ToolResults:
         measures = changed_tool(healthy.T_flange_tool, taught, tool).T_flange_tool
         if tool.against is not None and np.array_equal(tool.against, healthy.T_flange_tool):
             return replace(tool, T_flange_tool=measures)
-        if tool.covariance is None or healthy.covariance is None:
-            return KnownTool(measures)
-        return KnownTool(measures, tool.covariance + healthy.covariance)
+        return KnownTool(measures, spread_between(tool, healthy))  # of two healthy runs: whole
 
     def _in_force(self) -> KnownTool:
         """The tool in force, the taught one as no change against the healthy tool's run."""

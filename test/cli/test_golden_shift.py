@@ -74,7 +74,7 @@ def test_no_gap_is_overrun_and_nothing_is_refused(shift):
     assert [one.cycle for one in record.passes] == [0, 1, 2]
     assert record.refused == []
     assert record.drive_faults == 0
-    assert 0.5 < record.peak_share < 1.0  # counted at all, and within the drives' speed
+    assert 0.0 < record.peak_share < 1.0  # counted at all, and within the drives' speed
 
 
 @pytest.mark.parametrize("node", SCHEMAS)

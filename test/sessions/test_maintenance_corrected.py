@@ -15,9 +15,9 @@ from maintenance_cell import (
     proposed,
 )
 
-from robocal_ros.core.correction_told import CorrectionState, ToldCorrection
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.sessions.correction_told import CorrectionState, ToldCorrection
 from robocal_ros.sessions.maintenance import AcceptBounds
 
 SILENT_S = 5.0

@@ -38,6 +38,7 @@ class Robot:
         config = ThermalConfig(sigma_m=NOISE_M, **work)
         self.session = ThermalSession(self.nominal, self.history, config, "test")
         self.shift, self.T_sensor = Shift(self.nominal.joint_names), STILL
+        self.known_m = 0.0  # how well the model in force is known
         bounds = config_of(home=self.q[0], poses=self.q[1:], T_flange_tool=TAUGHT)
         self.decider = Decider(self.nominal, self.history, bounds)
 
@@ -83,7 +84,7 @@ def robot(tmp_path) -> Robot:
     """After a shift: its model is in force."""
     made = Robot(tmp_path)
     assert made.capture(0.0, 0.0, rounds=3).done
-    made.work()
+    made.known_m = known_m(made.work())
     return made
 
 
@@ -102,15 +103,15 @@ def test_a_robot_that_cooled_has_not_yesterdays_drift(robot, T_sensor):
     assert "the robot is cold" in captured.message
     told = robot.session.accuracy(robot.session.newest_joints_ns)
     assert told.level is AccuracyLevel.DEGRADED
-    assert told.error.rms_m == pytest.approx(drift_m, rel=0.05)
+    assert told.error.rms_m >= drift_m
     found = robot.work(0.0, 0.1)
     assert robot.off_m(0.0) < known_m(found)
     told = robot.session.accuracy(robot.session.newest_joints_ns)
-    assert told.error.rms_m < 0.5 * drift_m
+    assert told.level is AccuracyLevel.OK
+    assert told.error.rms_m < drift_m
 
 
 def test_a_warm_robot_keeps_its_drift_when_the_sensor_was_knocked(robot):
-    drift_m = robot.off_m(0.0)
     robot.T_sensor = KNOCK
     assert robot.visit(events.IDENTIFY, KELVIN, 0.1).status is Code.SENSOR_OR_ROBOT_MOVED
     captured = robot.capture(KELVIN, 0.1, rounds=3)
@@ -119,7 +120,7 @@ def test_a_warm_robot_keeps_its_drift_when_the_sensor_was_knocked(robot):
     assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.session.arm.mdh)
     found = robot.visit(events.IDENTIFY, KELVIN, 0.5)
     assert found.status is Code.NO_SIGNIFICANT_GAIN, found.message
-    assert robot.off_m(KELVIN) < 0.2 * drift_m
+    assert robot.off_m(KELVIN) < robot.known_m
     captured = robot.capture(0.0, NIGHT_H, rounds=3)  # against the warm reference
     assert "the robot is cold" in captured.message
     assert np.array_equal(robot.session.reference.cell.arm.mdh, robot.nominal.mdh)
@@ -163,7 +164,7 @@ def test_the_bound_does_not_creep_over_five_mornings(robot):
         robot.work(0.0, 0.1)
         found = robot.work(KELVIN, 2.0)
         shift_m = robot.decider.thermal_shift_m(found.calibration_id)
-        assert shift_m == pytest.approx(robot.shift_m(KELVIN), rel=0.2)
+        assert shift_m == pytest.approx(robot.shift_m(KELVIN), abs=known_m(found))
         assert robot.off_m(KELVIN) < known_m(found)
 
 
@@ -173,7 +174,7 @@ def test_the_bound_counts_what_a_warm_reference_holds(robot):
         assert robot.capture(kelvin - 5.0, 0.1, rounds=3).done
         found = robot.work(kelvin, 1.0)
         shift_m = robot.decider.thermal_shift_m(found.calibration_id)
-        assert shift_m == pytest.approx(robot.shift_m(kelvin), rel=0.2)
+        assert shift_m == pytest.approx(robot.shift_m(kelvin), abs=known_m(found))
 
 
 @pytest.mark.parametrize(("kelvin", "after_h"), [(0.0, NIGHT_H), (KELVIN, 0.1)])

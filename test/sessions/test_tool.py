@@ -109,6 +109,22 @@ def test_a_healthy_tool_is_said_to_be_the_taught_one(history):
     assert driver.measure().status is Code.NO_SIGNIFICANT_GAIN
 
 
+def test_a_check_counts_a_healthy_run_that_was_made_anew_since(history):
+    """It does not cancel against that of the tool in force: the check knows less."""
+    driver = driver_of(history, TAUGHT, noisy_cell())
+    assert driver.measure("reference").done
+    driver.program.tool = RoundTool.cylinder(TRUTH, 0.0025)
+    bent_one = driver.measure()
+    assert driver.command(Command(ACCEPT, {"id": bent_one.calibration_id, "by": "me"})).done
+    before = driver.measure("quick")
+    driver.program.tool = RoundTool.cylinder(TAUGHT, 0.0025)
+    assert driver.measure("reference").done
+    driver.program.tool = RoundTool.cylinder(TRUTH, 0.0025)
+    after = driver.measure("quick")
+    assert [one.document["answer"] for one in (before, after)] == ["pass", "pass"]
+    assert after.document["sigma_mm"] > before.document["sigma_mm"]
+
+
 def test_the_healthy_tool_takes_the_robots_absolute_error_away(history):
     """The laser is believed 0.4 mm from where it is: the change of the tool does not show it."""
     cell = noisy_cell()

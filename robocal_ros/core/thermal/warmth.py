@@ -23,9 +23,8 @@ from robocal_ros.core.thermal.spots import ColdSpots
 
 Array = NDArray[np.float64]
 
-LIKELIER = (
-    1000.0  # noise makes the wrong answer so much likelier in one case of as many (Wald 1945)
-)
+# Noise makes the wrong answer so much likelier in one case of as many (Wald 1945).
+LIKELIER = 1000.0
 MOST_LEFT = 0.25  # share of the drift that an answer may leave, to be missing in all later models
 FALSE_ALARM = 0.001  # chance that a set-up that stands still looks moved
 

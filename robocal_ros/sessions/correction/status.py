@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.correction_told import CorrectionState
 from robocal_ros.core.joint_correction.bounds import Policy, Survey
 from robocal_ros.core.joint_correction.refusals import Reason
+from robocal_ros.sessions.correction_told import CorrectionState
 
 Array = NDArray[np.float64]
 

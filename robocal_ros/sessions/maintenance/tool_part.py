@@ -49,7 +49,6 @@ class ToolPart:
         self._decided, self._unsure = decided, unsure
         self._measuring = ToolMeasuring(hands, decider, memory, drift)
         self._late = False  # nothing but the time for its check was against the last candidate
-        self.wall_ns = 0
 
     @property
     def outcome(self) -> ToolOutcome:
@@ -58,14 +57,14 @@ class ToolPart:
 
     def at(self, wall_ns: int) -> None:
         """Tell the time, for what is kept."""
-        self.wall_ns = self._measuring.wall_ns = wall_ns
+        self._measuring.wall_ns = wall_ns
 
     def wants(self) -> str:
         """The measurement that is due: FULL or QUICK; empty: none."""
         record, config = self._memory.tool, self._hands.config
         if config.T_base_laser is None or self._decider.newest(TOOL):
             return ""
-        known = 0 < record.wall_ns <= self.wall_ns
+        known = 0 < record.wall_ns <= self._measuring.wall_ns
         known = known and record.revision == self._decider.revision(TOOL)
         known = known and record.thermal_id == self._decider.thermal_id()
         if known and record.answer in ("recalibrate", "cannot tell"):
@@ -141,7 +140,7 @@ class ToolPart:
         outcome, self._late = self.outcome, False
         number = outcome.candidate_id
         found = yield from settled(
-            self._hands, self._decider, TOOL, number, self._doubt, self.wall_ns
+            self._hands, self._decider, TOOL, number, self._doubt, self._measuring.wall_ns
         )
         self._decided(found)
         if is_accepted(found):
@@ -187,7 +186,7 @@ class ToolPart:
             words = "the accepted tool failed its check and is no longer in force"
             return Outcome(Command(ROLLBACK, {}), Code.ACCEPT, words, repeated=True)
         why, revision = "its check failed", self._measuring.revision
-        return self._decider.roll_back(TOOL, revision, BY, why, self.wall_ns)
+        return self._decider.roll_back(TOOL, revision, BY, why, self._measuring.wall_ns)
 
     def _took_back(self, back: Outcome) -> None:
         """Of the tool that is back nothing is known: two measurements contradict each other."""
@@ -207,4 +206,4 @@ class ToolPart:
         self.outcome.fault = words
 
     def _age_s(self, wall_ns: int) -> float:
-        return (self.wall_ns - wall_ns) / NS
+        return (self._measuring.wall_ns - wall_ns) / NS
