@@ -1,18 +1,20 @@
 """Damped Gauss-Newton on a manifold, robust or plain, and the test of each sample."""
 
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.freedom import Freedom, require_told
+from robocal_ros.core.loss import Loss, Problem, Run, information_of
 
 Array = NDArray[np.float64]
 S = TypeVar("S")
 
 FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
 MOST_ITERATIONS = 50
+OVERSHOT = 0.5  # slope behind a step, of that before it: then whole steps take too many to settle
 DAMPINGS = (0.0, *(10.0**power for power in range(-4, 7)))
 SOUND_FIT = 0.999  # residuals beyond this quantile say that given sigmas are too small
 CLEAR_STRETCH = 1.6  # beyond the scatter of a median of six samples
@@ -21,43 +23,11 @@ FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
 SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
 
 
-class Problem(Protocol[S]):
-    """Residuals of m samples with c components each, linearised at a state."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names (k) of the increments, for reports."""
-
-    def linearise(self, state: S) -> tuple[Array, Array]:
-        """Residual (m, c), prediction minus measurement over sigma, and Jacobian (m, c, k)."""
-
-    def retract(self, state: S, step: Array) -> S:
-        """Move the state by an increment (k,)."""
-
-    @property
-    def scale_components(self) -> int:
-        """How many of the c components tell the noise when it is unknown (the first ones)."""
-
-    def deviation(self, state: S) -> Array:
-        """Distance (k,) of the state from the prior's mean; zero where the prior is flat."""
-
-
 def chi2_quantile(probability: float, dof: float) -> float:
     """Quantile of the chi-square distribution."""
     from scipy.special import gammaincinv
 
     return float(2.0 * gammaincinv(0.5 * dof, probability))
-
-
-@dataclass(frozen=True)
-class Run(Generic[S]):
-    """Where a descent stands: the state, its residual (m, c) and Jacobian (m, c, k)."""
-
-    state: S
-    residual: Array
-    jacobian: Array
-    iterations: int
-    converged: bool
 
 
 @dataclass(frozen=True)
@@ -88,28 +58,48 @@ class Descent(Generic[S]):
         ``huber`` (m,): length of each sample's residual from which it counts linearly.
         """
         k = run.jacobian.shape[2]
-        state, residual, jacobian = run.state, run.residual, run.jacobian
-        left = self._left(jacobian, keep)  # hardly changes on the way
-        for iterations in range(run.iterations + 1, run.iterations + MOST_ITERATIONS + 1):
-            scale = self._scale(residual, keep, left, huber)
-            normal, gradient, cost = self._normal(state, residual, jacobian, keep, scale, huber)
-            step = _damped_step(normal, gradient, 0.0)
-            to_go = float(step @ normal @ step)
+        left = self._left(run.jacobian, keep)  # hardly changes on the way
+        for _ in range(MOST_ITERATIONS):
+            scale = self._scale(run.residual, keep, left, huber)
+            loss = Loss(self.problem, self.prior, keep, scale, huber)
+            information, gradient = loss.information(run), loss.gradient(run)
+            here = loss.at(run.state, run.residual)
+            step = _damped_step(information, gradient, 0.0)
+            to_go = float(step @ information @ step)
             if to_go < tolerance**2 * k:
-                near = residual + jacobian @ step  # exact enough so near
-                return Run(self.problem.retract(state, step), near, jacobian, iterations, True)
+                near = run.residual + run.jacobian @ step  # exact enough so near
+                state = self.problem.retract(run.state, step)
+                return Run(state, near, run.jacobian, run.iterations + 1, True)
             for damping in DAMPINGS:
                 if damping:
-                    step = _damped_step(normal, gradient, damping)
-                trial = self.problem.retract(state, step)
-                new_residual, new_jacobian = self.problem.linearise(trial)
-                if self._cost(trial, new_residual, keep, scale, huber) <= cost:
+                    step = _damped_step(information, gradient, damping)
+                trial = self._moved(run, step)
+                if loss.at(trial.state, trial.residual) <= here:
                     break
             else:  # no step of any length helps: trusted only where all of it is far below a sigma
-                found = to_go < FIRST_TOLERANCE**2 * k
-                return Run(state, residual, jacobian, iterations, found)
-            state, residual, jacobian = trial, new_residual, new_jacobian
-        return Run(state, residual, jacobian, iterations, False)
+                return replace(run, converged=to_go < FIRST_TOLERANCE**2 * k)
+            run = self._shortened(loss, run, trial, step, gradient)
+        return run
+
+    def _moved(self, run: Run[S], step: Array) -> Run[S]:
+        state = self.problem.retract(run.state, step)
+        return Run(state, *self.problem.linearise(state), run.iterations + 1, False)
+
+    def _shortened(
+        self, loss: Loss[S], run: Run[S], trial: Run[S], step: Array, gradient: Array
+    ) -> Run[S]:
+        """Where the step ends; short of that if the way down has long been passed there.
+
+        Residuals that curve, as those of a path through noisy readings, let Gauss-Newton's whole
+        step overshoot, by nearly twice its length for ever. The slope's zero along it is nearer.
+        """
+        ahead = -float(step @ gradient)
+        passed = float(step @ loss.gradient(trial))
+        if passed <= OVERSHOT * ahead:
+            return trial
+        shorter = self._moved(run, ahead / (ahead + passed) * step)
+        better = loss.at(shorter.state, shorter.residual) < loss.at(trial.state, trial.residual)
+        return shorter if better else trial
 
     def _scale(
         self, residual: Array, keep: NDArray[np.bool_], left: Freedom | None, huber: Array | None
@@ -192,38 +182,6 @@ class Descent(Generic[S]):
             return self.quantiles(probability)
         return np.asarray(self.sizes * fdtri(self.sizes, self.freedom, probability))
 
-    def _normal(
-        self,
-        state: S,
-        residual: Array,
-        jacobian: Array,
-        keep: NDArray[np.bool_],
-        scale: float,
-        huber: Array | None,
-    ) -> tuple[Array, Array, float]:
-        weight = np.where(keep, 1.0, 0.0)
-        if huber is not None:
-            distance = _lengths(residual)
-            weight *= np.minimum(1.0, huber * scale / np.maximum(distance, np.finfo(float).tiny))
-        J = jacobian.reshape(-1, jacobian.shape[2])
-        gradient = J.T @ (residual * weight[:, None]).ravel() / scale**2
-        gradient += self.prior @ self.problem.deviation(state)
-        information = information_of(jacobian, weight) / scale**2 + self.prior
-        return information, gradient, self._cost(state, residual, keep, scale, huber)
-
-    def _cost(
-        self,
-        state: S,
-        residual: Array,
-        keep: NDArray[np.bool_],
-        scale: float,
-        huber: Array | None,
-    ) -> float:
-        distance = _lengths(residual[keep]) / scale
-        near = distance if huber is None else np.minimum(distance, huber[keep])
-        away = self.problem.deviation(state)
-        return float(np.sum(near * (2.0 * distance - near)) + away @ self.prior @ away)
-
     def posterior(self, normal: Array, scale: float) -> Array:
         """Covariance (k, k) of the unknowns from the data's normal matrix."""
         information = normal / scale**2 + self.prior
@@ -258,25 +216,6 @@ def _found(left: Freedom, total: float) -> float:
     if left.by_prior:
         require_told(left.at(scale**2))
     return scale
-
-
-def rows_of(jacobian: Array, keep: NDArray[np.bool_]) -> Array:
-    """Rows (N, k) of the samples to keep, copied only when some are left out."""
-    used = jacobian if np.all(keep) else jacobian[keep]
-    return used.reshape(-1, jacobian.shape[2])
-
-
-def _lengths(rows: Array) -> Array:
-    return np.asarray(np.sqrt(np.einsum("mc,mc->m", rows, rows)))
-
-
-def information_of(jacobian: Array, weight: NDArray[np.float64 | np.bool_]) -> Array:
-    """Normal matrix (k, k) of a Jacobian (m, c, k) whose samples have weights (m,)."""
-    used = jacobian
-    if not np.all(weight == 1.0):
-        used = jacobian * np.sqrt(weight)[:, None, None]
-    J = used.reshape(-1, jacobian.shape[2])
-    return np.asarray(J.T @ J)
 
 
 def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:

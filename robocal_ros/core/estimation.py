@@ -12,15 +12,9 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.descent import (
-    FIRST_TOLERANCE,
-    Descent,
-    Problem,
-    Run,
-    information_of,
-    rows_of,
-)
+from robocal_ros.core.descent import FIRST_TOLERANCE, Descent
 from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.core.loss import Problem, Run, information_of, rows_of
 from robocal_ros.core.observability import Observability, describe, observability
 
 Array = NDArray[np.float64]

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from robocal_ros.core.descent import FIRST_TOLERANCE, Descent, Run
+from robocal_ros.core.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent
+from robocal_ros.core.loss import Run
 
 
 @dataclass(frozen=True)
@@ -62,3 +63,37 @@ def test_where_no_step_helps_far_away_nothing_is_found():
     held = [run for run, step in zip(found, to_go, strict=True) if step > 0.1]
     assert held
     assert not any(run.converged for run in held)
+
+
+@dataclass(frozen=True)
+class Bent:
+    """One number whose residual curves by a share of the squared slope where it is smallest."""
+
+    share: float
+
+    names = ("x",)
+    scale_components = 1
+
+    def linearise(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = state[0]
+        residual = np.array([[x], [1.0 + 0.5 * self.share * x**2]])
+        return residual, np.array([[[1.0]], [[self.share * x]]])
+
+    def retract(self, state: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return state + step
+
+    def deviation(self, state: np.ndarray) -> np.ndarray:
+        return np.zeros(1)
+
+
+@pytest.mark.parametrize("share", [0.4, 0.9, 0.99, 1.5])
+@pytest.mark.parametrize("start", [0.01, -0.5])
+def test_a_step_that_overshoots_for_ever_is_shortened(share, start):
+    """Whole steps of Gauss-Newton end at -share times where they began: 0.99 needs 500 of them."""
+    problem = Bent(share)
+    state = np.array([start])
+    begin = Run(state, *problem.linearise(state), 0, False)
+    run = Descent(problem, np.zeros((1, 1)), 0, np.full(2, 1)).run(begin, np.ones(2, dtype=bool))
+    assert run.converged
+    assert abs(run.state[0]) < STEP_TOLERANCE  # of the sigma, which is one
+    assert run.iterations < 20

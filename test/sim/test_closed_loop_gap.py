@@ -58,3 +58,12 @@ def test_a_jump_that_is_sent_is_counted(cell):
     plant.send(JointPlan(np.array([0.0, 0.008]), np.vstack([q, q + 1.0]), *np.zeros((2, 2, 6))))
     assert plant.cell.motion.faults == 1
     assert not plant.cell.moving
+
+
+@pytest.mark.parametrize("seed", [51, 65, 73])
+def test_a_healthy_tool_is_found_where_noisy_readings_bend_its_path(seed):
+    """Joint readings whose noise lets whole steps of the search overshoot for ever."""
+    nominal = load_robot("kr150_r3100")
+    with equipped(nominal, SimulatedCell(kr150_cell(nominal, seed, points=0))) as (plant, suite):
+        plant.commission()
+        assert suite.tool.current.measured_healthy is not None

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
-from robocal_ros.core.descent import Problem
 from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
 from robocal_ros.core.estimation import Estimate, solve
+from robocal_ros.core.loss import Problem
 from robocal_ros.core.observability import observability
 
 Array = NDArray[np.float64]
