@@ -50,6 +50,7 @@ SEEN_BY_CHECK: tuple[Fault, ...] = (
     "swapped_cables",
     "beam_x_dead",
     "beam_y_dead",
+    "beams_dead",
     "chatter",
     "lost_edge",
     "double_edge",

@@ -26,6 +26,7 @@ RIGHT: Mapping[Fault, Code] = {
     "beam_dirty": Code.BEAM_EDGES_WRONG,
     "beam_x_dead": Code.BEAM_EDGES_WRONG,
     "beam_y_dead": Code.BEAM_EDGES_WRONG,
+    "beams_dead": Code.BEAM_EDGES_WRONG,
     "chatter": Code.BEAM_EDGES_WRONG,
     "lost_edge": Code.BEAM_EDGES_WRONG,
     "double_edge": Code.BEAM_EDGES_WRONG,

@@ -48,7 +48,7 @@ def tool_answer(outcome: Outcome) -> Answer:
     """What a tool measurement tells the maintenance."""
     document = outcome.document
     if document is None:
-        return Answer(outcome.status, outcome.message)
+        return Answer(outcome.status, outcome.message, left_plan=outcome.left_plan)
     return Answer(
         outcome.status,
         outcome.message,

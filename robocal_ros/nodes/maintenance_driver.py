@@ -122,6 +122,7 @@ class MaintenanceDriver:
                 answer=WORDS_OF.get(result.answer, ""),
                 deviation_mm=result.deviation_mm,
                 sigma_mm=result.sigma_mm,
+                left_plan=result.left_plan,
             ),
         )
 

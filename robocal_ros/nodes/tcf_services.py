@@ -125,6 +125,7 @@ class TcfServices:
     ) -> Any:
         document = None if outcome is None else outcome.document
         result = MeasureTool.Result(success=document is not None, message=message, status=int(code))
+        result.left_plan = outcome is not None and outcome.left_plan
         if outcome is not None and document is not None:
             result.candidate_id = outcome.calibration_id
             _fill(result, document)

@@ -17,6 +17,7 @@ MEASURE_TOOL = "measure_tool"
 STEP_BEGINS = "step_begins"
 TOOL_STEP = "tool_step"
 BREAK_OFF = "break_off"
+LEFT_PLAN = "left_plan"  # argument of it: the robot was stopped because it left its plan
 START = "start"
 CAPTURE = "capture"
 SAMPLE = "sample"
@@ -75,6 +76,11 @@ class Outcome:
     samples: int = 0
     outside: bool = False
     repeated: bool = False
+
+    @property
+    def left_plan(self) -> bool:
+        """Whether the robot was stopped because it left its plan: it may be held, or hit."""
+        return bool(self.command.arguments.get(LEFT_PLAN, False))
 
     @property
     def done(self) -> bool:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, RobocalError
+from robocal_ros.core.errors import ConflictError, LimitError, RobocalError
 from robocal_ros.core.motion.cell import MotionCell
 from robocal_ros.core.motion.housing import ToolBody
 from robocal_ros.core.motion.measuring import approach, measuring
 from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.motion.stopping import stop
 from robocal_ros.sessions.driving_config import DrivingConfig
-from robocal_ros.sessions.events import BREAK_OFF, STEP_BEGINS, Command
+from robocal_ros.sessions.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
 from robocal_ros.sessions.robot_watch import RobotWatch
 from robocal_ros.sessions.tool import ToolSession
 
@@ -47,6 +47,10 @@ class StopError(RobocalError):
     def __init__(self, code: Code, message: str) -> None:
         super().__init__(message)
         self.code = code
+
+
+class LeftPlanError(LimitError):
+    """The robot is not where its plan has it: it may be held, or have hit something."""
 
 
 class ToolDriver:
@@ -151,6 +155,8 @@ class ToolDriver:
             self.disarm(why, now_s)
         try:
             self._tick(now_s)
+        except LeftPlanError as error:
+            self._fault(error.code, str(error), now_s, left_plan=True)
         except RobocalError as error:
             self._fault(error.code, str(error), now_s)
 
@@ -249,23 +255,29 @@ class ToolDriver:
             raise StopError(Code.BEAM_EDGES_WRONG, "more edges than a tool makes: look for it")
         tip_m, joint_rad = self._robot.away()
         if not self._kept(tip_m, joint_rad):
-            raise StopError(
-                Code.LIMIT_EXCEEDED,
+            raise LeftPlanError(
                 f"the robot is {tip_m * 1e3:.1f} mm and {np.degrees(joint_rad):.2f} deg away from "
                 f"its plan (allowed {self._config.deviation_m * 1e3:.1f} mm, "
-                f"{np.degrees(self._config.deviation_rad):.2f} deg)",
+                f"{np.degrees(self._config.deviation_rad):.2f} deg)"
             )
         if self._robot.overdue_s(now_s) > REST_WITHIN_S:
-            raise StopError(
-                Code.TOO_FEW_SAMPLES if self.phase is Phase.MEASURE else Code.LIMIT_EXCEEDED,
-                f"the motion ended {REST_WITHIN_S:g} s ago, but the robot is not where it ends, or "
-                "edges are missing",
-            )
+            self._stop_overdue(now_s)
+
+    def _stop_overdue(self, now_s: float) -> None:
+        """Raise why a motion that ended long ago is not over."""
+        ended = f"the motion ended {REST_WITHIN_S:g} s ago, but"
+        if self.phase is not Phase.MEASURE or not self._robot.at_end(now_s):
+            raise LeftPlanError(f"{ended} the robot does not rest where it ends")
+        missing = "edges are missing" if self._beams.total() else "no edge came"
+        raise StopError(
+            Code.BEAM_EDGES_WRONG,
+            f"{ended} {missing}: there is no tool, it is far too short, or beams are dead",
+        )
 
     def _kept(self, tip_m: float, joint_rad: float) -> bool:
         return tip_m <= self._config.deviation_m and joint_rad <= self._config.deviation_rad
 
-    def _fault(self, code: Code, reason: str, now_s: float) -> None:
+    def _fault(self, code: Code, reason: str, now_s: float, *, left_plan: bool = False) -> None:
         """Stop the robot where it moves, disarm, and end the run."""
         robot = self._robot
         moving = self.phase is not Phase.IDLE and robot.heard
@@ -274,4 +286,5 @@ class ToolDriver:
         if state is not None:
             self._send(stop(self._session.nominal, self._config.limits, *state))
         if self._session.run is not None:
-            self._ask(Command(BREAK_OFF, {"code": int(code), "reason": reason}))
+            told = {"code": int(code), "reason": reason}
+            self._ask(Command(BREAK_OFF, {**told, LEFT_PLAN: True} if left_plan else told))

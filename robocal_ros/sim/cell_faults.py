@@ -22,6 +22,7 @@ Fault = Literal[
     "beam_dirty",
     "beam_x_dead",
     "beam_y_dead",
+    "beams_dead",
     "chatter",
     "lost_edge",
     "double_edge",
@@ -58,6 +59,7 @@ NEXT_MOTION: frozenset[Fault] = frozenset(
     {
         "beam_x_dead",
         "beam_y_dead",
+        "beams_dead",
         "chatter",
         "lost_edge",
         "double_edge",
@@ -171,7 +173,7 @@ class FaultyInput:
 
     def _passed(self, edge: BeamEdge) -> list[BeamEdge]:
         faults = self._faults
-        if f"beam_{edge.beam}_dead" in faults.sizes:
+        if "beams_dead" in faults or f"beam_{edge.beam}_dead" in faults.sizes:
             return []
         self._seen += edge.beam == "y"
         second = edge.beam == "y" and self._seen == 2

@@ -48,6 +48,7 @@ class Robot:
         self.edges: list[EdgeSample] = []
         self.path: list[np.ndarray] = []
         self.silent = False
+        self.deaf = False  # no edge comes
         self.offset = np.zeros(arm.n)
 
     def closed(self, now_s: float) -> str:
@@ -68,6 +69,8 @@ class Robot:
         self.edges = [
             EdgeSample(self.ns(e.time_s), "", e.beam, e.blocked, e.sigma_s) for e in moved
         ]
+        if self.deaf:
+            self.edges.clear()
 
     def ask(self, command: Command) -> None:
         self.session.submit(command)

@@ -8,12 +8,14 @@ from maintenance_cell import (
     ARM,
     DRIVING,
     HOME,
+    KNOWN,
     LAG_S,
     LONG_S,
     POSES,
     SILENT,
     TICK_S,
     Cell,
+    bent,
     config_of,
     kinds,
     opened,
@@ -24,8 +26,10 @@ from maintenance_cell import (
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError, StorageError
 from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance.hands import Hands
+from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import Ways
 from robocal_ros.sim.joint_motion import JointMotion
 
@@ -162,6 +166,28 @@ def test_a_fault_away_from_home_is_not_acknowledged(cell):
     cell.pass_time(0.5)
     cell.session.acknowledge("me")
     assert cell.state is State.IDLE
+
+
+@pytest.mark.parametrize("mode", ["quick", "full"])
+def test_a_robot_that_left_its_plan_in_a_tool_run_is_not_driven_on(cell, mode):
+    """It may be held, or have hit something; only a person knows."""
+    held = Answer(Code.LIMIT_EXCEEDED, "away from its plan", left_plan=True)
+    cell.check, cell.full = (held if mode == "quick" else bent()), lambda _: held
+    cell.run("c1", LONG_S)
+    assert cell.finish().code is Code.LIMIT_EXCEEDED
+    over(cell, fault=True)
+    status = cell.session.status(cell.now_s)
+    assert (cell.state, status.fault_code) == (State.FAULT, Code.LIMIT_EXCEEDED)
+    assert held.message in status.fault
+    asked = kinds(cell)
+    assert "Move" not in asked[len(asked) - asked[::-1].index("Measure") :]
+    cell.motion = JointMotion(HOME)  # brought there by hand
+    cell.pass_time(0.5)
+    cell.session.acknowledge("me")
+    cell.session.drift(KNOWN, cell.now_s)
+    said = cell.session.accuracy(cell.now_s, cell.wall_ns)
+    assert said.level > AccuracyLevel.DUE
+    assert held.message in said.reason
 
 
 def test_a_tool_run_that_ends_beside_home_is_brought_to_it(cell):

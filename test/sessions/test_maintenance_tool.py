@@ -22,9 +22,11 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.sessions.events import ACCEPT, ROLLBACK
+from robocal_ros.sessions.maintenance.requests import Answer
 
 TOO_SHORT_FOR_FULL_S = 33.0
 DAY_NS = 86_400 * 10**9
+WITHOUT_WAY = Answer(Code.LIMIT_EXCEEDED, "the housing would be hit")
 OTHER_MODEL = "another thermal model is in force than it was checked with: check it"
 
 
@@ -47,20 +49,23 @@ def test_a_check_in_the_future_is_none(cell, monkeypatch):
     assert level(cell) is AccuracyLevel.OK
 
 
+@pytest.mark.parametrize("told", [wrong_tool(), WITHOUT_WAY])
 @pytest.mark.parametrize("mode", ["quick", "full"])
-def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(cell, monkeypatch, mode):
+def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(
+    cell, monkeypatch, mode, told
+):
     cell.run("c1", LONG_S)
     cell.finish()
     assert level(cell) is AccuracyLevel.OK
-    cell.check, cell.full = (wrong_tool() if mode == "quick" else bent()), lambda _: wrong_tool()
+    cell.check, cell.full = (told if mode == "quick" else bent()), lambda _: told
     later_ns = round(cell.config.check_every_s * 1e9)
     monkeypatch.setattr(maintenance_cell, "WALL_NS", maintenance_cell.WALL_NS + later_ns)
     cell.run("c2", LONG_S)
     result = cell.finish()
-    assert (result.tool_code, result.complete) == (Code.WRONG_TOOL, False)
+    assert (result.tool_code, result.complete) == (told.code, False)
     assert result.left == (f"tool measurement ({mode})",)
     assert level(cell) is AccuracyLevel.DEGRADED
-    assert wrong_tool().message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
+    assert told.message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
     cell.restart()
     assert level(cell) is AccuracyLevel.DEGRADED
     cell.pass_time(0.3)

@@ -203,7 +203,34 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
     robot.run(0.5)
     assert robot.sent == []
     assert robot.outcomes[-1].status is Code.LIMIT_EXCEEDED
+    assert not robot.outcomes[-1].left_plan
     assert "housing" in robot.driver.told
+
+
+@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
+def test_a_robot_that_is_held_has_left_its_plan(robot, phase):
+    driving(robot, phase)
+    robot.motion = JointMotion(robot.q)
+    robot.run(5.0, until=lambda: not robot.driver.armed)
+    last = robot.outcomes[-1]
+    assert (last.status, last.left_plan) == (Code.LIMIT_EXCEEDED, True)
+    assert "away from its plan" in last.message
+
+
+@pytest.mark.parametrize("dead", ["tool", "beams"])
+def test_a_step_without_an_edge_is_told_as_that(history, dead):
+    """Nothing is mounted that could break a beam, or nothing tells that it is broken."""
+    robot = Robot(history, bent(TAUGHT, TAUGHT[:3, 2] * -0.03, np.zeros(3)))
+    if dead == "beams":
+        robot = Robot(history)
+        robot.deaf = True
+    robot.run(0.4)
+    robot.driver.arm(robot.now_s)
+    robot.measure()
+    robot.run(30.0, until=lambda: not robot.driver.armed)
+    last = robot.outcomes[-1]
+    assert (last.status, last.left_plan) == (Code.BEAM_EDGES_WRONG, False)
+    assert "no edge came" in last.message
 
 
 def test_a_tool_bent_beyond_the_circle_stops_the_run(history):

@@ -161,7 +161,13 @@ def test_the_seed_tells_everything_whenever_the_cell_is_asked():
 
 @pytest.mark.parametrize(
     ("fault", "x", "y"),
-    [("beam_x_dead", 0, 4), ("beam_y_dead", 4, 0), ("lost_edge", 4, 3), ("double_edge", 4, 5)],
+    [
+        ("beam_x_dead", 0, 4),
+        ("beam_y_dead", 4, 0),
+        ("beams_dead", 0, 0),
+        ("lost_edge", 4, 3),
+        ("double_edge", 4, 5),
+    ],
 )
 def test_faults_of_the_input_from_the_next_motion_on(fault, x, y):
     cell = SimulatedCell(plan_of())

@@ -54,6 +54,7 @@ TOUCHED = {
     "beam_dirty": {"edges"},
     "beam_x_dead": {"edges"},
     "beam_y_dead": {"edges"},
+    "beams_dead": {"edges"},
     "chatter": {"edges"},
     "lost_edge": {"edges"},
     "double_edge": {"edges"},

@@ -81,6 +81,7 @@ class Answer:
     has_result : whether a measurement reached one.
     answer : of a quick check: "pass", "recalibrate", "cannot tell".
     deviation_mm, sigma_mm : of the tip from the tool in force.
+    left_plan : the robot was stopped because it left its plan.
     absent : the request reached nobody, as the node is not there.
     """
 
@@ -92,6 +93,7 @@ class Answer:
     answer: str = ""
     deviation_mm: float = 0.0
     sigma_mm: float = 0.0
+    left_plan: bool = False
     absent: bool = False
     visited: int | None = None
 

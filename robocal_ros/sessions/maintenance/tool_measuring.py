@@ -10,11 +10,18 @@ from robocal_ros.sessions.maintenance.asking import Script, SilentError
 from robocal_ros.sessions.maintenance.deciding import Decider
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import Memory, ToolRecord
+from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.tool_driving import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
-FAILED = (Code.WRONG_TOOL, Code.CLOCK_WRONG, Code.BEAM_EDGES_WRONG, Code.RESIDUAL_TOO_LARGE)
+FAILED = (  # without a result they say that something is wrong with the tool, or its measurement
+    Code.WRONG_TOOL,
+    Code.CLOCK_WRONG,
+    Code.BEAM_EDGES_WRONG,
+    Code.RESIDUAL_TOO_LARGE,
+    Code.LIMIT_EXCEEDED,
+)
 
 
 @dataclass
@@ -89,7 +96,13 @@ class ToolMeasuring:
         self.revision = self.wall_ns = 0
 
     def measured(self, mode: str, cycle_id: str) -> Script[Answer | None]:
-        """The answer; None where it did not fit, or gave no result for the tool in force."""
+        """The answer; None where it did not fit, or gave no result for the tool in force.
+
+        Raises
+        ------
+        FaultError
+            When the robot was stopped because it left its plan, or as `Hands` do.
+        """
         hands, times, outcome = self._hands, self._hands.config.times, self.outcome
         yield  # what was kept just before may have taken its time: the gap is looked at again
         if hands.tool.absent:
@@ -113,6 +126,8 @@ class ToolMeasuring:
         self._learn(mode, answer)
         yield from hands.disarmed()
         yield from hands.stand(STANDS_S)
+        if answer.left_plan:  # held, or it hit something: nobody drives it on unseen
+            raise FaultError(answer.code, answer.message)
         yield from hands.go_home()
         return self._credited(mode, answer, before)
 
