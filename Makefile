@@ -29,13 +29,13 @@ endif
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 14
 
-demo: setup  ## a simulated shift through the live nodes, with a report in out/
+demo: setup  ## a simulated cell in closed loop through the live nodes, report in out/report/
 	$(ROS) python bags/demo.py
 
-# Live cells of up to six processes come first, one after the other; then the other node tests, two at
-# a time. Both mostly wait: what all others compute fills their pauses, and gives way at once.
-# What failed is shown last. One of the two at a time that failed is run once again, as the other may
-# have starved it, and named; never one whose examples chance picks.
+# Live cells of up to six processes come first, one after the other; then the other node tests, three
+# at a time. Both mostly wait: what all others compute fills their pauses, and gives way at once.
+# What failed is shown last. One of the three at a time that failed is run once again, as the others
+# may have starved it, and named; never one whose examples chance picks.
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
 PYTEST := $(ROS) python -m pytest -p no:cacheprovider
 test: setup  ## all tests; TESTS="test/core -k tool" for some

@@ -90,8 +90,8 @@ class Descent(Generic[S]):
     ) -> Run[S]:
         """Where the step ends; short of that if the way down has long been passed there.
 
-        Residuals that curve, as those of a path through noisy readings, let Gauss-Newton's whole
-        step overshoot, by nearly twice its length for ever. The slope's zero along it is nearer.
+        Residuals that curve, as those of a path through noisy readings, let Gauss-Newton's steps
+        go nearly twice as far as they should, for ever. The slope's zero along a step is nearer.
         """
         ahead = -float(step @ gradient)
         passed = float(step @ loss.gradient(trial))

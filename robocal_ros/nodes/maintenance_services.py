@@ -142,7 +142,7 @@ class MaintenanceServices:
         result = session.result(request.cycle_id) if request.cycle_id else status.last
         response.result = result_message(result)
         if request.cycle_id and result is None:
-            raise InputError(f"cycle '{request.cycle_id}' is not known: it never ran")
+            raise InputError(f"cycle '{request.cycle_id}' is not known: it never ran, or long ago")
         response.success, response.status = True, int(Code.ACCEPT)
         response.message = status.fault or status.doing or status.state.name
         if status.trouble:

@@ -275,7 +275,7 @@ def test_a_pose_takes_its_worst_case_and_no_more(history):
     """The way, a rest there, the measurement, a rest before the next, which does not fit, home."""
     cell = Cell(history, config_of(poses=POSES[:2], T_base_laser=None), services={"sensor": SILENT})
     cell.open_gap()
-    cell.run("c1", cell.session.worst_cases()["one measuring pose"] + 2.0)
+    cell.run("c1", cell.session.worst_cases()["the first measuring pose"])
     sent: list[tuple[float, ask.Move]] = []
     while cell.state is State.RUNNING:
         if sent:

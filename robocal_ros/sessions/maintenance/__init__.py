@@ -2,6 +2,7 @@
 
 session         what is driven: heartbeats, readings, calls and answers in, requests out
 requests        what it asks of its driver, and what is answered
+asking          requests that wait for answers, from tick to tick
 config          settings, bounds, and how long each part may take
 conductor       plays a run's script, stops everything where something is odd
 run             the script of a run: thermal, tool, decisions
@@ -9,6 +10,7 @@ thermal_part    visit the measuring poses, end the cycle
 tool_part       quick check, full measurement, verification
 tool_measuring  one measurement of the tool, and what it tells
 hands           what a script does with robot and nodes
+disarming       whether the tool's node may move the robot
 mover           one motion at a time, supervised
 ways            the ways that the robot may take
 deciding        accept, reject, roll back; what needs no person

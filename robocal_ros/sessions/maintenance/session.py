@@ -242,7 +242,7 @@ class MaintenanceSession:
     def worst_cases(self) -> dict[str, float]:
         """How long each step may take at the most, its way home included, s."""
         thermal = ThermalPart(self._hands, self._book)
-        found = {"one measuring pose": thermal.worst_s()} if self.ways.count else {}
+        found = {"the first measuring pose": thermal.worst_s()} if self.ways.count else {}
         if self.config.T_base_laser is not None:
             worst_s = self._hands.tool_worst_s
             found |= {f"tool measurement ({mode})": worst_s(mode) for mode in (QUICK, FULL)}

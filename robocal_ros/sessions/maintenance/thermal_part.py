@@ -53,10 +53,10 @@ class ThermalPart:
         self._times = hands.config.times
 
     def worst_s(self) -> float:
-        """The longest step with its way home, before it is planned: one pose."""
+        """The longest first step of a gap, before it is planned: one pose, with its way home."""
         ways = self._hands.ways
         homes = max((ways.home_s(i) for i in range(1, ways.count + 1)), default=0.0)
-        return self._step_s(ways.longest_line_s(), homes)
+        return self._first_s(ways.longest_line_s(), homes)
 
     def drop_old(self) -> str:
         """Give up an open cycle whose last pose is too old, and say so; empty: there is none."""
@@ -83,7 +83,8 @@ class ThermalPart:
         hands, book = self._hands, self._book
         todo = [i for i in range(1, hands.ways.count + 1) if i not in book.visited]
         if todo:
-            if not hands.fits(2.0 * self._times.answer_s + self._first_s(todo[0])):
+            way_s = hands.ways.to((HOME, HOME), hands.config.home, todo[0]).plan.duration_s
+            if not hands.fits(self._first_s(way_s, hands.ways.home_s(todo[0]))):
                 return None, f"{MEASUREMENT}, {len(todo)} poses"
             begun = yield from self._begin(cycle_id)
             if not begun.done:
@@ -173,10 +174,9 @@ class ThermalPart:
         book.moved = answer.code is Code.SENSOR_OR_ROBOT_MOVED
         return answer
 
-    def _first_s(self, pose: int) -> float:
-        ways, near = self._hands.ways, self._hands.config.home
-        route = ways.to((HOME, HOME), near, pose)
-        return STANDS_S + self._step_s(route.plan.duration_s, ways.home_s(pose))
+    def _first_s(self, way_s: float, home_s: float) -> float:
+        """The cycle begins before it."""
+        return 2.0 * self._times.answer_s + STANDS_S + self._step_s(way_s, home_s)
 
     def _step_s(self, way_s: float, home_s: float) -> float:
         """At the most: a rest at each arrival, before the measurement and after it.
