@@ -20,6 +20,8 @@ class Recorded:
 
     topic: str
     msgtype: str
+    reliable: bool
+    latched: bool
     messages: int = 0
     subscription: Any = None
 
@@ -55,7 +57,11 @@ class RecordedTopics:
         return [t for t in self._wanted if t not in self.found and t not in self.unknown]
 
     def look(self) -> None:
-        """Subscribe what is offered by now."""
+        """Subscribe what is offered by now; afresh, where less is offered than was asked for."""
+        for topic, recorded in list(self.found.items()):
+            reliable, latched = self._offered(topic)
+            if (recorded.reliable and not reliable) or (recorded.latched and not latched):
+                self._drop(topic)
         if not (missing := self.missing):
             return
         offered = dict(self._node.get_topic_names_and_types())
@@ -70,16 +76,14 @@ class RecordedTopics:
         except InputError as error:
             self.unknown[topic] = str(error)
             return
-        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
-        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
-        latched = all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+        reliable, latched = self._offered(topic)
         profile = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
             depth=DEPTH,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        recorded = self.found[topic] = Recorded(topic, msgtype)
+        recorded = self.found[topic] = Recorded(topic, msgtype, reliable, latched)
         if latched:
             self.latched.add(topic)
 
@@ -91,14 +95,22 @@ class RecordedTopics:
             kind, topic, receive, profile, raw=True
         )
 
+    def _offered(self, topic: str) -> tuple[bool, bool]:
+        """Whether all its publishers are reliable, and whether all are latched."""
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
+        reliable = all(o.reliability == ReliabilityPolicy.RELIABLE for o in offers)
+        return reliable, all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
+
+    def _drop(self, topic: str) -> None:
+        self._node.destroy_subscription(self.found.pop(topic).subscription)
+
     def renew_latched(self) -> None:
         """Subscribe latched topics afresh: their publishers send what is in force once more."""
         for topic in self.latched & set(self.found):
-            self._node.destroy_subscription(self.found.pop(topic).subscription)
+            self._drop(topic)
         self.look()
 
     def close(self) -> None:
         """Take the subscriptions down."""
-        for recorded in self.found.values():
-            self._node.destroy_subscription(recorded.subscription)
-        self.found.clear()
+        for topic in list(self.found):
+            self._drop(topic)

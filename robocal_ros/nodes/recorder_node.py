@@ -80,6 +80,11 @@ SETTINGS = (
 )
 
 
+def utc() -> str:
+    """The time now."""
+    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime())
+
+
 class RecorderNode(HouseNode):
     """Writes one recording after another; the oldest are deleted."""
 
@@ -104,7 +109,7 @@ class RecorderNode(HouseNode):
 
     def activate(self) -> None:
         """Begin a recording."""
-        self._fault, self._lost, self._deleted = "", 0, 0
+        self._fault, self._lost, self._lost_since, self._deleted = "", 0, "", 0
         self._again_s: float | None = None  # when a recording that broke off is begun again
         self._topics = RecordedTopics(self, self.settings["topics"], self._take)
         self._topics.look()
@@ -126,6 +131,7 @@ class RecorderNode(HouseNode):
             recording.write(recorded.topic, recorded.msgtype, data, self.now_ns())
         except StorageError as error:
             self._lost += 1
+            self._lost_since = self._lost_since or utc()
             self._break_off(error)
 
     def _begin(self) -> BagRecording:
@@ -200,7 +206,7 @@ class RecorderNode(HouseNode):
         recording = self._recording
         if recording is None:
             raise ConflictError("nothing is being recorded: there is nothing to keep")
-        keep(recording.folder, f"kept at {time.strftime('%Y-%m-%d %H:%M:%SZ', time.gmtime())}")
+        keep(recording.folder, f"kept at {utc()}")
         response.success = True
         response.message = trigger_text(0, Code.ACCEPT, f"{recording.folder} is kept for good")
         return response
@@ -217,8 +223,10 @@ class RecorderNode(HouseNode):
     def health(self) -> Health:
         """Tell what is recorded, and what is not."""
         health, topics, recording = Health(), self._topics, self._recording
+        if self._lost:
+            health.worsen(WARN, f"{self._lost} messages since {self._lost_since} are not recorded")
         if self._fault:
-            health.worsen(ERROR, f"{self._fault}; {self._lost} messages are not recorded")
+            health.worsen(ERROR, self._fault)
         if topics is None:
             return health
         if topics.unknown:
@@ -234,6 +242,7 @@ class RecorderNode(HouseNode):
             "messages": 0 if recording is None else recording.messages,
             "not there": ", ".join(topics.missing),
             "recordings deleted": self._deleted,
+            "messages not recorded": self._lost,
         }
         return health
 

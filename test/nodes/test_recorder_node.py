@@ -1,8 +1,10 @@
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
 import os
+from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from robocal_msgs.msg import SessionEvent
 from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
@@ -21,6 +23,7 @@ from robocal_ros.storage.bag_recording import KEEP, MB, recordings, size_bytes
 from robocal_ros.storage.bags import BagReader
 
 NODE = "recorder_node"
+WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 LEFT_OUT = {"/image"}  # large
 WIRED = {"/kinematic_model": "/thermal_node/model", "/tool": "/tcf_node/tool"}
 MOTION = {  # by what moves a robot
@@ -124,6 +127,48 @@ def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_
     assert set(words(folder, "/words")) <= {"again"}
     with BagReader(folder) as bag:
         assert [m.message.command for m in bag.messages(["/events"])] == commands
+
+
+def test_messages_that_were_lost_are_told_also_when_it_records_again(graph, monkeypatch):
+    """Its diagnostics are recorded too: a dispute must find the hole."""
+    monkeypatch.setattr(recorder_node, "AGAIN_S", 0.2)
+    graph.state.mkdir(exist_ok=True)
+    folder = graph.state / "rec"
+    folder.write_text("a file where the folder should be")
+    node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(folder)})
+    publisher = graph.publisher(String, "/words")
+    said(graph, publisher, String, "lost")
+    graph.spin_until(lambda: node.health().level == ERROR, "it cannot record")
+    folder.unlink()
+
+    def recorded_again() -> bool:
+        said(graph, publisher, String, "again")
+        return bool(node.health().values["messages"])
+
+    graph.spin_until(recorded_again, "it records again")
+    health = node.health()
+    assert health.level == WARN
+    assert f"{health.values['messages not recorded']} messages since 20" in health.message
+
+
+@pytest.mark.parametrize("less", [qos.SENSOR, qos.RELIABLE])
+def test_what_comes_back_with_less_than_before_is_recorded(graph, less):
+    """A driver is started anew: best effort instead of reliable, or no longer latched."""
+    node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(graph.state / "rec")})
+    before = qos.RELIABLE if less is qos.SENSOR else qos.LATCHED
+    first = graph.probe.create_publisher(String, "/words", qos.own(before))
+    count: dict[str, int] = {}
+
+    def recorded(by: Any) -> bool:
+        said(graph, by, String, "words")
+        return bool(node.health().values["messages"] > count.setdefault("before", 0))
+
+    graph.spin_until(lambda: recorded(first), "the first is recorded")
+    graph.probe.destroy_publisher(first)
+    graph.spin_for(0.5)
+    count["before"] = node.health().values["messages"]
+    second = graph.probe.create_publisher(String, "/words", qos.own(less))
+    graph.spin_until(lambda: recorded(second), "the second is recorded")
 
 
 KEEP_MB = 2.0
