@@ -42,7 +42,7 @@ setup(
             "tcf_node = robocal_ros.nodes.tcf_node:main",
             "hand_eye_node = robocal_ros.nodes.hand_eye_node:main",
             "thermal_node = robocal_ros.nodes.thermal_node:main",
-            "joint_correction_node = robocal_ros.nodes.joint_correction_node:main",
+            "joint_correction_node = robocal_ros.correction.node:main",
             "cell_sim_node = robocal_ros.nodes.cell_sim_node:main",
             "maintenance_node = robocal_ros.nodes.maintenance_node:main",
             "replay_node = robocal_ros.nodes.replay_node:main",

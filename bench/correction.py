@@ -15,17 +15,14 @@ from numpy.typing import NDArray
 from bench.speed import medians, pinocchio_model
 from bench.tables import Cell, Goal, Table
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import JointCorrection, pack_model, solution
-from robocal_ros.core.joint_correction.room import work_size
-from robocal_ros.core.joint_correction.staged import StagedCorrection
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.kinematics.universal_robots import link_transform
-from robocal_ros.sessions.correction import (
-    CorrectionSession,
-    JointCommand,
-    OfferedModel,
-    TrajectoryCommand,
-)
+from robocal_ros.correction import solution
+from robocal_ros.correction.inputs import JointCommand, OfferedModel, TrajectoryCommand
+from robocal_ros.correction.joint_correction import JointCorrection, pack_model
+from robocal_ros.correction.room import work_size
+from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]

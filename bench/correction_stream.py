@@ -162,7 +162,7 @@ def _correct(probe: "Probe", stream: "Stream", arm: Any) -> None:
     from robocal_msgs.msg import KinematicModel
 
     from bench.stream_probe import drifted, offered, path
-    from robocal_ros.core.joint_correction import JointCorrection
+    from robocal_ros.correction.joint_correction import JointCorrection
 
     actual = drifted(arm, DRIFT_M)
     models = probe.model_publisher(stream.subject)

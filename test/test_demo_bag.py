@@ -10,8 +10,8 @@ import pytest
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of
-from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.sessions.found_cycles import automatic_commands
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.replay import feed, replay

@@ -11,8 +11,8 @@ import pytest
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import arm_of
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.point_clouds import cloud_points
+from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.inputs import take_message

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from bench.closed_loop.words import tool_answer
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession

@@ -13,13 +13,13 @@ from bench.closed_loop import setting
 from bench.closed_loop.suite import Clock, Record, Suite, unrecorded
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.joint_correction.refusals import RefusedError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.motion.travel import joint_way
 from robocal_ros.core.thermal.process_learning import LearnedProcess
+from robocal_ros.correction.inputs import TrajectoryCommand
+from robocal_ros.correction.refusals import RefusedError
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.travel import joint_way
 from robocal_ros.sessions import events
-from robocal_ros.sessions.correction import TrajectoryCommand
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import CycleResult
 from robocal_ros.sessions.maintenance.ways import STATION

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from robocal_ros.core.motion.housing import Housing
-from robocal_ros.core.motion.limits import MotionLimits
 from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.sessions.maintenance import AcceptBounds, MaintenanceConfig, Times
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of

@@ -13,18 +13,19 @@ from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
 from robocal_ros import __version__
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import MEASURED_POINT, SPHERE_CLOUD, JointSample, PointSample
 from robocal_ros.core.thermal.process_documents import process_document
 from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.motion.gap import Gap
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.sessions import events
-from robocal_ros.sessions.correction import CorrectionSession, JointCommand
 from robocal_ros.sessions.drift_following import EXPECTED
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.maintenance import MaintenanceSession
 from robocal_ros.sessions.maintenance.accuracy import Accuracy
 from robocal_ros.sessions.observations import JOINTS

@@ -28,3 +28,4 @@ class Code(IntEnum):
     BEAM_EDGES_WRONG = 15
     WRONG_TOOL = 16
     CLOCK_WRONG = 17
+    STATION_MOVED = 18

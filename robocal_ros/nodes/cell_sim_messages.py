@@ -15,8 +15,8 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.crossed_model import StepKind
 from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.correction.inputs import TrajectoryCommand
 from robocal_ros.nodes.conversions import header
-from robocal_ros.sessions.correction.inputs import TrajectoryCommand
 
 Array = NDArray[np.float64]
 

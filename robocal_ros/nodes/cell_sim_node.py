@@ -9,6 +9,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.correction.inputs import trajectory_command
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.cell_sim_messages import in_joint_order, planned_step
@@ -23,7 +24,6 @@ from robocal_ros.nodes.cell_sim_settings import (
 from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.endpoints import LOG_EVERY_S
 from robocal_ros.nodes.run import run
-from robocal_ros.sessions.correction.inputs import trajectory_command
 from robocal_ros.sim.cell import TICK_S, SimulatedCell
 from robocal_ros.sim.cell_plan import known_laser
 from robocal_ros.sim.kr150_cell import worked_for

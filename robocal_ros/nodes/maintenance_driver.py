@@ -12,9 +12,9 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
+from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode
-from robocal_ros.nodes.motion_settings import trajectory_message
 from robocal_ros.nodes.tcf_services import ANSWERS, MODES
 from robocal_ros.sessions.maintenance import requests as asked
 from robocal_ros.sessions.maintenance.requests import Answer

@@ -10,14 +10,14 @@ from sensor_msgs.msg import JointState, PointCloud2
 from std_msgs.msg import Bool
 
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.motion.loading import load_motion
 from robocal_ros.core.samples import joint_sample, stamp_ns
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.motion.gap_sources import GapSources
+from robocal_ros.motion.loading import load_motion
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, Health
 from robocal_ros.nodes.endpoints import NotActiveError
-from robocal_ros.nodes.gap_sources import GapSources
 from robocal_ros.nodes.history_settings import open_history, warn_without_serial
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
 from robocal_ros.nodes.maintenance_inputs import require_robot, told_correction, told_drift

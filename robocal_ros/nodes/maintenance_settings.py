@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.motion.settings import MOTION, driving_config, require_limits
 from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.joint_poses import MM, joint_poses, joints_of
-from robocal_ros.nodes.motion_settings import MOTION, driving_config, require_limits
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.pose_settings import given_pose, pose_settings
 from robocal_ros.sessions.maintenance import AcceptBounds, MaintenanceConfig, Times

@@ -8,23 +8,23 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
-from robocal_ros.nodes.gap_sources import GapSources
-from robocal_ros.nodes.motion_settings import (
+from robocal_ros.motion.gap import Gap
+from robocal_ros.motion.gap_sources import GapSources
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.settings import (
     MOTION,
     NS,
     driving_config,
     require_limits,
     trajectory_message,
 )
+from robocal_ros.nodes import qos
+from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
 from robocal_ros.nodes.parameters import Setting, length
 from robocal_ros.nodes.steady_clock import SteadyClock
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import ToolDriver
 

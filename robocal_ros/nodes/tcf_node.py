@@ -11,8 +11,9 @@ from sensor_msgs.msg import JointState
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.motion.loading import load_motion
 from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.motion.loading import load_motion
+from robocal_ros.motion.silence import Silence
 from robocal_ros.nodes import qos, tcf_motion
 from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
@@ -34,7 +35,6 @@ from robocal_ros.sessions.events import (
     Outcome,
 )
 from robocal_ros.sessions.observations import JOINTS
-from robocal_ros.sessions.silence import Silence
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_inputs import take_tool_message

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, LimitError, RobocalError
-from robocal_ros.core.motion.cell import MotionCell
-from robocal_ros.core.motion.housing import ToolBody
-from robocal_ros.core.motion.measuring import approach, measuring
-from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.motion.stopping import stop
-from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.motion.cell import MotionCell
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import ToolBody
+from robocal_ros.motion.measuring import approach, measuring
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import RobotWatch
+from robocal_ros.motion.stopping import stop
 from robocal_ros.sessions.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
-from robocal_ros.sessions.robot_watch import RobotWatch
 from robocal_ros.sessions.tool import ToolSession
 
 Array = NDArray[np.float64]

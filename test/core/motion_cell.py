@@ -3,11 +3,11 @@
 import numpy as np
 
 from robocal_ros.core import frames
-from robocal_ros.core.motion.cell import MotionCell
-from robocal_ros.core.motion.housing import Housing, ToolBody
-from robocal_ros.core.motion.limits import MotionLimits
-from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.motion.cell import MotionCell
+from robocal_ros.motion.housing import Housing, ToolBody
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.storage.robots import load_robot
 
 POSTURES = {

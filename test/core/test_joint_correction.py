@@ -9,16 +9,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import (
-    JointCorrection,
-    blend_models,
-    pack_model,
-    solution,
-)
-from robocal_ros.core.joint_correction.rates import rates_batch
-from robocal_ros.core.joint_correction.solution import MOST_OVER
-from robocal_ros.core.joint_correction.staged import StagedCorrection
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction import solution
+from robocal_ros.correction.joint_correction import JointCorrection, blend_models, pack_model
+from robocal_ros.correction.rates import rates_batch
+from robocal_ros.correction.solution import MOST_OVER
+from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import pack_model
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig, Policy
-from robocal_ros.core.joint_correction.clamping import (
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.bounds import CorrectionConfig, Policy
+from robocal_ros.correction.clamping import (
     FADES_WITHIN,
     ClampedCorrection,
     correction_between,
 )
-from robocal_ros.core.joint_correction.refusals import Reason
-from robocal_ros.core.joint_correction.staged import StagedCorrection
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.joint_correction import pack_model
+from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = replace(

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import CorrectionResult, JointCorrection, pack_model
-from robocal_ros.core.joint_correction.staged import StagedCorrection
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
+from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 NM = 1e-9

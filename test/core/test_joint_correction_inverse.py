@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import pack_model
-from robocal_ros.core.joint_correction.bounds import FADES_FROM, CorrectionConfig
-from robocal_ros.core.joint_correction.staged import StagedCorrection
+from robocal_ros.correction.bounds import FADES_FROM, CorrectionConfig
+from robocal_ros.correction.joint_correction import pack_model
+from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 ARM = load_robot("kr150_r3100")

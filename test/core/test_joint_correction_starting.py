@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.core.joint_correction.memory import RESPONSE_S
-from robocal_ros.core.joint_correction.starting import Sent
+from robocal_ros.correction.memory import RESPONSE_S
+from robocal_ros.correction.starting import Sent
 
 EVERY_S = 2e-4
 

@@ -23,11 +23,11 @@ from motion_cell import (
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError, LimitError
 from robocal_ros.core.kinematics.inverse import inverse
-from robocal_ros.core.motion.limits import MotionLimits
-from robocal_ros.core.motion.measuring import approach, measuring, start_pose, turn_s
-from robocal_ros.core.motion.timing import Ride
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.measuring import approach, measuring, start_pose, turn_s
+from robocal_ros.motion.timing import Ride
 from robocal_ros.sim.beams import beams_of
 
 ROBOTS = pytest.mark.parametrize("robot", POSTURES)

@@ -16,8 +16,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.nodes import conversions, qos
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.tool_messages import ToolMessages
 from robocal_ros.storage.robots import load_robot
 

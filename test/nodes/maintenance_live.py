@@ -20,13 +20,13 @@ from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.kinematics.inverse import inverse
-from robocal_ros.core.motion.cell import MotionCell
-from robocal_ros.core.motion.housing import Housing, ToolBody
-from robocal_ros.core.motion.limits import MotionLimits
-from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.motion.travel import joint_way
+from robocal_ros.motion.cell import MotionCell
+from robocal_ros.motion.housing import Housing, ToolBody
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.settings import trajectory_message
+from robocal_ros.motion.travel import joint_way
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.motion_settings import trajectory_message
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.storage.robots import load_robot
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
+from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.recorder_node import RecorderNode
 from robocal_ros.nodes.tcf_node import TcfNode

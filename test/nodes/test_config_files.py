@@ -12,14 +12,14 @@ from rclpy.qos import ReliabilityPolicy
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.tool.judging import ToolLimits
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.motion.settings import MOTION
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.cell_sim_node import CellSimNode
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.motion_settings import MOTION
 from robocal_ros.nodes.recorder_node import RecorderNode
 from robocal_ros.nodes.replay_node import ReplayNode
 from robocal_ros.nodes.tcf_node import INPUTS as TCF_INPUTS

@@ -31,8 +31,8 @@ from rclpy.action import ActionClient, ActionServer, GoalResponse
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.joint_correction import JointCorrection, pack_model
-from robocal_ros.core.joint_correction.bounds import FADES_FROM
+from robocal_ros.correction.bounds import FADES_FROM
+from robocal_ros.correction.joint_correction import JointCorrection, pack_model
 
 LONGEST_STEP_S = 0.02
 # A drift of some millimetres that blends in slowly, so that most commands meet a blend.

@@ -32,11 +32,11 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.samples import CORRECTED, TAUGHT
+from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.correction.settings import SETTINGS
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.base import AUTOSTART, SERIAL
 from robocal_ros.nodes.diagnostics import OK, WARN
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
-from robocal_ros.nodes.joint_correction_settings import SETTINGS
 
 BUSY = 2.0  # other work on the machine
 

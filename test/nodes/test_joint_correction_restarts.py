@@ -20,10 +20,10 @@ from std_srvs.srv import SetBool
 from tool_driver import noisy_cell
 
 from robocal_ros.core.documents import model_document
-from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.nodes import qos
 from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -25,9 +25,9 @@ from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.samples import CORRECTED
+from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.correction.periods import LONGEST_GAP_S
 from robocal_ros.nodes import conversions
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
-from robocal_ros.sessions.correction.periods import LONGEST_GAP_S
 
 
 @pytest.fixture

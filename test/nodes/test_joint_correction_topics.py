@@ -27,9 +27,9 @@ from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.correction.settings import session_config
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
-from robocal_ros.nodes.joint_correction_settings import session_config
 from robocal_ros.nodes.tcf_node import TcfNode
 
 BLEND_RAD_S = np.radians(0.5)

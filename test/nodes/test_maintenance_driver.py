@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
 from robocal_ros.sessions.maintenance.requests import Move

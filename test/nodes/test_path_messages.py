@@ -12,9 +12,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.serialized_path import read_path
-from robocal_ros.nodes.path_messages import PathMessage
-from robocal_ros.sessions.correction import Reason, RefusedError, trajectory_command
+from robocal_ros.correction.inputs import trajectory_command
+from robocal_ros.correction.path_messages import PathMessage
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.serialized_path import read_path
 
 FIELDS = ("positions", "velocities", "accelerations", "effort")
 

@@ -11,9 +11,9 @@ from std_srvs.srv import Trigger
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
+from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.nodes import qos, recorder_node
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
 from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNode
 from robocal_ros.nodes.session_events import EVENTS

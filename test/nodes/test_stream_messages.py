@@ -14,10 +14,10 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import CORRECTED
-from robocal_ros.nodes.path_messages import PathMessage
-from robocal_ros.nodes.stream_messages import ArrayMessage, JointMessage
-from robocal_ros.sessions.correction import Reason, RefusedError
-from robocal_ros.sessions.correction.wire import JointWire
+from robocal_ros.correction.path_messages import PathMessage
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.stream_messages import ArrayMessage, JointMessage
+from robocal_ros.correction.wire import JointWire
 
 NAN = math.nan
 

@@ -20,8 +20,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.live.cell import set_fault
 from robocal_ros.core.codes import Code
-from robocal_ros.core.motion.limits import MotionLimits
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.nodes import qos
 
 pytestmark = pytest.mark.cell

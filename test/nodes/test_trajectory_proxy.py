@@ -24,8 +24,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.nodes import qos, trajectory_proxy
-from robocal_ros.nodes.joint_correction_node import JointCorrectionNode
+from robocal_ros.correction import action as trajectory_proxy
+from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.nodes import qos
 
 OWN = f"{NODE}/follow_joint_trajectory"
 Result = FollowJointTrajectory.Result

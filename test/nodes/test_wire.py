@@ -11,8 +11,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from robocal_ros.sessions.correction import JointCommand, finite_command
-from robocal_ros.sessions.correction.wire import JointWire
+from robocal_ros.correction.inputs import JointCommand, finite_command
+from robocal_ros.correction.wire import JointWire
 
 NAMES = (("a", "b"), ("joint_a1", "joint_a2", "x"), ("only",))
 FRAMES = ("", "base", "base_link", "world_of_robots", "grüße")

@@ -8,18 +8,12 @@ import numpy as np
 import pytest
 
 from robocal_ros.core import frames
-from robocal_ros.core.joint_correction import JointCorrection
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.correction import (
-    CorrectionSession,
-    JointCommand,
-    OfferedModel,
-    OfferedTool,
-    Reason,
-    RefusedError,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool, TrajectoryCommand
+from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.storage.robots import load_robot
 
 NOMINAL = replace(

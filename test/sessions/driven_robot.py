@@ -3,13 +3,13 @@
 import numpy as np
 from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
 
-from robocal_ros.core.motion.housing import Housing
-from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.edge_samples import EdgeSample
-from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.gap import Gap
+from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.sessions.events import MEASURE_TOOL, Command
-from robocal_ros.sessions.gap import Gap
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 from robocal_ros.sim.beams import RoundTool

@@ -13,9 +13,9 @@ from tool_driver import TAUGHT
 
 from bench.closed_loop.carrying import Carrier
 from bench.closed_loop.words import drift_of
-from robocal_ros.core.motion.travel import joint_way
 from robocal_ros.core.samples import JointSample, PointSample
-from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.travel import joint_way
 from robocal_ros.sessions.events import CAPTURE_REFERENCE, Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession

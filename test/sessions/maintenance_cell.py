@@ -14,12 +14,12 @@ from tool_driver import config_of as tool_config
 from robocal_ros.core.codes import Code
 from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.motion.housing import Housing
-from robocal_ros.core.motion.plan import JointPlan
 from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.sessions.driving_config import DrivingConfig
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift

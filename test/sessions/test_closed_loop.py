@@ -9,8 +9,8 @@ from scipy.stats import chi2, norm
 from shift import BALL, NOISE_M, Shift, built, postures, warmed
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.joint_correction import JointCorrection
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession

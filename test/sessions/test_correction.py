@@ -18,10 +18,8 @@ from correction_robot import (
     pose,
 )
 
-from robocal_ros.sessions.correction import (
-    CorrectionSession,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.inputs import TrajectoryCommand
+from robocal_ros.correction.session import CorrectionSession
 
 # ---- off, on, off --------------------------------------------------------------------------------
 

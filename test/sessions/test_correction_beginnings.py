@@ -16,11 +16,8 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.sessions.correction import (
-    JointCommand,
-    Reason,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
 
 FAR = np.radians(0.021)  # beyond the tolerance of 0.02 deg
 NEAR = np.radians(0.019)

@@ -19,11 +19,8 @@ from correction_robot import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.sessions.correction import (
-    OfferedTool,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import OfferedTool, TrajectoryCommand
 
 EVENTS = st.lists(
     st.tuples(

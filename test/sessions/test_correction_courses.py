@@ -20,7 +20,9 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.sessions.correction import Course, JointCommand, Reason, TrajectoryCommand
+from robocal_ros.correction.courses import Course
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
 
 STEP_S = 0.05
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from correction_robot import HOME, NAMES, RATE, Robot, bent_tool, drifted, offer, refused, still
 
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.sessions.correction import Reason, TrajectoryCommand
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
 
 LIMIT = 1.0
 NEAR = CorrectionConfig().start_rad

@@ -23,13 +23,10 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.core.joint_correction import JointCorrection
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.sessions.correction import (
-    JointCommand,
-    Reason,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.refusals import Reason
 
 
 def test_joint_limits_hold_after_the_correction(warm: Robot) -> None:

@@ -10,18 +10,14 @@ from correction_robot import HOME, NAMES, NOMINAL, bent_tool, drifted, offer
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core.joint_correction import plain
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.core.joint_correction.staged import load_kernels
-from robocal_ros.sessions.correction import (
-    CorrectionSession,
-    Policy,
-    Reason,
-    RefusedError,
-    TrajectoryCommand,
-)
-from robocal_ros.sessions.correction.incoming import MOST_STAMPS
-from robocal_ros.sessions.correction.wire import JointWire
+from robocal_ros.correction import plain
+from robocal_ros.correction.bounds import CorrectionConfig, Policy
+from robocal_ros.correction.incoming import MOST_STAMPS
+from robocal_ros.correction.inputs import TrajectoryCommand
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.correction.staged import load_kernels
+from robocal_ros.correction.wire import JointWire
 
 DT = 0.002
 OTHERS = (*NAMES[:3], "gripper", *NAMES[:2:-1])  # the arm's joints in another order, and one more

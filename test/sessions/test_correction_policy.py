@@ -24,13 +24,9 @@ from correction_robot import (
 )
 
 from robocal_ros.core.samples import CORRECTED
-from robocal_ros.sessions.correction import (
-    JointCommand,
-    Policy,
-    Reason,
-    ShiftBounds,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.bounds import Policy, ShiftBounds
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
 
 TIGHT = ShiftBounds(0.2e-3, np.radians(0.1), np.radians(0.3))
 WIDE = ShiftBounds(1e-3, np.radians(0.1), np.radians(0.3))

@@ -18,14 +18,9 @@ from correction_robot import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
-from robocal_ros.sessions.correction import (
-    JointCommand,
-    Policy,
-    RefusedError,
-    ShiftBounds,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import RefusedError
 
 TIGHT = ShiftBounds(0.3e-3, np.radians(0.1), np.radians(0.3))
 FASTEST = 1.0  # rad/s, where there is a limit

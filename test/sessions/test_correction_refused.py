@@ -18,13 +18,10 @@ from correction_robot import (
     swing,
 )
 
-from robocal_ros.core.joint_correction.staged import StagedCorrection, StagedResult
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.sessions.correction import (
-    JointCommand,
-    Reason,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.staged import StagedCorrection, StagedResult
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

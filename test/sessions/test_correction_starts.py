@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from correction_robot import DT, HOME, NAMES, Robot, bent_tool, drifted, offer, refused, still
 
-from robocal_ros.sessions.correction import JointCommand, Reason, TrajectoryCommand
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
 
 SECOND = 1_000_000_000
 

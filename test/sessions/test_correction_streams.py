@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from correction_robot import DT, HOME, RATE, ROUNDING, Robot, drifted, offer, refused
 
-from robocal_ros.sessions.correction import JointCommand, Reason
+from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.refusals import Reason
 
 SECOND = 1_000_000_000
 

@@ -18,7 +18,8 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.sessions.correction import Reason, TrajectoryCommand, offered_tool
+from robocal_ros.correction.inputs import TrajectoryCommand, offered_tool
+from robocal_ros.correction.refusals import Reason
 
 
 def waiting(robot: Robot) -> int | None:

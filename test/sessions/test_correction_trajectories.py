@@ -19,13 +19,10 @@ from correction_robot import (
     swing,
 )
 
-from robocal_ros.core.joint_correction.bounds import CorrectionConfig
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.sessions.correction import (
-    JointCommand,
-    Reason,
-    TrajectoryCommand,
-)
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
 
 
 def test_a_trajectory_is_corrected_as_a_whole(warm: Robot) -> None:

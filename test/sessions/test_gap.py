@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.sessions.gap import STALL_S, Gap
+from robocal_ros.motion.gap import STALL_S, Gap
 
 TICK_S, BEAT_S, STALE_S = 0.02, 0.2, 0.5
 LATE_S = 0.05  # after a pause, until the last beat that waited is delivered

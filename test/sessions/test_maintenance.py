@@ -30,9 +30,9 @@ from maintenance_cell import (
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, StorageError
-from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.events import LEAVE
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask

@@ -37,9 +37,9 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StaleError
 from robocal_ros.core.proposals import THERMAL, TOOL, Action, Decision, Head
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.motion.gap import STALL_S
 from robocal_ros.sessions.decisions import decide
 from robocal_ros.sessions.events import ACCEPT, WITHHOLD, Command, Outcome
-from robocal_ros.sessions.gap import STALL_S
 from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.tool_config import rows_of

@@ -24,8 +24,8 @@ from maintenance_cell import (
 )
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
-from robocal_ros.sessions.gap import DRAIN_S
+from robocal_ros.motion.gap import DRAIN_S
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance.conductor import UNSAVED_S
 from robocal_ros.sessions.maintenance.hands import DEAF_S

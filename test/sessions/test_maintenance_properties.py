@@ -39,9 +39,9 @@ from tool_driver import TAUGHT
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.proposals import Action
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.maintenance import AcceptBounds, State
 from robocal_ros.sessions.maintenance.hands import DEAF_S
 from robocal_ros.sessions.maintenance.requests import Answer

@@ -25,8 +25,8 @@ from maintenance_cell import (
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError, StorageError
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.requests import Answer

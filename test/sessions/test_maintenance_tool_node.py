@@ -25,10 +25,10 @@ from maintenance_cell import (
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S
+from robocal_ros.motion.robot_watch import VELOCITY_S
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance.hands import DEAF_S
-from robocal_ros.sessions.robot_watch import VELOCITY_S
 from robocal_ros.sessions.tool_driving import SETTLED_S
 from robocal_ros.sim.joint_motion import JointMotion
 

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocal_ros.core.motion.housing import Housing
-from robocal_ros.core.motion.limits import MotionLimits
-from robocal_ros.core.motion.stopping import SHORTEST_STOP_S, stop
-from robocal_ros.sessions.driving_config import DrivingConfig
-from robocal_ros.sessions.robot_watch import LEAST, RobotWatch
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.robot_watch import LEAST, RobotWatch
+from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
 from robocal_ros.storage.robots import load_robot
 
 ARM = load_robot("kr150_r3100")

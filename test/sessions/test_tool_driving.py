@@ -7,9 +7,9 @@ from tool_driver import TAUGHT, TRUTH
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError
-from robocal_ros.core.motion.limits import MotionLimits
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.sessions.events import MEASURE_TOOL, Command
 from robocal_ros.sessions.tool_driving import Phase
 from robocal_ros.sim.beams import bent

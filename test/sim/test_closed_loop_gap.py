@@ -6,7 +6,7 @@ import pytest
 from bench.closed_loop.plant import BEAT_S, STEP_S, equipped
 from bench.closed_loop.setting import LIMITS
 from robocal_ros.core.errors import ConflictError
-from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.tool_driving import Phase

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from kr150_shift import ABOVE, ARM, CYCLE, HOME, WORK, cell_of, true_laser
 
-from robocal_ros.core.motion.cell import MotionCell
-from robocal_ros.core.motion.housing import Housing, ToolBody
-from robocal_ros.core.motion.measuring import approach, measuring
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan
+from robocal_ros.motion.cell import MotionCell
+from robocal_ros.motion.housing import Housing, ToolBody
+from robocal_ros.motion.measuring import approach, measuring
 from robocal_ros.sim import kr150
 from robocal_ros.sim.kr150_cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
 from robocal_ros.sim.robot import shift, turn

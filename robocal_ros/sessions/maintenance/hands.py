@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import LimitError
-from robocal_ros.sessions.gap import Gap
+from robocal_ros.motion.gap import Gap
 from robocal_ros.sessions.maintenance import requests as asked
 from robocal_ros.sessions.maintenance.asking import Asking, Script
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig

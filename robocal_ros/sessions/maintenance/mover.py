@@ -5,12 +5,12 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.motion.measuring import start_near
-from robocal_ros.core.motion.plan import JointPlan
-from robocal_ros.core.motion.stopping import stop, stop_time
+from robocal_ros.motion.measuring import start_near
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import VELOCITY_S, RobotWatch
+from robocal_ros.motion.stopping import stop, stop_time
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Line, Route, Ways
-from robocal_ros.sessions.robot_watch import VELOCITY_S, RobotWatch
 
 Array = NDArray[np.float64]
 

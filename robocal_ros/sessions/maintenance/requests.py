@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.motion.plan import JointPlan
+from robocal_ros.motion.plan import JointPlan
 
 
 @dataclass(frozen=True)

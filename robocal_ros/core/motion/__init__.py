@@ -1,1 +1,0 @@
-"""Motions that measure a tool: planned from where the robot stands, checked as they are sent."""

@@ -1,0 +1,1 @@
+"""Taught joints in, corrected ones out: on-line joint correction before the controller."""

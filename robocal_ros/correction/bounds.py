@@ -1,0 +1,213 @@
+"""Bounds of the joint correction, and what is checked against them."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.staged import StagedResult
+
+Array = NDArray[np.float64]
+
+# What floating point adds to a value that lies on its bound.
+ROUNDING = 1e-9
+# Near a singularity less is corrected from this share of the bound on, which the first Newton
+# step is held against: the solution may bend a little beyond its first step.
+FADES_FROM = 0.8
+# What a survey looks at: +-3 sigma of the share are 5 % at most.
+POSTURES = 1000
+WITHOUT_LIMIT = np.pi  # range of a joint without limits, rad (prismatic: m)
+
+
+@dataclass(frozen=True)
+class ShiftBounds:
+    """Largest correction: at the tool (m, rad) and of one joint (rad; prismatic: ``tcp_m``)."""
+
+    tcp_m: float
+    tcp_rad: float
+    joint_rad: float
+
+    def of_joints(self, arm: SerialArm) -> Array:
+        """(n,) largest shift of each joint."""
+        return np.where(arm.prismatic, self.tcp_m, self.joint_rad)
+
+    def hold(self, result: CorrectionResult) -> NDArray[np.bool_]:
+        """Whether corrections keep within them at the tool."""
+        return np.asarray(
+            (result.tcp_shift_m <= self.tcp_m + ROUNDING)
+            & (result.tcp_rotation_rad <= self.tcp_rad + ROUNDING)
+        )
+
+
+def _degrees(value: float) -> float:
+    return float(np.radians(value))
+
+
+class Policy(StrEnum):
+    """What is done with a command whose correction would exceed a bound or a limit."""
+
+    REFUSE = "refuse"
+    CLAMP = "clamp"
+    PASS = "pass"
+
+
+@dataclass(frozen=True)
+class CorrectionConfig:
+    """Settings of a correction session.
+
+    Attributes
+    ----------
+    thermal, tool : bounds of the arm's drift and of the tool's change. The tool's tilt is that of
+        a tip 10 mm aside by a bend 150 mm above it.
+    blend_rad_s, blend_m_s : fastest change of a joint's correction (prismatic: m/s).
+    longest_step_s : a pause in a stream advances the blend by no more than this.
+    stream_gap_s : after a pause that is longer than this, and than two of its periods, a stream
+        begins anew, where the robot stands.
+    start_rad, start_m : how far from where a command begins the robot may stand.
+    joint_state_age_s : readings that are older do not tell where the robot is.
+    flange_frame, tool_frame : parent and child of an acceptable tool frame; an empty child: any.
+    policy : what is done with a command whose correction would exceed a bound or a limit.
+    model_age_s : a model with an older stamp is not corrected with; 0: any age.
+    velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none; None: no joint has one.
+    free_axis : the tool may turn about its z.
+    shadow : commands and readings pass as they came; the correction is only shown.
+    """
+
+    thermal: ShiftBounds = field(
+        default_factory=lambda: ShiftBounds(1e-3, _degrees(0.1), _degrees(0.3))
+    )
+    tool: ShiftBounds = field(
+        default_factory=lambda: ShiftBounds(10e-3, _degrees(4.0), _degrees(5.0))
+    )
+    blend_rad_s: float = field(default_factory=lambda: _degrees(0.5))
+    blend_m_s: float = 1e-3
+    longest_step_s: float = 0.02
+    stream_gap_s: float = 0.1
+    start_rad: float = field(default_factory=lambda: _degrees(0.02))
+    start_m: float = 5e-5
+    joint_state_age_s: float = 0.2
+    flange_frame: str = "tool0"
+    tool_frame: str = ""
+    policy: Policy = Policy.REFUSE
+    model_age_s: float = 0.0
+    velocity_limits: Array | None = field(default=None, compare=False)
+    free_axis: bool = False
+    shadow: bool = False
+
+    def blend_rates(self, arm: SerialArm) -> Array:
+        """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""
+        return np.where(arm.prismatic, self.blend_m_s, self.blend_rad_s)
+
+    def start_near(self, arm: SerialArm) -> Array:
+        """(n,) how far from where a command begins each joint may stand, rad (prismatic: m)."""
+        return np.where(arm.prismatic, self.start_m, self.start_rad)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """An arm's correction over postures that fill its joint range.
+
+    Attributes
+    ----------
+    beyond : share of postures in which it exceeds its bounds at the tool.
+    worst_m, worst_rad : largest correction at the tool.
+    """
+
+    beyond: float
+    worst_m: float
+    worst_rad: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.worst_m * 1e3:.3f} mm and {np.degrees(self.worst_rad):.3f} deg at worst, "
+            f"beyond the bounds in {self.beyond:.1%} of the postures"
+        )
+
+
+def survey(reference: SerialArm, actual: SerialArm, bounds: ShiftBounds) -> Survey:
+    """Look at the correction in `POSTURES` postures over the joint range, always the same ones."""
+    lower = np.where(np.isfinite(reference.lower), reference.lower, -WITHOUT_LIMIT)
+    upper = np.where(np.isfinite(reference.upper), reference.upper, WITHOUT_LIMIT)
+    q = np.random.default_rng(0).uniform(lower, upper, (POSTURES, reference.n))
+    found = JointCorrection.between(reference, actual).correct(q)
+    fine = bounds.hold(found)
+    return Survey(
+        1.0 - float(np.mean(fine)),
+        float(np.max(found.tcp_shift_m)),
+        float(np.max(found.tcp_rotation_rad)),
+    )
+
+
+def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialArm) -> None:
+    """Refuse a correction that is beyond its bounds; names the first point that is.
+
+    Near a singularity the arm's drift may be corrected in part: what remains is less than the
+    bound at the tool. A tool's change is corrected in full or not at all.
+    """
+    drift = result.arm
+    bound = config.thermal
+    fine = bound.hold(drift)
+    if not np.all(fine):
+        detail = (
+            f"{np.max(drift.tcp_shift_m) * 1e3:.3f} mm and "
+            f"{np.degrees(np.max(drift.tcp_rotation_rad)):.3f} deg at most, allowed "
+            f"{bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg"
+        )
+        _require(fine, Reason.TCP_BOUND, detail)
+    _require_joints(drift.joint_shift, bound.of_joints(arm), arm)
+    if result.tool is not None:
+        detail = "a singularity is too near to make up for the tool's change"
+        _require(result.tool.share == 1.0, Reason.JOINT_BOUND, detail)
+        _require_joints(result.tool.joint_shift, config.tool.of_joints(arm), arm)
+
+
+def require_solved(result: StagedResult) -> None:
+    """Refuse a point that has no solution near by."""
+    solved = result.arm.converged
+    if result.tool is not None:
+        solved = solved & result.tool.converged
+    _require(solved, Reason.NOT_SOLVED, "the pose is at the edge of the reach")
+
+
+def require_limits(q: Array, arm: SerialArm) -> None:
+    """Refuse joints (m, n) beyond the arm's limits, and what is no number."""
+    inside = (q >= arm.lower - ROUNDING) & (q <= arm.upper + ROUNDING)
+    if not inside.all():
+        point, joint = np.argwhere(~inside)[0]
+        raise RefusedError(
+            Reason.JOINT_LIMIT,
+            f"{arm.joint_names[joint]} would be at {q[point, joint]:.6f}, allowed "
+            f"{arm.lower[joint]:.6f} to {arm.upper[joint]:.6f} (point {point + 1})",
+        )
+
+
+def require_speeds(velocity: Array, limits: Array, arm: SerialArm) -> None:
+    """Refuse velocities (m, n) beyond their limits (n,), rad/s (prismatic: m/s)."""
+    within = np.abs(velocity) <= limits * (1.0 + ROUNDING)
+    if not within.all():
+        point, joint = np.argwhere(~within)[0]
+        raise RefusedError(
+            Reason.VELOCITY_LIMIT,
+            f"{arm.joint_names[joint]} would move at {velocity[point, joint]:.6f}, allowed "
+            f"{limits[joint]:.6f} (point {point + 1})",
+        )
+
+
+def _require(fine: NDArray[np.bool_], reason: Reason, detail: str) -> None:
+    if not fine.all():
+        raise RefusedError(reason, f"{detail} (point {int(np.argmin(fine)) + 1})")
+
+
+def _require_joints(shift: Array, largest: Array, arm: SerialArm) -> None:
+    over = np.abs(shift) > largest + ROUNDING
+    if over.any():
+        point, joint = np.argwhere(over)[0]
+        raise RefusedError(
+            Reason.JOINT_BOUND,
+            f"{arm.joint_names[joint]} by {shift[point, joint]:.6f}, allowed "
+            f"{largest[joint]:.6f} (point {point + 1})",
+        )

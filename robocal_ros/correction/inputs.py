@@ -1,0 +1,247 @@
+"""What the correction session takes in.
+
+The builders accept any object with the attributes of the ROS message.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.samples import stamp_ns
+from robocal_ros.correction.refusals import Reason, RefusedError
+
+Array = NDArray[np.float64]
+
+MOST_POINTS = 100_000  # of a trajectory; tens of thousands are corrected in well under a second
+TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
+
+
+@dataclass(frozen=True)
+class JointCommand:
+    """Joint targets or joint readings at one instant.
+
+    Attributes
+    ----------
+    names : the joints, in the message's order.
+    position : (k,) rad (prismatic: m).
+    velocity : (k,) or None when the message has none.
+    stamp_ns : source stamp; 0 when not set.
+    mark : ``frame_id`` of the message's header.
+    """
+
+    names: tuple[str, ...]
+    position: Array
+    velocity: Array | None = None
+    stamp_ns: int = 0
+    mark: str = ""
+
+
+@dataclass(frozen=True)
+class TrajectoryCommand:
+    """A trajectory of m points; ``position`` (m, k), rates likewise or None, times (m,) in s."""
+
+    names: tuple[str, ...]
+    position: Array
+    time_from_start_s: Array
+    velocity: Array | None = None
+    acceleration: Array | None = None
+    stamp_ns: int = 0
+    mark: str = ""
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+@dataclass(frozen=True)
+class OfferedModel:
+    """A kinematic model that somebody published; ``mdh`` (n, 5) absolute, SI."""
+
+    robot: str
+    serial: str
+    model_hash: str
+    revision: int
+    accepted: bool
+    joint_names: tuple[str, ...]
+    mdh: Array
+    T_base_root: Array = field(default_factory=lambda: np.eye(4))
+    stamp_ns: int = 0
+
+
+@dataclass(frozen=True)
+class OfferedTool:
+    """A measured tool that somebody published, absolute.
+
+    Attributes
+    ----------
+    parent, child : its frames' names.
+    T_flange_tool : (4, 4); None: the taught tool again.
+    """
+
+    parent: str
+    T_flange_tool: Array | None
+    child: str
+    robot: str
+    serial: str
+    model_hash: str
+    revision: int
+    accepted: bool
+    stamp_ns: int = 0
+
+
+def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:
+    if len(values) == 0:
+        return None
+    array = np.array(values, dtype=np.float64)
+    if len(array) != len(names):
+        detail = f"{len(names)} names but {len(array)} {what}"
+        raise RefusedError(Reason.WRONG_SIZE, detail)
+    return array
+
+
+def joint_command(message: Any) -> JointCommand:
+    """Build from a ``sensor_msgs/JointState``.
+
+    Raises
+    ------
+    RefusedError
+        When names and values differ in number, or there are no positions.
+    """
+    names = tuple(message.name)
+    position = _values(message.position, names, "positions")
+    if position is None:
+        if names:
+            raise RefusedError(Reason.NO_POSITION, f"of {', '.join(names)}")
+        position = np.empty(0)
+    velocity = _values(message.velocity, names, "velocities")
+    _require_finite(position, "a position")
+    header = message.header
+    return JointCommand(names, position, velocity, stamp_ns(header.stamp), str(header.frame_id))
+
+
+def finite_command(message: Any) -> JointCommand:
+    """``joint_command`` of targets, whose efforts must be finite too: they go out as they came."""
+    _require_finite(message.effort, "an effort")
+    return joint_command(message)
+
+
+def _require_finite(values: Any, what: str) -> None:
+    if not np.all(np.isfinite(values)):
+        raise RefusedError(Reason.NOT_FINITE, f"{what}: {list(values)}")
+
+
+def require_few(points: int) -> None:
+    """Refuse a trajectory of so many points that nothing else would be heard meanwhile."""
+    if points > MOST_POINTS:
+        raise RefusedError(Reason.BURST, f"{points}, allowed {MOST_POINTS}")
+
+
+def trajectory_command(message: Any) -> TrajectoryCommand:
+    """Build from a ``trajectory_msgs/JointTrajectory``; one without points is a stop.
+
+    Raises
+    ------
+    RefusedError
+        When numbers differ, a point has no positions, only some points have a rate, or there are
+        too many points.
+    """
+    names = tuple(message.joint_names)
+    points = message.points
+    require_few(len(points))
+    for point in points:
+        _require_finite(point.effort, "an effort")
+    rows = {
+        what: _rows([getattr(point, what) for point in points], len(names), what)
+        for what in ("positions", "velocities", "accelerations")
+    }
+    position = rows["positions"]
+    if position is None:
+        if len(points):
+            raise RefusedError(Reason.NO_POSITION, "a point of the trajectory has none")
+        position = np.empty((0, len(names)))
+    if rows["velocities"] is None and rows["accelerations"] is not None:
+        raise RefusedError(Reason.WRONG_SIZE, "accelerations without velocities")
+    times = [point.time_from_start for point in points]
+    return TrajectoryCommand(
+        names,
+        position,
+        np.array([t.sec + 1e-9 * t.nanosec for t in times], dtype=np.float64),
+        rows["velocities"],
+        rows["accelerations"],
+        stamp_ns(message.header.stamp),
+        str(message.header.frame_id),
+    )
+
+
+def _rows(values: list[Any], k: int, what: str) -> Array | None:
+    if all(len(row) == 0 for row in values):
+        return None
+    for i, row in enumerate(values):
+        if len(row) != k:
+            detail = f"point {i + 1} has {len(row)} {what} for {k} joints"
+            raise RefusedError(Reason.WRONG_SIZE, detail)
+    return np.array(values, dtype=np.float64)
+
+
+def _pose(translation: Any, rotation: Any, reason: Reason) -> Array:
+    xyz = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
+    quat = np.array([rotation.x, rotation.y, rotation.z, rotation.w], dtype=np.float64)
+    if not (np.all(np.isfinite(xyz)) and abs(math.hypot(*quat) - 1.0) < 1e-3):
+        raise RefusedError(reason, f"translation {xyz.tolist()}, quaternion {quat.tolist()}")
+    return frames.transform_from_quat(xyz, quat)
+
+
+def offered_model(message: Any, accepted_state: int) -> OfferedModel:
+    """Build from a ``robocal_msgs/KinematicModel``.
+
+    Raises
+    ------
+    RefusedError
+        When numbers differ or are not finite.
+    """
+    names = tuple(message.joint_names)
+    columns = [message.d, message.theta, message.a, message.alpha, message.beta]
+    if any(len(column) != len(names) for column in columns):
+        raise RefusedError(Reason.WRONG_SIZE, f"model of {len(names)} joints")
+    mdh = np.array(columns, dtype=np.float64).T
+    if not np.all(np.isfinite(mdh)):
+        raise RefusedError(Reason.NOT_FINITE, f"model of {message.robot}")
+    root = message.base_root
+    return OfferedModel(
+        robot=message.robot,
+        serial=message.serial,
+        model_hash=message.model_hash,
+        revision=int(message.revision),
+        accepted=int(message.state) == accepted_state,
+        joint_names=names,
+        mdh=mdh,
+        T_base_root=_pose(root.translation, root.rotation, Reason.NOT_FINITE),
+        stamp_ns=stamp_ns(message.header.stamp),
+    )
+
+
+def offered_tool(message: Any, accepted_state: int) -> OfferedTool:
+    """Build from a ``robocal_msgs/ToolFrame``; its state NONE says: the taught tool, as accepted.
+
+    Raises
+    ------
+    RefusedError
+        When a number is not finite or the quaternion is not of unit length.
+    """
+    taught = int(message.state) == TAUGHT_TOOL
+    pose = message.tool
+    T = None if taught else _pose(pose.translation, pose.rotation, Reason.BAD_TOOL)
+    return OfferedTool(
+        parent=str(message.header.frame_id),
+        T_flange_tool=T,
+        child=str(message.child_frame_id),
+        robot=message.robot,
+        serial=message.serial,
+        model_hash=message.model_hash,
+        revision=int(message.revision),
+        accepted=taught or int(message.state) == accepted_state,
+        stamp_ns=stamp_ns(message.header.stamp),
+    )

@@ -1,0 +1,171 @@
+"""Which models and tools the correction takes over."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.bounds import CorrectionConfig, Survey, survey
+from robocal_ros.correction.inputs import OfferedModel, OfferedTool
+from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.tools import ToolGate
+
+Array = NDArray[np.float64]
+
+
+class CorrectionGate:
+    """Judges offered models and tools, and keeps the last good ones.
+
+    Attributes
+    ----------
+    revision : of the model taken over, None before the first.
+    survey : its correction over the joint range.
+    waiting : a model that was refused but may be taken over when it is looked at again.
+    stale : why the model is too old to be used, in words; empty when it is not.
+    tools : the measured tools.
+    """
+
+    def __init__(
+        self, nominal: SerialArm, reference: SerialArm, serial: str, config: CorrectionConfig
+    ) -> None:
+        if nominal.joint_names != reference.joint_names or np.any(
+            (nominal.sign != reference.sign) | (nominal.prismatic != reference.prismatic)
+        ):
+            raise ValueError("nominal and reference model have different joints")
+        self._nominal = nominal
+        self._reference = reference
+        self._serial = serial
+        self._config = config
+        self._model: OfferedModel | None = None
+        self.revision: int | None = None
+        self.survey = Survey(0.0, 0.0, 0.0)
+        self.waiting: OfferedModel | None = None
+        self.stale = ""
+        self.tools = ToolGate(reference.T_flange_tool, config)
+
+    @property
+    def actual(self) -> SerialArm:
+        """The actual arm with its tool, as far as they are known; else the reference's."""
+        arm = self._reference
+        if self._model is not None and not self.stale:
+            arm = self._arm_of(self._model)
+        tool = self.tools.T_flange_tool
+        return arm if tool is None else replace(arm, T_flange_tool=tool)
+
+    def take_model(self, model: OfferedModel, places: Array, *, again: bool = False) -> None:
+        """Take over a model; ``places`` (k, n) are where the robot is, and goes.
+
+        A revision lower than the one in use comes from a history that began again: it must be
+        newer by its stamp, or be looked at (``again``). One that is refused for this, or for its
+        size here, waits for `look_again`.
+
+        Raises
+        ------
+        RefusedError
+            When it is not accepted, made for another robot, older than the one in use, or would
+            move the tool beyond the bounds where the robot is or goes.
+        """
+        if not model.accepted:
+            raise RefusedError(Reason.NOT_ACCEPTED, f"revision {model.revision}")
+        self._require_robot(model)
+        if model.joint_names != self._nominal.joint_names:
+            detail = f"joints {model.joint_names}, this has {self._nominal.joint_names}"
+            raise RefusedError(Reason.WRONG_ROBOT, detail)
+        self.waiting = None
+        if self._model is not None and not again:
+            if _same(model, self._model):
+                self._model = model
+                return
+            if not _later(model, self._model):
+                self.waiting = model
+                raise RefusedError(
+                    Reason.OLD_REVISION,
+                    f"revision {model.revision} with other numbers after {self.revision}, and not "
+                    "newer by its stamp; ~/enable takes it over",
+                )
+        arm = self._arm_of(model)
+        if len(places):
+            self._require_small(model, arm, places)
+        self._model, self.revision = model, model.revision
+        self.survey = survey(self._reference, arm, self._config.thermal)
+
+    def watch_age(self, now_ns: int) -> bool:
+        """Compare the model's stamp with the clock; returns whether it became stale, or fresh."""
+        was, limit_s = bool(self.stale), self._config.model_age_s
+        self.stale = ""
+        if self._model is not None and limit_s > 0.0:
+            age_ns = now_ns - self._model.stamp_ns
+            if abs(age_ns) > limit_s * 1e9:
+                old = f"{abs(age_ns) * 1e-9:.1f} s " + ("old" if age_ns > 0 else "in the future")
+                self.stale = (
+                    f"model revision {self._model.revision} is {old}, allowed {limit_s:g} s"
+                )
+        return was != bool(self.stale)
+
+    def look_again(self, places: Array) -> None:
+        """Take over the model that waits for it, if there is one; raises as `take_model`."""
+        if self.waiting is not None:
+            self.take_model(self.waiting, places, again=True)
+
+    @property
+    def serial(self) -> str:
+        """Of the model in use; empty without one."""
+        return "" if self._model is None else self._model.serial
+
+    def _require_robot(self, offered: OfferedModel | OfferedTool) -> None:
+        expected = {
+            "robot": (offered.robot, self._nominal.name),
+            "serial": (offered.serial, self._serial),
+            "nominal model's hash": (offered.model_hash, self._nominal.model_hash),
+        }
+        for what, (found, own) in expected.items():
+            if found != own:
+                raise RefusedError(Reason.WRONG_ROBOT, f"{what} {found}, this is {own}")
+
+    def _arm_of(self, model: OfferedModel) -> SerialArm:
+        """The offered arm; the nominal one says that no drift is known: then the reference."""
+        nominal = self._nominal
+        # The root travels as a quaternion: equal up to rounding.
+        if np.array_equal(model.mdh, nominal.mdh) and np.allclose(
+            model.T_base_root, nominal.T_base_root, rtol=0.0, atol=1e-12
+        ):
+            return self._reference
+        return replace(self._reference, mdh=model.mdh, T_base_root=model.T_base_root)
+
+    def _require_small(self, model: OfferedModel, arm: SerialArm, places: Array) -> None:
+        bound = self._config.thermal
+        shift = JointCorrection.between(self._reference, arm).correct(places)
+        if not np.all(bound.hold(shift)):
+            self.waiting = model
+            raise RefusedError(
+                Reason.TCP_BOUND,
+                f"{np.max(shift.tcp_shift_m) * 1e3:.3f} mm and "
+                f"{np.degrees(np.max(shift.tcp_rotation_rad)):.3f} deg where the robot is or "
+                f"goes, allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg; "
+                f"over its joint range {survey(self._reference, arm, bound)}",
+            )
+
+    def take_tool(self, tool: OfferedTool) -> None:
+        """Let a tool wait for its adoption.
+
+        Raises
+        ------
+        RefusedError
+            When it was made for another robot; else as `ToolGate.take`.
+        """
+        self._require_robot(tool)
+        self.tools.take(tool)
+
+
+def _same(a: OfferedModel, b: OfferedModel) -> bool:
+    return (
+        a.revision == b.revision
+        and np.array_equal(a.mdh, b.mdh)
+        and np.array_equal(a.T_base_root, b.T_base_root)
+    )
+
+
+def _later(a: OfferedModel, b: OfferedModel) -> bool:
+    return a.revision > b.revision or a.stamp_ns > b.stamp_ns

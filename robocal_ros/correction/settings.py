@@ -1,0 +1,269 @@
+"""Parameters of the joint correction node."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
+from robocal_ros.nodes.history_settings import STATE_DIR
+from robocal_ros.nodes.parameters import Setting
+from robocal_ros.storage.robots import load_description, load_robot
+
+NOMINAL = "nominal"
+
+
+def _tool_fault(values: list[float]) -> str | None:
+    if len(values) != 7:
+        return "not seven numbers: x, y, z, qx, qy, qz, qw"
+    if any(values) and abs(math.hypot(*values[3:]) - 1.0) > 1e-3:
+        return "the quaternion is not of unit length"
+    return None
+
+
+SETTINGS = (
+    Setting("robot", "kr150_r3100", "Robot type (config/robots) or path of a robot file"),
+    Setting(
+        "reference",
+        NOMINAL,
+        "Model that the program was made with: nominal, or path of a robot file that holds the "
+        "calibrated cold model of a taught program",
+    ),
+    Setting(
+        "taught_tool",
+        [0.0] * 7,
+        "Tool on the flange that the program was made with: x, y, z in m, qx, qy, qz, qw; all "
+        "zero: the tool of the robot file",
+        check=_tool_fault,
+    ),
+    Setting(
+        "command_joints",
+        [""],
+        "Joints of joint_commands (Float64MultiArray), in its order; empty: all joints of the arm, "
+        "from base to flange",
+    ),
+    Setting(
+        "shadow",
+        False,
+        "Compute everything and change nothing: outputs go out as the inputs came in",
+    ),
+    Setting(
+        "policy",
+        Policy.REFUSE.value,
+        "What becomes of a command whose correction exceeds a bound or leads beyond a limit: "
+        "refuse it, clamp the correction, or pass it while the correction is blended out",
+        choices=tuple(policy.value for policy in Policy),
+    ),
+    Setting(
+        "model_age_s",
+        0.0,
+        "A model whose stamp is older is no longer used; 0: it may be of any age",
+        unit="s",
+        low=0.0,
+        high=1e7,
+    ),
+    Setting(
+        "free_axis",
+        False,
+        "The tool may turn about its z axis (drill, sphere, torch): the joints move as little as "
+        "they can",
+    ),
+    Setting(
+        "velocity_limits",
+        [0.0],
+        "Largest speed of each joint after correction, rad/s (sliding: m/s), one number for each; "
+        "0: as the robot file says",
+        low=0.0,
+        high=1e3,
+    ),
+    Setting("flange_frame", "tool0", "Parent frame that tools of the topic tool must have"),
+    Setting("tool_child_frame", "", "Child frame that they must have; empty: any"),
+    Setting(
+        "follow_joint_trajectory",
+        "",
+        "Action of the controller that goals of follow_joint_trajectory go to; empty: no action",
+    ),
+    STATE_DIR,
+    Setting("enable_on_start", False, "Correct from the start, without a call of ~/enable"),
+    Setting(
+        "thermal_tcp_mm",
+        1.0,
+        "Largest correction of the arm's drift at the tool",
+        unit="mm",
+        low=0.0,
+        high=20.0,
+    ),
+    Setting(
+        "thermal_tcp_deg",
+        0.1,
+        "and in orientation",
+        unit="deg",
+        low=0.0,
+        high=5.0,
+    ),
+    Setting(
+        "thermal_joint_deg",
+        0.3,
+        "and of one joint; near a singularity less is corrected, so that this holds",
+        unit="deg",
+        low=0.001,
+        high=5.0,
+    ),
+    Setting(
+        "tool_tcp_mm",
+        10.0,
+        "Largest change of the tool that is made up for",
+        unit="mm",
+        low=0.0,
+        high=100.0,
+    ),
+    Setting("tool_tcp_deg", 4.0, "and in orientation", unit="deg", low=0.0, high=30.0),
+    Setting(
+        "tool_joint_deg",
+        5.0,
+        "and by one joint; where more is needed, commands are refused",
+        unit="deg",
+        low=0.001,
+        high=30.0,
+    ),
+    Setting(
+        "blend_deg_s",
+        0.5,
+        "Fastest change of a joint's correction",
+        unit="deg/s",
+        low=0.001,
+        high=5.0,
+    ),
+    Setting(
+        "blend_mm_s",
+        1.0,
+        "Fastest change of a sliding joint's correction",
+        unit="mm/s",
+        low=0.001,
+        high=20.0,
+    ),
+    Setting(
+        "longest_step_s",
+        0.02,
+        "A pause in a stream of targets advances a blend by no more than this",
+        unit="s",
+        low=1e-4,
+        high=0.1,
+    ),
+    Setting(
+        "stream_gap_s",
+        0.1,
+        "After a longer pause a stream of targets must begin again where the robot stands",
+        unit="s",
+        low=0.01,
+        high=10.0,
+    ),
+    Setting(
+        "start_deg",
+        0.02,
+        "How far from where a command begins a joint may stand",
+        unit="deg",
+        low=0.001,
+        high=0.5,
+    ),
+    Setting("start_mm", 0.05, "and a sliding joint", unit="mm", low=0.001, high=1.0),
+    Setting(
+        "joint_state_age_s",
+        0.2,
+        "Older joint states do not tell where the robot is",
+        unit="s",
+        low=0.01,
+        high=5.0,
+    ),
+)
+
+
+def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
+    """The nominal arm, and the reference arm with the taught tool.
+
+    Raises
+    ------
+    InputError
+        When a robot file cannot be read.
+    """
+    nominal = load_robot(settings["robot"])
+    chosen = settings["reference"]
+    reference = nominal if chosen == NOMINAL else load_robot(chosen)
+    reference = replace(  # a calibrated file does not lift the robot's limits
+        reference,
+        lower=np.maximum(nominal.lower, reference.lower),
+        upper=np.minimum(nominal.upper, reference.upper),
+    )
+    tool = settings["taught_tool"]
+    if any(tool):
+        reference = replace(reference, T_flange_tool=frames.transform_from_quat(tool[:3], tool[3:]))
+    return nominal, reference
+
+
+def command_joints(settings: Mapping[str, Any], arm: SerialArm) -> tuple[str, ...]:
+    """The joints of ``joint_commands``, in its order.
+
+    Raises
+    ------
+    InputError
+        When one of them is not the arm's, or is named twice.
+    """
+    names = tuple(settings["command_joints"]) or arm.joint_names
+    unknown = [name for name in names if name not in arm.joint_names]
+    if unknown or len(set(names)) != len(names):
+        fault = f"{', '.join(unknown)} unknown" if unknown else "a joint is named twice"
+        raise InputError(
+            f"command_joints = {', '.join(names)}: {fault}; the arm has "
+            f"{', '.join(arm.joint_names)}"
+        )
+    return names
+
+
+def _velocity_limits(settings: Mapping[str, Any]) -> NDArray[np.float64]:
+    """(n,) largest speeds, rad/s (prismatic: m/s); infinite where neither says one."""
+    robot = load_description(settings["robot"])
+    given, count = np.array(settings["velocity_limits"]), robot.arm.n
+    if len(given) != count and given.any():
+        raise InputError(f"velocity_limits has {len(given)} numbers, the arm {count} joints")
+    return np.where(given > 0.0, given, robot.max_velocity)
+
+
+def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
+    """Settings of the session, in SI.
+
+    Raises
+    ------
+    InputError
+        When the numbers of joints and of velocity limits differ.
+    """
+
+    def bounds(what: str) -> ShiftBounds:
+        degrees = (settings[f"{what}_{where}_deg"] for where in ("tcp", "joint"))
+        return ShiftBounds(
+            settings[f"{what}_tcp_mm"] * 1e-3, *(float(np.radians(x)) for x in degrees)
+        )
+
+    return CorrectionConfig(
+        thermal=bounds("thermal"),
+        tool=bounds("tool"),
+        blend_rad_s=float(np.radians(settings["blend_deg_s"])),
+        blend_m_s=settings["blend_mm_s"] * 1e-3,
+        longest_step_s=settings["longest_step_s"],
+        stream_gap_s=settings["stream_gap_s"],
+        start_rad=float(np.radians(settings["start_deg"])),
+        start_m=settings["start_mm"] * 1e-3,
+        joint_state_age_s=settings["joint_state_age_s"],
+        flange_frame=settings["flange_frame"],
+        tool_frame=settings["tool_child_frame"],
+        policy=Policy(settings["policy"]),
+        model_age_s=settings["model_age_s"],
+        free_axis=settings["free_axis"],
+        velocity_limits=_velocity_limits(settings),
+        shadow=settings["shadow"],
+    )

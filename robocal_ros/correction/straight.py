@@ -1,0 +1,220 @@
+"""Compiled correction of six turning joints without a branch, for many points at once.
+
+Newton's method as in `solution`, three factored matrices with two steps each, written with single
+numbers: the compiler works on several points at a time in vector registers. Each gets the
+bits that it gets alone. Where that does not do (a bound or a singularity near, a shift so large
+that it needs more steps) a point is left to `solution`.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.compiled import kernel, lean
+from robocal_ros.core.kinematics.sines import LARGEST_ANGLE
+from robocal_ros.correction.straight_kinematics import (
+    ACTUAL,
+    LARGEST,
+    Frame,
+    Frames,
+    N,
+    Six,
+    column,
+    goal,
+    residual,
+    walk,
+)
+
+Array = NDArray[np.float64]
+
+LANES = 16
+# what is written for each point
+ROWS = 11
+POSITION_LEFT, ROTATION_LEFT, FINE, TCP_SHIFT, TCP_ROTATION = range(N, ROWS)
+ITERATIONS = 3.0
+
+# A residual (m, rad) that is left alone.
+AT_GOAL = 1e-12
+# Longest second step as a share of the first: see `solution`.
+AHEAD, BESIDE = 0.2, 0.5
+# The last matrix was made so near to the solution that its second step, this short, is the last:
+# what is left is their product, times a curvature that even beside a singularity is below 1e4.
+NEAR, SHORT = 1e-6, 1e-11
+SINGULAR = 1e-13  # square of a column's part that no column before has, beside the first's
+FAR = 2.0  # a solution so many times beyond the bound is another posture
+
+
+@lean
+def _dot(a: Six, b: Six) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
+
+
+@lean
+def _more(a: Six, s: float, b: Six) -> Six:
+    """A + s b."""
+    return (
+        a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2],
+        a[3] + s * b[3], a[4] + s * b[4], a[5] + s * b[5],
+    )  # fmt: skip
+
+
+Factor = tuple[Six, Six, Six, Six, Six, Six, Six, Six, Six, Six]
+
+
+@lean
+def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
+    """Orthogonal columns of the Jacobian, its triangle in two sixes and a half, 1 / squares.
+
+    By the modified Gram-Schmidt process; False where singular.
+    """
+    s, e = ACTUAL + 7, f[6]
+    a0, a1, a2 = column(c[s], f[0], e), column(c[s + 9], f[1], e), column(c[s + 18], f[2], e)
+    a3, a4 = column(c[s + 27], f[3], e), column(c[s + 36], f[4], e)
+    a5 = column(c[s + 45], f[5], e)
+    n0 = _dot(a0, a0)
+    i0 = 1.0 / n0
+    r01, r02, r03 = _dot(a0, a1) * i0, _dot(a0, a2) * i0, _dot(a0, a3) * i0
+    r04, r05 = _dot(a0, a4) * i0, _dot(a0, a5) * i0
+    a1, a2, a3 = _more(a1, -r01, a0), _more(a2, -r02, a0), _more(a3, -r03, a0)
+    a4, a5 = _more(a4, -r04, a0), _more(a5, -r05, a0)
+    n1 = _dot(a1, a1)
+    i1 = 1.0 / n1
+    r12, r13, r14, r15 = (
+        _dot(a1, a2) * i1, _dot(a1, a3) * i1, _dot(a1, a4) * i1, _dot(a1, a5) * i1
+    )  # fmt: skip
+    a2, a3 = _more(a2, -r12, a1), _more(a3, -r13, a1)
+    a4, a5 = _more(a4, -r14, a1), _more(a5, -r15, a1)
+    n2 = _dot(a2, a2)
+    i2 = 1.0 / n2
+    r23, r24, r25 = _dot(a2, a3) * i2, _dot(a2, a4) * i2, _dot(a2, a5) * i2
+    a3, a4, a5 = _more(a3, -r23, a2), _more(a4, -r24, a2), _more(a5, -r25, a2)
+    n3 = _dot(a3, a3)
+    i3 = 1.0 / n3
+    r34, r35 = _dot(a3, a4) * i3, _dot(a3, a5) * i3
+    a4, a5 = _more(a4, -r34, a3), _more(a5, -r35, a3)
+    n4 = _dot(a4, a4)
+    i4 = 1.0 / n4
+    r45 = _dot(a4, a5) * i4
+    a5 = _more(a5, -r45, a4)
+    n5 = _dot(a5, a5)
+    least = SINGULAR * n0
+    regular = (n1 > least) & (n2 > least) & (n3 > least) & (n4 > least) & (n5 > least)
+    i, r = (i0, i1, i2, i3, i4, 1.0 / n5), (r01, r02, r03, r04, r05, r12)
+    t, u = (r13, r14, r15, r23, r24, r25), (r34, r35, r45, 0.0, 0.0, 0.0)
+    return (a0, a1, a2, a3, a4, a5, i, r, t, u), regular
+
+
+@lean
+def _step(factor: Factor, e: Six) -> Six:
+    """Joint step for a twist."""
+    a0, a1, a2, a3, a4, a5, i, r, t, u = factor
+    y0 = _dot(a0, e) * i[0]
+    y1 = _dot(a1, e) * i[1]
+    y2 = _dot(a2, e) * i[2]
+    y3 = _dot(a3, e) * i[3]
+    y4 = _dot(a4, e) * i[4]
+    x5 = _dot(a5, e) * i[5]
+    x4 = y4 - u[2] * x5
+    x3 = y3 - (u[0] * x4 + u[1] * x5)
+    x2 = y2 - (t[3] * x3 + t[4] * x4 + t[5] * x5)
+    x1 = y1 - (r[5] * x2 + t[0] * x3 + t[1] * x4 + t[2] * x5)
+    x0 = y0 - (r[0] * x1 + r[1] * x2 + r[2] * x3 + r[3] * x4 + r[4] * x5)
+    return x0, x1, x2, x3, x4, x5
+
+
+@lean
+def _within(c: Array, x: Six, times: float) -> bool:
+    """Whether no joint is shifted by more than so many times its bound."""
+    b = LARGEST
+    return bool(
+        (abs(x[0]) <= times * c[b])
+        & (abs(x[1]) <= times * c[b + 1])
+        & (abs(x[2]) <= times * c[b + 2])
+        & (abs(x[3]) <= times * c[b + 3])
+        & (abs(x[4]) <= times * c[b + 4])
+        & (abs(x[5]) <= times * c[b + 5])
+    )
+
+
+@lean
+def _turns_little(c: Array, at: int, q: Six) -> bool:
+    """Whether all angles are within the reach of their sines; False for NaN."""
+    return bool(
+        (abs(c[at + 1] + c[at + 7] * q[0]) <= LARGEST_ANGLE)
+        & (abs(c[at + 10] + c[at + 16] * q[1]) <= LARGEST_ANGLE)
+        & (abs(c[at + 19] + c[at + 25] * q[2]) <= LARGEST_ANGLE)
+        & (abs(c[at + 28] + c[at + 34] * q[3]) <= LARGEST_ANGLE)
+        & (abs(c[at + 37] + c[at + 43] * q[4]) <= LARGEST_ANGLE)
+        & (abs(c[at + 46] + c[at + 52] * q[5]) <= LARGEST_ANGLE)
+    )
+
+
+@lean
+def _two_steps(c: Array, q: Six, aim: Frame, x: Six) -> tuple[Six, Six, float, float, bool]:
+    """Shift after two steps with one matrix, the residual before the last, the steps' squares."""
+    frames = walk(c, ACTUAL, _more(q, 1.0, x))
+    e, near = residual(aim, frames[6])
+    factor, regular = _factor(c, frames)
+    step = _step(factor, e)
+    x, before = _more(x, 1.0, step), _dot(step, step)
+    last, still_near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
+    step = _step(factor, last)
+    return _more(x, 1.0, step), last, before, _dot(step, step), near & regular & still_near
+
+
+@lean
+def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool]:
+    """Shift of the joints, first and last residual, and whether the shift is the solution."""
+    aim = goal(c, q)
+    frames = walk(c, ACTUAL, q)
+    first, near = residual(aim, frames[6])
+    fine = near & _turns_little(c, 0, q) & _turns_little(c, ACTUAL, q)
+    # of no more than this nothing is left to do, and nothing is done
+    fine &= _dot(first, first) > AT_GOAL * AT_GOAL * N
+    factor, regular = _factor(c, frames)
+    x = _step(factor, first)
+    fine &= regular & _within(c, x, 1.0)
+    e, near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
+    step = _step(factor, e)
+    length, along = _dot(x, x), _dot(x, step)
+    fine &= near & (along <= AHEAD * length) & (_dot(step, step) <= BESIDE * BESIDE * length)
+    x, _, _, _, good = _two_steps(c, q, aim, _more(x, 1.0, step))
+    fine &= good
+    x, last, before, size, good = _two_steps(c, q, aim, x)
+    fine &= good & (before <= NEAR * NEAR) & (size <= SHORT * SHORT) & _within(c, x, FAR)
+    return x, first, last, fine
+
+
+@lean
+def _length(x: float, y: float, z: float) -> float:
+    return float(np.sqrt(x * x + y * y + z * z))
+
+
+@lean
+def _correct(c: Array, q: Array, k: int, lanes: int, out: Array) -> None:
+    """Point ``k`` of ``lanes``."""
+    at = (
+        q[k], q[lanes + k], q[2 * lanes + k],
+        q[3 * lanes + k], q[4 * lanes + k], q[5 * lanes + k],
+    )  # fmt: skip
+    x, first, last, fine = _solve(c, at)
+    out[k], out[lanes + k] = at[0] + x[0], at[1] + x[1]
+    out[2 * lanes + k], out[3 * lanes + k] = at[2] + x[2], at[3] + x[3]
+    out[4 * lanes + k], out[5 * lanes + k] = at[4] + x[4], at[5] + x[5]
+    out[POSITION_LEFT * lanes + k] = _length(last[0], last[1], last[2])
+    out[ROTATION_LEFT * lanes + k] = _length(last[3], last[4], last[5])
+    out[FINE * lanes + k] = 1.0 if fine else 0.0
+    out[TCP_SHIFT * lanes + k] = _length(first[0], first[1], first[2])
+    out[TCP_ROTATION * lanes + k] = _length(first[3], first[4], first[5])
+
+
+@kernel
+def correct_one(c: Array, q: Array, out: Array) -> None:
+    """Corrected joints of one point (6,) and its report: ``out`` (11,)."""
+    _correct(c, q, 0, 1, out)
+
+
+@kernel
+def correct_lanes(c: Array, q: Array, out: Array) -> None:
+    """`correct_one` for sixteen points: ``q`` (96,) and ``out`` (176,), joint by joint."""
+    for k in range(LANES):
+        _correct(c, q, k, LANES, out)

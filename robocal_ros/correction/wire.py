@@ -1,0 +1,210 @@
+"""Joint states as they come over the wire, without a message's objects: for fast streams.
+
+Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState``. A stream's
+messages are laid out alike: where their numbers are is found once.
+"""
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.joint_lanes import BEGIN, lanes
+
+HEAD = b"\0\1\0\0"  # plain, little endian
+STAMP, FRAME = len(HEAD), len(HEAD) + 8  # where they begin
+NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where things are in a message: ``frame_id`` up to ``names_end``, then numbers, in bytes."""
+
+    head: bytes
+    frame_id: str
+    names: tuple[str, ...]
+    names_begin: int
+    names_end: int
+    counts: tuple[tuple[int, int], ...]  # where each stands, and what it is
+    places: tuple[int, ...]
+    size: int
+
+    def fits(self, data: bytes) -> bool:
+        return (
+            len(data) == self.size
+            and data[FRAME : self.names_end] == self.head
+            and data[: len(HEAD)] == HEAD
+            and all(_number(data, at) == count for at, count in self.counts)
+        )
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """What compiled code needs to know of messages that are laid out alike.
+
+    Attributes
+    ----------
+    names, frame_id : in them.
+    form : (2, lanes) what all have, and a mask of it.
+    goes : (lanes,) room for what goes out, laid out.
+    layout : of both: see `joint_lanes`.
+    sizes : of both, bytes.
+    """
+
+    names: tuple[str, ...]
+    frame_id: str
+    form: NDArray[np.float64]
+    goes: NDArray[np.float64]
+    layout: NDArray[np.int64]
+    sizes: tuple[int, int]
+
+
+class JointWire:
+    """Reads the joint messages of one topic and writes what goes out for them."""
+
+    def __init__(self) -> None:
+        self._layout: _Layout | None = None
+        self._out = bytearray()
+        self._made_for: tuple[_Layout | None, str] = (None, "")
+        self._places: list[int] = []
+        self._lanes: Lanes | None = None
+
+    def read(self, data: bytes) -> JointCommand | None:
+        """The command in a message; None for one that is not regular, finite and whole."""
+        layout = self._layout
+        if layout is None or not layout.fits(data):
+            layout = self._layout = _layout(data)
+            if layout is None:
+                return None
+        position, velocity, effort = (
+            np.frombuffer(data, np.float64, count, place)
+            for (_, count), place in zip(layout.counts, layout.places, strict=True)
+        )
+        # for so few numbers this takes a fifth of the time of NumPy's isfinite
+        if not all(all(map(math.isfinite, n.tolist())) for n in (position, velocity, effort)):
+            return None
+        sec, nanosec = struct.unpack_from("<iI", data, STAMP)
+        rates = velocity.copy() if len(velocity) else None
+        stamp = sec * NS + nanosec
+        return JointCommand(layout.names, position.copy(), rates, stamp, layout.frame_id)
+
+    def written(self, data: bytes, command: JointCommand) -> bytes:
+        """The message read last, ``data``, with the command's values and mark."""
+        layout = self._layout
+        if layout is None:
+            raise ValueError("no message was read")
+        self._make(layout, command.mark)
+        out = self._out
+        out[STAMP:FRAME] = data[STAMP:FRAME]
+        effort = data[layout.places[2] : layout.places[2] + 8 * layout.counts[2][1]]
+        velocity = b"" if command.velocity is None else command.velocity.tobytes()
+        for at, values in zip(
+            self._places, (command.position.tobytes(), velocity, effort), strict=True
+        ):
+            out[at : at + len(values)] = values
+        return bytes(out)
+
+    def lanes(self, mark: str) -> Lanes | None:
+        """Room for messages laid out as the one read last; None after an irregular one."""
+        layout = self._layout
+        if layout is None:
+            return None
+        self._make(layout, mark)
+        if self._lanes is None:
+            self._lanes = self._in_lanes(layout)
+        return self._lanes
+
+    def _in_lanes(self, layout: _Layout) -> Lanes:
+        known, mask = bytearray(layout.size), bytearray(layout.size)
+        pieces = [(0, HEAD), (FRAME, layout.head)]
+        pieces += [(at, struct.pack("<I", count)) for at, count in layout.counts]
+        for at, piece in pieces:
+            known[at : at + len(piece)], mask[at : at + len(piece)] = piece, b"\xff" * len(piece)
+        ends = [(BEGIN + at) // 8 for at in (*layout.places, *self._places)]
+        return Lanes(
+            layout.names,
+            layout.frame_id,
+            np.stack([_in_lanes(known), _in_lanes(mask)]),
+            _in_lanes(self._out),
+            np.array([*ends, *(count for _, count in layout.counts)]),
+            (layout.size, len(self._out)),
+        )
+
+    def _make(self, layout: _Layout, mark: str) -> None:
+        """Lay the outgoing message out."""
+        if self._made_for[0] is layout and self._made_for[1] == mark:
+            return
+        self._lanes = None
+        text = mark.encode() + b"\0"
+        out = bytearray(HEAD + bytes(8) + struct.pack("<I", len(text)) + text)
+        out += bytes(-len(out) % 4) + layout.head[layout.names_begin - FRAME :]
+        self._places = []
+        for _, count in layout.counts:
+            out += bytes(-len(out) % 4) + struct.pack("<I", count)
+            if count:
+                out += bytes((len(HEAD) - len(out)) % 8)
+            self._places.append(len(out))
+            out += bytes(8 * count)
+        self._out, self._made_for = out, (layout, mark)
+
+
+def _in_lanes(data: bytearray) -> NDArray[np.float64]:
+    out = np.zeros(lanes(len(data)))
+    out.view(np.uint8)[BEGIN : BEGIN + len(data)] = data
+    return out
+
+
+def _number(data: bytes, at: int) -> int:
+    return int.from_bytes(data[at : at + 4], "little")
+
+
+def _layout(data: bytes) -> _Layout | None:
+    """Find where things are; None for what is not a whole regular message with positions."""
+    if data[: len(HEAD)] != HEAD:
+        return None
+    try:
+        frame_id, at = _string(data, FRAME)
+        names_begin = at
+        (count,) = struct.unpack_from("<I", data, at)
+        names, at = [], at + 4
+        if count > len(data):
+            return None
+        for _ in range(count):
+            name, at = _string(data, at)
+            names.append(name)
+        names_end, counts, places = at, [], []
+        for _ in range(3):
+            (count,) = struct.unpack_from("<I", data, at)
+            counts.append((at, count))
+            at += 4 + ((len(HEAD) - at - 4) % 8 if count else 0)
+            places.append(at)
+            at += 8 * count
+    except (struct.error, UnicodeDecodeError):
+        return None
+    k = len(names)
+    whole = at <= len(data) and counts[0][1] == k > 0 and counts[1][1] in (0, k)
+    if not whole:
+        return None
+    head = data[FRAME:names_end]
+    return _Layout(
+        head,
+        frame_id,
+        tuple(names),
+        names_begin,
+        names_end,
+        tuple(counts),
+        tuple(places),
+        len(data),
+    )
+
+
+def _string(data: bytes, at: int) -> tuple[str, int]:
+    """Text and where the next number begins."""
+    (length,) = struct.unpack_from("<I", data, at)
+    end = at + 4 + length
+    if not length > 0 or end > len(data):
+        raise struct.error("a string is longer than the message")
+    return data[at + 4 : end - 1].decode(), end + -end % 4

@@ -1,0 +1,1 @@
+"""Measuring motions: ways, timing, stops, watching the robot, the gap."""

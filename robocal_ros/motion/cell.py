@@ -1,0 +1,141 @@
+"""A robot with its tool at a station, and the check of a motion along its whole way."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core import frames
+from robocal_ros.core.errors import LimitError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.inverse import follow, require_within_limits
+from robocal_ros.motion.housing import Housing, ToolBody
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.stopping import stop_time
+from robocal_ros.motion.tip_path import TipPath
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-6  # relative, of a speed that is driven at its limit
+LARGEST_STEP_M = 5e-4  # no point of the tool moves further from one checked instant to the next
+FEWEST_STEPS = 4  # between two points of a plan
+
+
+@dataclass(frozen=True, eq=False)
+class MotionCell:
+    """What motions are planned for.
+
+    Attributes
+    ----------
+    arm : the model in force, with the joints' limits.
+    T_base_laser : (4, 4) of the station.
+    """
+
+    arm: SerialArm
+    tool: ToolBody
+    T_base_laser: Array
+    housing: Housing
+    limits: MotionLimits = field(default_factory=MotionLimits)
+
+    def T_base_tip(self, q: Array) -> Array:
+        """The tip's place with the flange's axes (4, 4) at joints (n,)."""
+        return self.tip_of(self.arm.fk(q))
+
+    def tip_of(self, T_base_flange: Array) -> Array:
+        """The same from a flange pose (4, 4)."""
+        return np.asarray(T_base_flange @ frames.transform(np.eye(3), self.tool.p_tip))
+
+    def in_laser(self, p_base: Array) -> Array:
+        """Points (..., 3) in the laser frame."""
+        T = self.T_base_laser
+        return np.asarray((p_base - T[:3, 3]) @ T[:3, :3])
+
+    def joints(self, path: TipPath, q_now: Array) -> JointPlan:
+        """A plan along a path that begins where the robot stands.
+
+        Raises
+        ------
+        LimitError
+            As `core.kinematics.inverse.follow`.
+        """
+        found = follow(
+            self.arm, path.T_base_tip, path.twist, path.twist_rate, q_now, self.tool.p_tip
+        )
+        return JointPlan(path.time_s, found.q, found.qd, found.qdd)
+
+    def demand(self, plan: JointPlan, tcp_speed_m_s: float) -> tuple[float, str]:
+        """Largest share of a speed or acceleration limit that a plan takes, and which."""
+        velocity, acceleration, _ = self.limits.of_joints(self.arm)
+        fastest, hardest = plan.peaks()
+        shares = np.concatenate([fastest / velocity, np.sqrt(hardest / acceleration)])
+        worst = int(np.argmax(shares))
+        tip = float(np.max(self._sampled(plan).speed_m_s[:, 0]))
+        if tip / tcp_speed_m_s >= shares[worst]:
+            return tip / tcp_speed_m_s, (
+                f"the tip would move at {tip * 1e3:.2f} mm/s, its limit is "
+                f"{tcp_speed_m_s * 1e3:.2f} mm/s"
+            )
+        joint, of_speed = worst % self.arm.n, worst < self.arm.n
+        value, limit = (fastest, velocity) if of_speed else (hardest, acceleration)
+        what = "velocity" if of_speed else "acceleration"
+        unit = ("m/s" if self.arm.prismatic[joint] else "rad/s") + ("" if of_speed else "^2")
+        return float(shares[worst]), (
+            f"{self.arm.joint_names[joint]} would need a {what} of {value[joint]:.4g} {unit}, "
+            f"its limit is {limit[joint]:.4g} {unit}"
+        )
+
+    def require_clear(self, plan: JointPlan, name: str) -> None:
+        """Refuse a plan that passes a joint limit or comes near the housing anywhere on its way.
+
+        The distance to be kept is what a stop from there needs, and the way from one checked
+        instant to the next.
+
+        Raises
+        ------
+        LimitError
+            Names what comes near, where, and by how much.
+        """
+        seen = self._sampled(plan)
+        require_within_limits(self.arm, seen.q)
+        fastest = np.max(seen.speed_m_s, axis=1)
+        stopping = 0.5 * fastest * stop_time(self.arm, self.limits, seen.qd)
+        margin = float(np.max(stopping) + np.max(fastest) * np.max(np.diff(seen.time_s)))
+        places = self.in_laser(seen.corners)
+        for part, cut in self.tool.cuts(self.housing, places, margin).items():
+            i = int(np.argmax(cut))
+            if cut[i] > 0.0:
+                x, y, z = 1e3 * places[i, 0]
+                raise LimitError(
+                    f"{name}: {part}, with {margin * 1e3:.1f} mm to be kept free, would cut "
+                    f"{cut[i] * 1e3:.1f} mm into the station's housing, the tip at "
+                    f"({x:.1f}, {y:.1f}, {z:.1f}) mm of the laser frame, {seen.time_s[i]:.2f} s "
+                    "after the start: drive the tool above the station by hand, or check the "
+                    "sizes of housing, tool and circle"
+                )
+
+    def _sampled(self, plan: JointPlan) -> "_Sampled":
+        """Between the points too, so that no point of the tool moves by more than a step."""
+        speed = np.max(self._moving(plan.time_s, plan.q, plan.qd).speed_m_s)
+        longest = float(np.max(np.diff(plan.time_s)))
+        steps = max(int(np.ceil(1.1 * speed * longest / LARGEST_STEP_M)), FEWEST_STEPS)
+        inside = plan.time_s[:-1, None] + np.diff(plan.time_s)[:, None] * np.arange(steps) / steps
+        time = np.append(inside.ravel(), plan.time_s[-1])
+        return self._moving(time, *plan.at(time))
+
+    def _moving(self, time: Array, q: Array, qd: Array) -> "_Sampled":
+        T, twist = self.arm.fk(q), (self.arm.jacobian(q) @ qd[:, :, None])[:, :, 0]
+        arms = self.tool.corners @ np.swapaxes(T[:, :3, :3], 1, 2)
+        velocity = twist[:, None, :3] + np.cross(twist[:, None, 3:], arms)
+        return _Sampled(time, q, qd, T[:, None, :3, 3] + arms, np.linalg.norm(velocity, axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """A plan at instants (m,): joints, places (m, 3, 3) and speeds (m, 3) of the tool's corners."""
+
+    time_s: Array
+    q: Array
+    qd: Array
+    corners: Array
+    speed_m_s: Array

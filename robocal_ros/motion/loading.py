@@ -1,0 +1,24 @@
+"""Loads what a motion needs, so that the first one does not wait for it while a robot moves."""
+
+from contextlib import suppress
+
+import numpy as np
+
+from robocal_ros.core.errors import LimitError
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.inverse import inverse
+from robocal_ros.core.tool.flange_path import FEWEST_READINGS, JointPath
+from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.stopping import stop
+
+
+def load_motion(arm: SerialArm) -> None:
+    """Call once what is compiled or imported at its first use: half a second."""
+    import scipy.special  # noqa: F401
+
+    q = np.full(arm.n, 0.3)
+    time = np.linspace(0.0, 0.1, FEWEST_READINGS)
+    JointPath(arm, time, np.tile(q, (len(time), 1))).at(np.array([0.05]))
+    stop(arm, MotionLimits(), q, np.full(arm.n, 0.01)).at(0.0)
+    with suppress(LimitError):  # a posture that some arm does not have
+        inverse(arm, arm.fk(q)[None], q)
