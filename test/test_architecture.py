@@ -28,8 +28,9 @@ MAY_IMPORT = {
 }  # fmt: skip
 ROOMS = {"correction", "motion"}  # each with its own files for ROS, which are nodes as well
 ROS_FILES = {
-    "node", "messages", "action", "settings", "report", "graph", "driver", "topics",
-    "command_sources", "health", "log", "settled_streams", "stream_messages", "path_messages", "gap_sources",
+    "node", "messages", "action", "settings", "report", "graph", "driver", "topics", "log",
+    "command_sources", "health", "settled_streams", "stream_messages", "path_messages",
+    "gap_sources",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",

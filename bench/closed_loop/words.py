@@ -78,7 +78,6 @@ def told_by(session: CorrectionSession) -> ToldCorrection:
         tool_revision=status.tool_revision or 0,
         waiting_tool_revision=status.waiting_tool,
         stale=status.stale,
-        blend_waits=status.waits,
         mismatch=status.mismatch,
         last_refusal=status.last_refusal,
     )

@@ -33,7 +33,6 @@ def test_a_correction_with_what_is_in_force_is_right():
         (WITHOUT, "wire its inputs"),
         (MISMATCH, "joint_a1 is 2 deg beside: see where the robot stands, call ~/enable"),
         (replace(ON, stale="model revision 4 is 90 s old, allowed 60 s"), "90 s old"),
-        (replace(ON, blend_waits="a joint limit is exceeded"), "a joint limit is exceeded"),
     ],
     ids=str,
 )
