@@ -55,7 +55,9 @@ class OffsetLimits:
         if not (0.0 < self.rest <= self.motion) or not (
             0.0 < self.rest_acceleration <= self.motion_acceleration
         ):
-            raise ValueError(f"limits of the offset must be positive, and greatest in motion: {self}")
+            raise ValueError(
+                f"limits of the offset must be positive, and greatest in motion: {self}"
+            )
 
     def row(self) -> tuple[float, float, float, float]:
         """In the order of the limits' rows."""
@@ -67,7 +69,9 @@ SLIDING = OffsetLimits(5e-3, 50e-3, 25e-3, 0.5)
 
 
 @lean
-def _range(rate: float, dt: float, moves: bool, limits: Array, j: int) -> tuple[float, float, float]:
+def _range(
+    rate: float, dt: float, moves: bool, limits: Array, j: int
+) -> tuple[float, float, float]:
     """Least and largest rate of joint ``j`` after a step, and the acceleration that it may have.
 
     One that is faster than the limit at rest as the motion ends slows down as in motion.
