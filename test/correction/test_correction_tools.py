@@ -46,7 +46,7 @@ def test_a_tool_waits_while_a_stream_is_under_way(robot: Robot) -> None:
     assert waiting(robot) is None
     assert robot.session.status().tool_revision == tool.revision
     first = robot.stream()
-    assert np.abs(robot.settle() - first).max() > 100.0 * REST * DT * DT
+    assert np.abs(robot.settle() - first).max() > 1e-3
 
 
 def test_before_anything_was_commanded_it_is_known_at_once() -> None:
@@ -174,7 +174,6 @@ def test_any_joint_state_is_un_corrected_without_being_remembered(robot: Robot) 
     robot.change_tool(bent_tool())
     at = robot.settle()
     robot.read(at)
-    elsewhere = HOME + 0.2
     for x in np.linspace(0.0, 0.2, 200):
         shifted = robot.stream(HOME + x)
     speed = np.full(6, 0.1)
