@@ -74,6 +74,8 @@ class CorrectionConfig:
     model_age_s : a model with an older stamp is not corrected with; 0: any age.
     velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none; None: no joint has one.
     free_axis : the tool may turn about its z.
+    robot_file_hash : of the robot file, where no serial tells robots of one model apart; a model
+        or tool must then have been made with the same file. Empty: the serial tells them apart.
     shadow : commands and readings pass as they came; the correction is only shown.
     """
 
@@ -96,6 +98,7 @@ class CorrectionConfig:
     model_age_s: float = 0.0
     velocity_limits: Array | None = field(default=None, compare=False)
     free_axis: bool = False
+    robot_file_hash: str = ""
     shadow: bool = False
 
     def blend_rates(self, arm: SerialArm) -> Array:

@@ -4,11 +4,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from robocal_ros.core.errors import WrongRobotError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import robot_file_hash
+from robocal_ros.storage.state_files import StateFile
 
 STATE_DIR = Setting(
     "state_dir", "", "Folder of the histories; empty: $ROBOCAL_STATE, else the XDG folder"
@@ -23,7 +26,8 @@ def open_history(
     Raises
     ------
     RobocalError
-        As `CalibrationHistory.open`.
+        As `CalibrationHistory.open`; also where no serial is set and the history was begun with
+        another robot file: nothing else tells two robots of one type apart.
     """
     serial = settings["serial"] or NO_SERIAL
     folder = settings[STATE_DIR.name]
@@ -31,10 +35,35 @@ def open_history(
     history = CalibrationHistory.open(
         serial, model_hash=nominal.model_hash, state_dir=state_dir, sole_user=sole_user
     )
+    if serial == NO_SERIAL:
+        try:
+            _require_robot_file(history, nominal, settings["robot"])
+        except BaseException:
+            history.close()
+            raise
     return serial, history
+
+
+def _require_robot_file(history: CalibrationHistory, nominal: SerialArm, robot: str) -> None:
+    """Refuse a nameless history that was begun with another robot file than this one."""
+    kept = StateFile(history.path, "robot_file")
+    own, known = {"robot": nominal.name, "robot_file_hash": robot_file_hash(robot)}, kept.load()
+    if known is None:
+        kept.save(own)
+    elif known != own:
+        raise WrongRobotError(
+            f"no serial is set, and {history.path} was begun with another robot file (hash "
+            f"{known.get('robot_file_hash')} of robot '{known.get('robot')}', this is "
+            f"{own['robot_file_hash']} of '{nominal.name}'): set the serial of each robot; if it "
+            f"is the same robot with its file changed, remove the folder {kept.path.parent}"
+        )
 
 
 def warn_without_serial(health: Health, serial: str) -> None:
     """Tell that no serial is set, where none is."""
     if serial == NO_SERIAL:
-        health.worsen(WARN, f"no serial is set: the history is kept as '{NO_SERIAL}'")
+        health.worsen(
+            WARN,
+            f"no serial is set: the history is kept as '{NO_SERIAL}', and only the robot file "
+            "tells this robot from another one of its type",
+        )
