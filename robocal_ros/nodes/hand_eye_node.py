@@ -28,7 +28,7 @@ from robocal_ros.nodes.hand_eye_files import HandEyeFiles
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.stamp_watch import StampWatch
@@ -264,7 +264,8 @@ class HandEyeNode(HouseNode):
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        warn_without_serial(health, self._serial_in_use)
+        if self._history is not None:
+            warn_of_history(health, self._history)
         health.values = values
         return health
 

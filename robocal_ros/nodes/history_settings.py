@@ -10,6 +10,8 @@ from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.history_damage import damage_notice
+from robocal_ros.storage.history_paths import history_path, state_folder
 from robocal_ros.storage.robots import robot_file_hash
 from robocal_ros.storage.state_files import StateFile
 
@@ -19,9 +21,11 @@ STATE_DIR = Setting(
 
 
 def open_history(
-    settings: Mapping[str, Any], nominal: SerialArm, sole_user: str = ""
+    settings: Mapping[str, Any], nominal: SerialArm, sole_user: str = "", *, owner: bool = True
 ) -> tuple[str, CalibrationHistory]:
     """The serial in use and its history; ``sole_user``: a node of which a robot has one at most.
+
+    ``owner``: a damaged history is set aside; who only adds to it is refused.
 
     Raises
     ------
@@ -29,11 +33,13 @@ def open_history(
         As `CalibrationHistory.open`; also where no serial is set and the history was begun with
         another robot file: nothing else tells two robots of one type apart.
     """
-    serial = settings["serial"] or NO_SERIAL
-    folder = settings[STATE_DIR.name]
-    state_dir = Path(folder) if folder else None
+    serial, state_dir = settings["serial"] or NO_SERIAL, _folder(settings)
     history = CalibrationHistory.open(
-        serial, model_hash=nominal.model_hash, state_dir=state_dir, sole_user=sole_user
+        serial,
+        model_hash=nominal.model_hash,
+        state_dir=state_dir,
+        sole_user=sole_user,
+        owner=owner,
     )
     if serial == NO_SERIAL:
         try:
@@ -59,9 +65,25 @@ def _require_robot_file(history: CalibrationHistory, nominal: SerialArm, robot: 
         )
 
 
-def warn_without_serial(health: Health, serial: str) -> None:
-    """Tell that no serial is set, where none is."""
-    if serial == NO_SERIAL:
+def history_notice(settings: Mapping[str, Any]) -> str:
+    """Tell of a damaged history that nobody has acknowledged; empty without one.
+
+    For a node that does not hold the history open.
+    """
+    folder = _folder(settings) or state_folder()
+    return damage_notice(history_path(settings["serial"] or NO_SERIAL, folder))
+
+
+def _folder(settings: Mapping[str, Any]) -> Path | None:
+    folder = settings[STATE_DIR.name]
+    return Path(folder) if folder else None
+
+
+def warn_of_history(health: Health, history: CalibrationHistory) -> None:
+    """Tell of a damaged history that nobody has acknowledged, and that no serial is set."""
+    if notice := damage_notice(history.path):
+        health.worsen(WARN, notice)
+    if history.serial == NO_SERIAL:
         health.worsen(
             WARN,
             f"no serial is set: the history is kept as '{NO_SERIAL}', and only the robot file "

@@ -19,7 +19,7 @@ from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.stamp_watch import StampWatch
@@ -281,7 +281,7 @@ class TcfNode(HouseNode):
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        warn_without_serial(health, self._serial_in_use)
+        warn_of_history(health, history)
         health.values = values
         return health
 

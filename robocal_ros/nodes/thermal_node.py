@@ -19,7 +19,7 @@ from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.data_clock import DataClock
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.set_up_services import SetUpServices
 from robocal_ros.nodes.source_guard import SourceGuard
@@ -225,12 +225,10 @@ class ThermalNode(HouseNode):
             health.worsen(ERROR, self._guard.fault)
         if session.fault:
             health.worsen(ERROR, session.fault)
-        if history.damaged is not None:
-            health.worsen(WARN, f"a damaged history was set aside as {history.damaged}")
         lost = [topic for topic, count in self.inputs.items() if count.lost]
         if lost:
             health.worsen(WARN, f"messages lost on {', '.join(lost)}")
-        warn_without_serial(health, self._serial_in_use)
+        warn_of_history(health, history)
         health.values = values
         return health
 
