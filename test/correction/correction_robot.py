@@ -11,21 +11,27 @@ from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool, TrajectoryCommand
-from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.limiter import TURNING
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_description
 
+DESCRIPTION = load_description("kr150_r3100")
 NOMINAL = replace(
-    load_robot("kr150_r3100"),
-    T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2]),
+    DESCRIPTION.arm, T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2])
 )
 NAMES = NOMINAL.joint_names
 HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
-RATE = np.radians(0.5)
-DT = 0.002
-ROUNDING = 1e-12
-NOT_STRAIGHT = np.radians(2.0) ** 2 / 8  # rad: second order of the longest blend below, 4 s long
+DT = 0.004
+LIMITS = {
+    "velocity_limits": DESCRIPTION.max_velocity,
+    "acceleration_limits": DESCRIPTION.max_acceleration,
+}
+# Of the offset, as the house promises it: at rest, and never more.
+REST, FASTEST = np.radians(2.0), np.radians(10.0)
+REST_A, LARGEST_A = np.radians(20.0), np.radians(200.0)
+ROUNDING = 1e-9
+assert (REST, REST_A, FASTEST, LARGEST_A) == pytest.approx(TURNING.row())
 
 
 def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:
@@ -75,34 +81,39 @@ class Robot:
     """A session, the time in which it is used, and a robot that goes where it is sent."""
 
     def __init__(self, **config: Any) -> None:
-        self.session = CorrectionSession(NOMINAL, NOMINAL, "s1", CorrectionConfig(**config))
+        settings = CorrectionConfig(**(LIMITS | config))
+        self.session = CorrectionSession(NOMINAL, NOMINAL, "s1", settings)
         self.now = 100.0
         self.at = HOME
+        self.rest()
 
     def stream(self, q: np.ndarray = HOME, dt: float = DT, **fields: Any) -> np.ndarray:
+        """Send a target, and let the robot follow it."""
         self.now += dt
         self.read(self.at)
-        self.at = self.session.target(JointCommand(NAMES, np.array(q), **fields), self.now).position
+        names = fields.pop("names", NAMES)
+        out = self.session.target(JointCommand(names, np.array(q), **fields), self.now)
+        self.go(out)
         return self.at
 
+    def go(self, command: JointCommand) -> None:
+        self.at = self.at.copy()
+        for name, position in zip(command.names, command.position, strict=True):
+            self.at[NAMES.index(name)] = position
+
     def settle(self, q: np.ndarray = HOME) -> np.ndarray:
-        out = self.stream(q)
-        for _ in range(5000):
+        for _ in range(3000):
             out = self.stream(q)
             if self.session.status().settled:
                 return out
-        pytest.fail("the blend does not end")
+        pytest.fail("the offset does not settle")
 
     def rest(self, seconds: float = 0.5) -> None:
         """Nothing is commanded, and the robot stands."""
-        for _ in range(round(seconds / 0.05)):
-            self.now += 0.05
+        for _ in range(round(seconds / 0.01)):
+            self.now += 0.01
             self.read(self.at)
         self.session.look(self.now, 0)
-
-    def change_tool(self, tool: OfferedTool) -> None:
-        self.session.offer_tool(tool)
-        self.rest()
 
     def read(self, q: np.ndarray, **fields: Any) -> JointCommand:
         return self.session.reading(JointCommand(NAMES, np.array(q), **fields), self.now)
@@ -119,7 +130,7 @@ def distance(a: np.ndarray, b: np.ndarray) -> float:
 def refused(reason: Reason, act: Any, *arguments: Any, **fields: Any) -> str:
     with pytest.raises(RefusedError) as caught:
         act(*arguments, **fields)
-    assert caught.value.reason is reason
+    assert caught.value.reason is reason, caught.value
     return str(caught.value)
 
 
@@ -128,33 +139,20 @@ def still(q: np.ndarray = HOME, first_s: float = 0.0, seconds: float = 20.0) -> 
     return TrajectoryCommand(NAMES, np.tile(q, (41, 1)), times)
 
 
-def good_here_only() -> tuple[SerialArm, np.ndarray]:
-    """A drift that is within the bounds at home, and a posture where it is not."""
-    far = HOME + np.array([1.0, 0.6, -0.8, 1.0, 0.6, 1.0])
-    bounds = CorrectionConfig().thermal
-    for seed in range(400):
-        arm = drifted(6.0, seed)
-        here, there = (JointCorrection.between(NOMINAL, arm).correct(q) for q in (HOME, far))
-        if bounds.hold(here).all() and there.tcp_shift_m > 1.05e-3:
-            return arm, far
-    pytest.fail("no such drift")
-
-
-def swing(m: int = 201, duration: float = 2.0) -> TrajectoryCommand:
+def swing(m: int = 201, duration: float = 2.0, first_s: float = 0.0) -> TrajectoryCommand:
     """A move from rest to rest with its true rates."""
     t = np.linspace(0.0, duration, m)
     w = np.pi / duration
     reach = np.array([0.4, -0.2, 0.3, -0.4, 0.3, 0.5])
     shape = [0.5 * (1 - np.cos(w * t)), 0.5 * w * np.sin(w * t), 0.5 * w * w * np.cos(w * t)]
     q, v, a = (x[:, None] * reach for x in shape)
-    return TrajectoryCommand(NAMES, HOME + q, t, v, a)
+    return TrajectoryCommand(NAMES, HOME + q, first_s + t, v, a)
 
 
-def large() -> Robot:
+def large(**config: Any) -> Robot:
     """Enabled, with a drift and a bent tool, at rest at home, uncorrected: shifts of degrees."""
-    robot = Robot()
+    robot = Robot(**config)
     robot.session.offer_model(offer(drifted()))
     robot.session.offer_tool(bent_tool())
-    robot.read(HOME)
     robot.session.enable(True)
     return robot
