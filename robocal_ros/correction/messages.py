@@ -61,10 +61,15 @@ def fill_path(message: Any, command: TrajectoryCommand) -> None:
                 setattr(point, name, doubles(row))
 
 
-def drop_unknown_efforts(message: Any) -> None:
-    """Empty the efforts of a ``JointState`` that are not finite: many drivers have none."""
-    if not np.all(np.isfinite(message.effort)):
-        message.effort = doubles(np.empty(0))
+def drop_unknown_rates(message: Any) -> None:
+    """Empty velocities and efforts of a ``JointState`` that are not finite, or of another number.
+
+    joint_state_broadcaster writes NaN for what the hardware has not: absent ones.
+    """
+    for field in ("velocity", "effort"):
+        values = getattr(message, field)
+        if len(values) != len(message.position) or not np.all(np.isfinite(values)):
+            setattr(message, field, doubles(np.empty(0)))
 
 
 def is_finite(message: Any) -> bool:

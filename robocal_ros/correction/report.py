@@ -66,7 +66,7 @@ class CorrectionReport:
             reference_hash=reference.model_hash,
             taught_tool=(*T[:3, 3].tolist(), *frames.quat_xyzw(T).tolist()),
         )
-        self._log = CorrectionLog(lambda: open_history(settings, nominal)[1])
+        self._log = CorrectionLog(lambda: open_history(settings, nominal, owner=False)[1])
 
     def close(self) -> None:
         """Finish the history."""

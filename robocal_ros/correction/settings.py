@@ -12,9 +12,10 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
+from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.storage.robots import load_description, load_robot
+from robocal_ros.storage.robots import load_description, load_robot, robot_file_hash
 
 NOMINAL = "nominal"
 
@@ -249,6 +250,7 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
             settings[f"{what}_tcp_mm"] * 1e-3, *(float(np.radians(x)) for x in degrees)
         )
 
+    nameless = settings["serial"] in ("", NO_SERIAL)
     return CorrectionConfig(
         thermal=bounds("thermal"),
         tool=bounds("tool"),
@@ -265,5 +267,6 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         model_age_s=settings["model_age_s"],
         free_axis=settings["free_axis"],
         velocity_limits=_velocity_limits(settings),
+        robot_file_hash=robot_file_hash(settings["robot"]) if nameless else "",
         shadow=settings["shadow"],
     )

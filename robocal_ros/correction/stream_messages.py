@@ -34,7 +34,7 @@ class JointMessage:
     Parameters
     ----------
     wire : of its topic.
-    is_reading : efforts that are not finite go out empty: many drivers have none.
+    is_reading : velocities and efforts that are not finite go out empty: many drivers have none.
 
     Raises
     ------
@@ -49,7 +49,7 @@ class JointMessage:
         if self._command is None:
             self._message = read_message(data, JointState)
             if is_reading:
-                messages.drop_unknown_efforts(self._message)
+                messages.drop_unknown_rates(self._message)
 
     def is_finite(self) -> bool:
         """Whether every number is finite."""

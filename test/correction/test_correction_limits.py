@@ -79,6 +79,22 @@ def test_models_of_others_are_not_taken_over(
     assert robot.session.status().revision is None
 
 
+def test_without_serials_robots_share_a_model_only_with_the_same_robot_file() -> None:
+    nameless = Robot(robot_file_hash="0123456789abcdef")
+    for other in ("", "fedcba9876543210"):
+        told = refused(
+            Reason.WRONG_ROBOT,
+            nameless.session.offer_model,
+            offer(drifted(), robot_file_hash=other),
+        )
+        assert "set the serial" in told
+        refused(Reason.WRONG_ROBOT, nameless.session.offer_tool, bent_tool(robot_file_hash=other))
+    nameless.session.offer_model(offer(drifted(), robot_file_hash="0123456789abcdef"))
+    nameless.session.offer_tool(bent_tool(robot_file_hash="0123456789abcdef"))
+    named = Robot()
+    named.session.offer_model(offer(drifted(), robot_file_hash="fedcba9876543210"))
+
+
 def test_revisions_only_grow(warm: Robot) -> None:
     warm.session.offer_model(offer(drifted(), 1))  # the same again, from a restarted node
     refused(Reason.OLD_REVISION, warm.session.offer_model, offer(drifted(0.5), 1))
