@@ -73,7 +73,7 @@ class DesiredOffset:
         self.stage = self.known if on else None
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
-        """Wanted offsets (m, n) at taught joints (m, n); raises `RefusedError` as the policy says."""
+        """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
         if self.stage is None:
             self.tcp_shift_m = self.largest = self.remaining_m = 0.0
             return np.zeros_like(q), None

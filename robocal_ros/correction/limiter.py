@@ -9,7 +9,7 @@ correction follows the posture.
 With the offset o, its rate v, the desired offset d and the withheld part e = o - d, each step of
 dt follows the desired rate w = d' and takes e back along its own direction,
 
-    v = w - e / T,    T = max_j |e_j| / u_j,    u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (1)
+    v = w - e / T,   T = max_j |e_j| / u_j,   u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (1)
 
 where u_j is the fastest rate that half of the acceleration a still brings to rest within |e_j| in
 steps of dt, and no more than the limit at rest. Then each joint's v is held to its limits, and a

@@ -199,6 +199,7 @@ def message(**changes: Any) -> SimpleNamespace:
         "robot": NOMINAL.name,
         "serial": "s1",
         "model_hash": NOMINAL.model_hash,
+        "robot_file_hash": "",
         "revision": 3,
         "tool": SimpleNamespace(
             translation=SimpleNamespace(**vector), rotation=SimpleNamespace(**turn)
