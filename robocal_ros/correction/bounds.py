@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 
 # What floating point adds to a value that lies on its bound.
 ROUNDING = 1e-9
-# Near a singularity less is corrected from this share of the bound on, which the first Newton
-# step is held against: the solution may bend a little beyond its first step.
+# Weak directions are damped for this share of the bound: the solution may bend a little beyond
+# the first order.
 FADES_FROM = 0.8
 # What a survey looks at: +-3 sigma of the share are 5 % at most.
 POSTURES = 1000
@@ -145,8 +145,7 @@ def survey(reference: SerialArm, actual: SerialArm, bounds: ShiftBounds) -> Surv
 def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialArm) -> None:
     """Refuse a correction that is beyond its bounds; names the first point that is.
 
-    Near a singularity the arm's drift may be corrected in part: what remains is less than the
-    bound at the tool. A tool's change is corrected in full or not at all.
+    Near a singularity the weak direction is corrected in part; what remains is reported.
     """
     drift = result.arm
     bound = config.thermal
@@ -160,8 +159,6 @@ def require_within(result: StagedResult, config: CorrectionConfig, arm: SerialAr
         _require(fine, Reason.TCP_BOUND, detail)
     _require_joints(drift.joint_shift, bound.of_joints(arm), arm)
     if result.tool is not None:
-        detail = "a singularity is too near to make up for the tool's change"
-        _require(result.tool.share == 1.0, Reason.JOINT_BOUND, detail)
         _require_joints(result.tool.joint_shift, config.tool.of_joints(arm), arm)
 
 

@@ -1,7 +1,7 @@
 """Correction of which no more is made than its bounds and the joint limits allow.
 
 With d(q) the whole shift of the joints, the shift made is k(q) d(q), with one share for all
-joints as near a singularity:
+joints:
 
     k = min(1, b_tool / e_tool, b_j / |d_j|, m_j / (FADES_WITHIN D_j))                        (1)
 
@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import FADES_FROM, CorrectionConfig, Policy
-from robocal_ros.correction.plainness import EXACT, FADES_WITHIN
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
 
 Array = NDArray[np.float64]
 
 TINY = 1e-300
-MOST_STEPS = 60
+FADES_WITHIN = 3.0  # of a joint limit
 
 
 @dataclass(frozen=True)
@@ -52,18 +51,16 @@ class ClampedCorrection(StagedCorrection):
     """A `StagedCorrection` that makes as much of the shift as the bounds allow (equation 1)."""
 
     def __init__(
-        self, reference: Array, start: Array, end: Array, arm: SerialArm, config: CorrectionConfig
+        self, reference: Array, actual: Array, arm: SerialArm, config: CorrectionConfig
     ) -> None:
         thermal, tool = config.thermal.of_joints(arm), config.tool.of_joints(arm)
-        super().__init__(
-            reference, start, end, FADES_FROM * thermal, tool, free_axis=config.free_axis
-        )
+        super().__init__(reference, actual, FADES_FROM * thermal, tool, config.free_axis)
         self._thermal, self._joint_bounds = config.thermal, (thermal, tool)
         self._lower, self._upper = arm.lower, arm.upper
 
-    def correct(self, q: Array, s: Array) -> ClampedResult:
-        """Correct joints (m, n) at blends (m,)."""
-        full = super().correct(q, s)
+    def correct(self, q: Array) -> ClampedResult:
+        """Correct joints (m, n)."""
+        full = super().correct(q)
         shares = self._shares(q, full)
         worst = min(shares, key=lambda reason: float(np.min(shares[reason])))
         kept = np.minimum(1.0, np.min(list(shares.values()), axis=0))
@@ -71,29 +68,6 @@ class ClampedCorrection(StagedCorrection):
         made = np.where((kept == 1.0)[:, None], full.q, part)
         reason = worst if np.any(kept < 1.0) else None
         return ClampedResult(made, full.arm, full.tool, kept, reason)
-
-    def inverse(self, corrected: Array, s: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Taught joints (m, n) of corrected ones, and whether all of the correction is made there.
-
-        Where a bound holds or a singularity is near, by plain steps until it is exact or as near
-        as it gets: the inverse of the whole correction would lead astray.
-        """
-        made = self.correct(corrected, s)
-        if np.all(made.whole):
-            return super().inverse(corrected, s)
-        q, answer, best = corrected, corrected, np.full(len(corrected), np.inf)
-        whole = np.zeros(len(corrected), dtype=np.bool_)
-        for _ in range(MOST_STEPS):
-            miss = corrected - made.q
-            size = np.max(np.abs(miss), axis=1)
-            answer = np.where((size < best)[:, None], q, answer)
-            whole = np.where(size < best, made.whole, whole)
-            best = np.minimum(best, size)
-            if np.all(best < EXACT):
-                break
-            q = q + miss
-            made = self.correct(q, s)
-        return answer, whole
 
     def _shares(self, q: Array, full: StagedResult) -> dict[Reason, Array]:
         """Largest share (m,) of the shift by each bound; equation 1."""
@@ -114,16 +88,10 @@ class ClampedCorrection(StagedCorrection):
 
 
 def correction_between(
-    reference: Array, start: Array, end: Array, arm: SerialArm, config: CorrectionConfig
+    reference: Array, actual: Array, arm: SerialArm, config: CorrectionConfig
 ) -> StagedCorrection:
     """The correction from one model to another that the policy asks for."""
     if config.policy is not Policy.REFUSE:
-        return ClampedCorrection(reference, start, end, arm, config)
-    return StagedCorrection(
-        reference,
-        start,
-        end,
-        FADES_FROM * config.thermal.of_joints(arm),
-        config.tool.of_joints(arm),
-        free_axis=config.free_axis,
-    )
+        return ClampedCorrection(reference, actual, arm, config)
+    thermal, tool = config.thermal.of_joints(arm), config.tool.of_joints(arm)
+    return StagedCorrection(reference, actual, FADES_FROM * thermal, tool, config.free_axis)

@@ -6,18 +6,23 @@ Given taught joints q, the corrected joints q' satisfy
 
 by Newton steps with the geometric Jacobian at the tool.
 
-Near a singularity the exact q' leaves every bound. There only a share of the correction is made:
-with x = J^-1 e the first Newton step and b the largest allowed shift of each joint,
+Near a singularity the exact q' leaves every bound. There the weak direction alone is given up:
+with e the twist (m, rad) that is left at the tool, J the Jacobian at q and J J^T = U S U^T,
 
-    share = min(1, 1 / max_j(|x_j| / b_j)^2)                                             (2)
+    q' = q + J^T y,   e(q') = D y,   D = U diag(d(s)) U^T,                                (2)
+    d(s) = l^2 (1 - s / (3 l^2))^3 below s = 3 l^2, else exactly 0.
 
-and (1) is solved exactly for the pose that lies this share of the way from the uncorrected to
-the taught one. So the shift stays within about b, is continuous in q through the singularity
-(where it is zero), and the remaining error is (1 - share) times the uncorrected one: never more
-than without correction.
+To first order the shift is sigma / (sigma^2 + d) times the error along each singular direction.
+Directions with d = 0 are corrected exactly. The damping is as strong as the error asks for:
+
+    l^2 = |e| hypot(1 / slope, 0.3 |e| / b^2),   |e|^2 = e(q)^2 + (1 um)^2               (3)
+
+so that the shift changes by no more than about ``slope`` per unit of a singular value, for any
+size of error (the first term), and two joints that share it keep within their bound b (the
+second). Every function here has two continuous derivatives: q' has a bounded slope in q.
 
 A tool that may turn about its z (`free_axis`) leaves five equations: its origin and its axis. The
-turn is then the one that moves the joints least, and only where these five are singular is less
+shift then is the least one (of the form J^T y), and only where these five are weak is less
 corrected.
 """
 
@@ -29,12 +34,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction import kernels, solution
+from robocal_ros.correction import solution
 from robocal_ros.correction.room import work_size
 
 Array = NDArray[np.float64]
 
 LARGEST_SHIFT = 1.0
+# Of the shift per unit of a singular value: at 60 deg/s of the joints a drift's correction moves
+# by less than 2 deg/s; a tool's, which is larger, keeps the map from taught joints one to one.
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 30.0, 1.0 / 2.0
+SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 RATE_STEP_S = 1e-3
 
 
@@ -58,16 +67,6 @@ def plain(values: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     return np.require(array, requirements=["C", "W"])
 
 
-def blend_models(start: Array, end: Array, s: float) -> Array:
-    """Packed model between two: ``start`` at s = 0, ``end`` at 1, exactly.
-
-    Lengths and joint offsets vary linearly, rotations along the chord between the two.
-    """
-    out = np.empty_like(start)
-    kernels.blend(start, end, float(s), out)
-    return out
-
-
 @dataclass(frozen=True)
 class CorrectionResult:
     """Corrected joints with what is left and what was done; scalars for one point, else (m,).
@@ -80,7 +79,7 @@ class CorrectionResult:
     iterations : Newton steps taken.
     converged : False where the point could not be solved; ``q`` then is the input.
     tcp_shift_m, tcp_rotation_rad : error at the tool without the correction.
-    share : part of the correction that was made; below 1 only near a singularity.
+    weak : whether a weak direction was given up, in part or in full.
     joint_shift : (n,) or (m, n) corrected less given joints.
     """
 
@@ -91,7 +90,7 @@ class CorrectionResult:
     converged: NDArray[np.bool_]
     tcp_shift_m: Array
     tcp_rotation_rad: Array
-    share: Array
+    weak: NDArray[np.bool_]
     joint_shift: Array
 
 
@@ -100,26 +99,34 @@ class JointCorrection:
 
     Parameters
     ----------
-    models : (4, n + 2, 9) packed reference and actual model, each at the start and at the end
-        of a blend (see `pack_model`, `between`).
-    largest : largest shift of a joint, rad (prismatic: m), for all or (n,) for each: bounds what
-        is done near a singularity, see equation 2.
+    models : (2, n + 2, 9) packed reference and actual model (see `pack_model`, `between`).
+    largest : largest shift of a joint, rad (prismatic: m), for all or (n,) for each; the turning
+        joints' least one is b of equation 3.
     free_axis : the tool may turn about its z; the turn is used to move the joints least.
+    slope : of equation 3.
     """
 
     def __init__(
-        self, models: Array, largest: ArrayLike = LARGEST_SHIFT, free_axis: bool = False
+        self,
+        models: Array,
+        largest: ArrayLike = LARGEST_SHIFT,
+        free_axis: bool = False,
+        slope: float = DRIFT_SLOPE,
     ) -> None:
         self.models = plain(models)
-        self.free_axis = free_axis
+        self.free_axis, self.slope = free_axis, slope
         self.n = self.models.shape[1] - 2
-        if self.models.shape != (4, self.n + 2, 9):
-            raise ValueError(f"models have shape {self.models.shape}, expected (4, n + 2, 9)")
+        if self.models.shape != (2, self.n + 2, 9):
+            raise ValueError(f"models have shape {self.models.shape}, expected (2, n + 2, 9)")
         self.largest = plain(largest, (self.n,)).copy()
         if not np.all(self.largest > 0.0):
             raise ValueError(f"largest shift must be positive: {self.largest}")
-        self._work = np.empty(work_size(self.n))
-        self._inverse: JointCorrection | None = None  # made once, for a stream of readings
+        turning = self.models[1, : self.n, 8] < 0.5
+        least = float(np.min(self.largest[turning] if np.any(turning) else self.largest))
+        self.work = np.zeros(work_size(self.n))
+        solution.prepare(
+            self.models, self.largest, 1.0 / slope, SHARED / least**2, free_axis, self.work
+        )
 
     @classmethod
     def between(
@@ -128,25 +135,23 @@ class JointCorrection:
         actual: SerialArm,
         largest: ArrayLike = LARGEST_SHIFT,
         free_axis: bool = False,
+        slope: float = DRIFT_SLOPE,
     ) -> "JointCorrection":
         """Correction from one arm to another, each with its base and its ``T_flange_tool``."""
         if reference.n != actual.n or np.any(reference.prismatic != actual.prismatic):
             raise ValueError(f"{reference.name} and {actual.name} have different joints")
-        first, second = pack_model(reference), pack_model(actual)
-        return cls(np.stack([first, first, second, second]), largest, free_axis)
+        models = np.stack([pack_model(reference), pack_model(actual)])
+        return cls(models, largest, free_axis, slope)
 
-    def correct(self, q: ArrayLike, s: ArrayLike = 1.0) -> CorrectionResult:
-        """Correct joints (n,) or (m, n), at blend s (one, or one per point).
+    def correct(self, q: ArrayLike) -> CorrectionResult:
+        """Correct joints (n,) or (m, n).
 
         A point's result does not depend on its neighbours: a batch gives a single point's bits.
         """
         joints = np.asarray(q, dtype=np.float64)
         points = plain(joints.reshape(-1, self.n))
         out = np.empty((len(points), self.n + solution.REPORT))
-        blends = plain(s, (len(points),))
-        solution.correct_batch(
-            points, self.models, blends, self.largest, self.free_axis, self._work, out
-        )
+        solution.correct_batch(points, self.largest, self.free_axis, self.work, out)
         lead = joints.shape[:-1]
         corrected, report = plain(out[:, : self.n]), out[:, self.n :].T.reshape(-1, *lead)
         return CorrectionResult(
@@ -157,27 +162,23 @@ class JointCorrection:
             converged=report[solution.CONVERGED] > 0.5,
             tcp_shift_m=report[solution.TCP_SHIFT],
             tcp_rotation_rad=report[solution.TCP_ROTATION],
-            share=report[solution.SHARE],
+            weak=report[solution.WEAK] > 0.5,
             joint_shift=(corrected - points).reshape(joints.shape),
         )
 
     def inverse(self) -> "JointCorrection":
         """The correction with the models exchanged: from corrected to taught joints.
 
-        Exact (to 1e-12 rad for condition numbers below 1e3) where the share is 1, all six
-        equations hold and no singularity lies within the shift (beyond it stands the mirrored
-        posture); with a free axis it chooses another turn, which differs by the second order of
-        the shift. `staged.StagedCorrection.uncorrect` refines both.
+        Exact (to 1e-12 rad for condition numbers below 1e3) where no direction is weak and all
+        six equations hold. `staged.StagedCorrection.uncorrect` is exact in the other postures too.
         """
-        if self._inverse is None:
-            self._inverse = JointCorrection(self.models[[2, 3, 0, 1]], self.largest, self.free_axis)
-        return self._inverse
+        return JointCorrection(self.models[::-1], self.largest, self.free_axis, self.slope)
 
 
 def path_rates(
-    corrected: Callable[[Array, float], Array], q: Array, velocity: Array, acceleration: Array
+    corrected: Callable[[Array], Array], q: Array, velocity: Array, acceleration: Array
 ) -> tuple[Array, Array]:
-    """Rates (m, n) of ``corrected(q, t)`` along the path q + v t + a t^2 / 2 at t = 0.
+    """Rates (m, n) of ``corrected(q)`` along the path q + v t + a t^2 / 2 at t = 0.
 
     Central differences of the shift over 1 ms each way.
     """
@@ -185,7 +186,7 @@ def path_rates(
     shift = []
     for t in (-h, 0.0, h):
         at = q + velocity * t + 0.5 * acceleration * t * t
-        shift.append(corrected(at, t) - at)
+        shift.append(corrected(at) - at)
     before, here, after = shift
     rate = (after - before) / (2.0 * h)
     return velocity + rate, acceleration + (after - 2.0 * here + before) / h**2

@@ -1,49 +1,25 @@
-"""Compiled parts of the joint correction: blended models, goals, shares.
+"""Compiled algebra of the joint correction: goals, residuals, and the damping of weak directions.
 
-A packed model (n + 2, 9) holds one row per joint (as ``kinematics.kernels.pack_links``), then
-the root's pose in the base and the tool's pose on the flange (as ``kinematics.newton`` packs
-them). Angles in rad, lengths in m, twists [v; w] in base axes at the tool.
+Twists [v; w] in base axes at the tool, m and rad: 1 m and 1 rad weigh the same (a singular value
+of the Jacobian of 0.1 means a joint speed of 10 rad/s for 1 m/s or 1 rad/s at the tool).
+
+A free axis is the tool's z: a turn about it is left out of the residual and of the Jacobian.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import lean
-from robocal_ros.core.kinematics.newton import copy, length
+from robocal_ros.core.kinematics import newton
 
 Array = NDArray[np.float64]
 
-
-@lean
-def blend(a: Array, b: Array, s: float, out: Array) -> None:
-    """Model between two packed ones: lengths and angles linear, rotations along the chord."""
-    n = a.shape[0] - 2
-    if s <= 0.0 or s >= 1.0:
-        copy(a if s <= 0.0 else b, out)
-        return
-    for i in range(n):
-        for c in range(3):
-            out[i, c] = a[i, c] + s * (b[i, c] - a[i, c])
-        for c in (3, 5):
-            x = a[i, c] + s * (b[i, c] - a[i, c])
-            y = a[i, c + 1] + s * (b[i, c + 1] - a[i, c + 1])
-            norm = np.sqrt(x * x + y * y)
-            out[i, c], out[i, c + 1] = x / norm, y / norm
-        out[i, 7], out[i, 8] = b[i, 7], b[i, 8]
-    for i in (n, n + 1):
-        same = 0.0
-        for c in range(4):
-            same += a[i, c] * b[i, c]
-        sign = -1.0 if same < 0.0 else 1.0
-        square = 0.0
-        for c in range(4):
-            out[i, c] = a[i, c] + s * (sign * b[i, c] - a[i, c])
-            square += out[i, c] * out[i, c]
-        for c in range(4):
-            out[i, c] /= np.sqrt(square)
-        for c in range(4, 7):
-            out[i, c] = a[i, c] + s * (b[i, c] - a[i, c])
-        out[i, 7], out[i, 8] = 0.0, 0.0
+# Errors at the tool (m, rad) below this are damped as this: what no robot repeats to.
+LEAST_ERROR = 1e-6
+# Squared singular values from so many lambda^2 on are not damped; at 3 the damping of the first
+# order cancels the singular value's own growth.
+WINDOW = 3.0
+MOST_SWEEPS = 12
 
 
 @lean
@@ -60,32 +36,150 @@ def swap_tool(T: Array, old: Array, new: Array) -> None:
 
 
 @lean
-def part_of_the_way(T: Array, e: Array, share: float, goal: Array) -> None:
-    """Pose ``goal``: ``T`` moved by a share of the twist ``e``."""
-    turn = length(e, 3)
-    c, s = np.cos(share * turn), np.sin(share * turn)
-    turn = max(turn, 1e-300)
-    u0, u1, u2 = e[3] / turn, e[4] / turn, e[5] / turn
-    for k in range(3):
-        a0, a1, a2 = T[0, k], T[1, k], T[2, k]
-        along = (u0 * a0 + u1 * a1 + u2 * a2) * (1.0 - c)
-        goal[0, k] = a0 * c + (u1 * a2 - u2 * a1) * s + u0 * along
-        goal[1, k] = a1 * c + (u2 * a0 - u0 * a2) * s + u1 * along
-        goal[2, k] = a2 * c + (u0 * a1 - u1 * a0) * s + u2 * along
-    for r in range(3):
-        goal[r, 3] = T[r, 3] + share * e[r]
+def tool_axis(T: Array, tool: Array) -> tuple[float, float, float]:
+    """Axis z of the tool on a flange with the axes of ``T``."""
+    x, y, z = tool[0, 2], tool[1, 2], tool[2, 2]
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
+    )
 
 
 @lean
-def share(step: Array, largest: Array) -> float:
-    """How much of the correction is made: all of it while the first step is within bounds.
+def residual(goal: Array, T: Array, tool: Array, free: bool, e: Array) -> None:
+    """Twist ``e`` from ``T`` to ``goal``; with a free axis its rotation is that of the tool's z."""
+    if not free:
+        newton.residual(goal, T, e)
+        return
+    z0, z1, z2 = tool_axis(T, tool)
+    g0, g1, g2 = tool_axis(goal, tool)
+    w0, w1, w2 = z1 * g2 - z2 * g1, z2 * g0 - z0 * g2, z0 * g1 - z1 * g0
+    sine_square, cosine = w0 * w0 + w1 * w1 + w2 * w2, z0 * g0 + z1 * g1 + z2 * g2
+    factor = newton.angle_by_sine(sine_square, cosine)
+    for r in range(3):
+        e[r] = goal[r, 3] - T[r, 3]
+    e[3], e[4], e[5] = factor * w0, factor * w1, factor * w2
 
-    Towards a singularity the step grows without end; the share falls with its square, so that
-    the shift made falls back to zero there and changes sign without a jump.
+
+@lean
+def product(A: Array, B: Array, out: Array) -> None:
+    """Sum over the joints of the columns' products: A^T B of (n, 6) arrays."""
+    for r in range(6):
+        for c in range(6):
+            value = 0.0
+            for i in range(A.shape[0]):
+                value += A[i, r] * B[i, c]
+            out[r, c] = value
+
+
+@lean
+def lambda_square(error_square: float, steepness: float, per_error: float) -> float:
+    """Square of the damping for an error at the tool, see `joint_correction` (3)."""
+    size = np.sqrt(error_square + LEAST_ERROR * LEAST_ERROR)
+    bent = per_error * size
+    return float(size * np.sqrt(steepness * steepness + bent * bent))
+
+
+@lean
+def inverse_norm(M: Array, L: Array, column: Array) -> float:
+    """Trace of the inverse of a symmetric matrix (6, 6), infinite where it is singular."""
+    newton.copy(M, L)
+    if not newton.factor_in_place(L):
+        return np.inf
+    trace = 0.0
+    for k in range(6):
+        for r in range(6):
+            column[r] = 1.0 if r == k else 0.0
+        newton.solve_in_place(L, column)
+        trace += column[k]
+    return trace
+
+
+@lean
+def eigen(A: Array, U: Array) -> None:
+    """Eigenvalues of a symmetric matrix (6, 6), onto its diagonal, and its vectors as columns.
+
+    By Jacobi's rotations.
     """
-    excess = 0.0
-    for i in range(step.shape[0]):
-        excess = max(excess, abs(step[i]) / largest[i])
-    if not excess < np.inf:
-        return 0.0
-    return 1.0 if excess <= 1.0 else 1.0 / (excess * excess)
+    for r in range(6):
+        for c in range(6):
+            U[r, c] = 1.0 if r == c else 0.0
+    for _ in range(MOST_SWEEPS):
+        off, on = 0.0, 0.0
+        for r in range(6):
+            on += A[r, r] * A[r, r]
+            for c in range(r):
+                off += A[r, c] * A[r, c]
+        if off <= 1e-34 * on:
+            return
+        for p in range(5):
+            for q in range(p + 1, 6):
+                if A[p, q] == 0.0:
+                    continue
+                ratio = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
+                t = 1.0 / (abs(ratio) + np.sqrt(ratio * ratio + 1.0))
+                t = t if ratio >= 0.0 else -t
+                cosine = 1.0 / np.sqrt(t * t + 1.0)
+                sine = t * cosine
+                for k in range(6):
+                    x, y = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = cosine * x - sine * y, sine * x + cosine * y
+                for k in range(6):
+                    x, y = A[p, k], A[q, k]
+                    A[p, k], A[q, k] = cosine * x - sine * y, sine * x + cosine * y
+                    x, y = U[k, p], U[k, q]
+                    U[k, p], U[k, q] = cosine * x - sine * y, sine * x + cosine * y
+
+
+@lean
+def damping(A: Array, U: Array, square: float, out: Array) -> int:
+    """Damping matrix (6, 6) of J J^T, of which `eigen` gave the values; how many are damped."""
+    count = 0
+    for k in range(6):
+        rest = 1.0 - A[k, k] / (WINDOW * square)
+        A[k, k] = square * rest * rest * rest if rest > 0.0 else 0.0
+        count += 1 if rest > 0.0 else 0
+    for r in range(6):
+        for c in range(6):
+            value = 0.0
+            for k in range(6):
+                value += U[r, k] * A[k, k] * U[c, k]
+            out[r, c] = value
+    return count
+
+
+@lean
+def eliminate(B: Array, order: Array) -> bool:
+    """Factor (6, 6) in place, rows by the largest pivot; False where singular."""
+    for k in range(6):
+        best = k
+        for r in range(k + 1, 6):
+            if abs(B[r, k]) > abs(B[best, k]):
+                best = r
+        order[k] = best
+        if not abs(B[best, k]) > 1e-300:
+            return False
+        if best != k:
+            for c in range(6):
+                B[k, c], B[best, c] = B[best, c], B[k, c]
+        for r in range(k + 1, 6):
+            B[r, k] /= B[k, k]
+            for c in range(k + 1, 6):
+                B[r, c] -= B[r, k] * B[k, c]
+    return True
+
+
+@lean
+def substitute(B: Array, order: Array, x: Array) -> None:
+    """Solve in place with the factors of `eliminate`."""
+    for k in range(6):
+        best = int(order[k])
+        x[k], x[best] = x[best], x[k]
+    for r in range(6):
+        for c in range(r):
+            x[r] -= B[r, c] * x[c]
+    for r in range(5, -1, -1):
+        for c in range(r + 1, 6):
+            x[r] -= B[r, c] * x[c]
+        x[r] /= B[r, r]

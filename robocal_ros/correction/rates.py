@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
-from robocal_ros.correction.room import Room, room_in, settle
+from robocal_ros.correction.room import Room, room_in
 
 Array = NDArray[np.float64]
 
@@ -20,48 +20,32 @@ def _stand(q: Array, links: Array, root: Array, tool: Array, room: Room) -> None
 
 
 @lean
-def rates_at(
-    q: Array, qd: Array, qdd: Array, corrected: Array, room: Room, out_v: Array, out_a: Array
-) -> None:
-    """Rates of one point with settled models, see `rates_batch`."""
-    n, J, L, v, a = q.shape[0], room.J, room.L, room.e, room.spare
-    _stand(q, room.taught_links, room.taught_root, room.taught_tool, room)
-    newton.bias(room.taught_links, room.frames, room.here, qd, v, a)
-    for i in range(n):
-        for r in range(6):
-            a[r] += J[i, r] * qdd[i]
-    _stand(corrected, room.links, room.root, room.tool, room)
-    if not newton.factor(J, L):
-        for i in range(n):
-            out_v[i], out_a[i] = np.nan, np.nan
-        return
-    newton.solve(J, L, v, out_v, out_v)
-    newton.bias(room.links, room.frames, room.here, out_v, v, room.spare_twist)
-    for r in range(6):
-        a[r] -= room.spare_twist[r]
-    newton.solve(J, L, a, out_v, out_a)
-
-
-@lean
 def rates_batch(
-    q: Array,
-    qd: Array,
-    qdd: Array,
-    corrected: Array,
-    models: Array,
-    s: Array,
-    work: Array,
-    velocity: Array,
-    acceleration: Array,
-) -> None:
-    """Joint rates (m, n) at corrected joints: the tool moves as the reference tool does.
+    q: Array, qd: Array, qdd: Array, corrected: Array, first: Array, last: Array, out_v: Array,
+    out_a: Array,
+) -> None:  # fmt: skip
+    """Joint rates (m, 6) at corrected joints: the tool moves as the reference tool does.
 
-    J' qd' = J qd, and its derivative J' qdd' + (dJ'/dt) qd' = J qdd + (dJ/dt) qd, analytically,
-    for arms of six joints. Meaningful where a point was corrected in full; NaN where the pose is
-    singular. ``work`` is scratch of `room.work_size` numbers.
+    J' qd' = J qd, and its derivative J' qdd' + (dJ'/dt) qd' = J qdd + (dJ/dt) qd, analytically.
+    Meaningful where no direction is weak; NaN where the pose is singular. ``first`` holds the
+    reference model, ``last`` the actual one: ``work`` of the first and of the last stage.
     """
-    room = room_in(work, q.shape[1], False)
-    for i in range(q.shape[0]):
-        if i == 0 or s[i] != s[i - 1]:
-            settle(models, s[i], room)
-        rates_at(q[i], qd[i], qdd[i], corrected[i], room, velocity[i], acceleration[i])
+    taught, room = room_in(first, q.shape[1]), room_in(last, q.shape[1])
+    n, J, L, v, a = q.shape[1], room.J, room.B, room.e, room.spare
+    for m in range(q.shape[0]):
+        velocity, acceleration = out_v[m], out_a[m]
+        _stand(q[m], taught.taught_links, taught.taught_root, taught.taught_tool, room)
+        newton.bias(taught.taught_links, room.frames, room.here, qd[m], v, a)
+        for i in range(n):
+            for r in range(6):
+                a[r] += J[i, r] * qdd[m, i]
+        _stand(corrected[m], room.links, room.root, room.tool, room)
+        if not newton.factor(J, L):
+            for i in range(n):
+                velocity[i], acceleration[i] = np.nan, np.nan
+            continue
+        newton.solve(J, L, v, velocity, velocity)
+        newton.bias(room.links, room.frames, room.here, velocity, v, room.step)
+        for r in range(6):
+            a[r] -= room.step[r]
+        newton.solve(J, L, a, velocity, acceleration)

@@ -1,7 +1,7 @@
-"""Where the joint correction is worked out: scratch numbers, and the models at a blend.
+"""Where the joint correction is worked out: its two models, and scratch numbers.
 
-``models`` (4, n + 2, 9) are the packed reference and actual model, each at the start and at the
-end of a blend. ``work`` is scratch of `work_size` numbers, so that a point allocates nothing.
+``work`` holds `work_size` numbers, so that a point allocates nothing; `settle` puts the models and
+the constants of a correction there, once.
 """
 
 from typing import NamedTuple
@@ -12,33 +12,33 @@ from numpy.typing import NDArray
 from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import turns_size
-from robocal_ros.correction import equations, straight
-from robocal_ros.correction import kernels as k
+from robocal_ros.correction import straight
 from robocal_ros.correction import straight_kinematics as six
 
 Array = NDArray[np.float64]
 
+POSES, SQUARES, TWISTS = 6, 4, 5
+STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
+
 
 class Room(NamedTuple):
-    """Where a solution is worked out: parts of ``work``, made once for a batch.
+    """Where a solution is worked out: parts of ``work``.
 
     Attributes
     ----------
-    taught, actual : (n + 2, 9) blended models.
-    taught_links, links : (n, 9) their joints.
+    taught_links, links : (n, 9) joints of the reference and of the actual model.
     taught_root, taught_tool, root, tool : their (4, 4) ends, T_base_root and T_flange_tool.
-    goal, aim : (4, 4) where the tool must go, and the part of the way there that is gone. Such
+    goal, here : (4, 4) where the tool must go, and where it is at the joints tried last. Such
         poses have the axes of the flange, their origin is the tool's.
-    here : (4, 4) pose of the tool at the joints tried last.
     turns, frames : scratch of `walk`.
-    J, L : (n, 6) Jacobian, and the factor for its steps.
-    e, spare, spare_twist : (6,) residual to ``aim``, and scratch.
-    x, step : (n,) shift of the joints, and its last step.
+    J, there : (n, 6) Jacobian at the taught joints, and at those tried last.
+    M, U, D, B : (6, 6) J J^T, its vectors, the damping, and the matrix of a step.
+    e, y, step, spare, order : (6,) residual, multipliers, their step, and scratch.
+    x : (n,) shift of the joints.
+    settings : steepness and its rise, and whether `straight` serves; see `joint_correction` (3).
     constants, came, goes : of `straight`, for sixteen points.
     """
 
-    taught: Array
-    actual: Array
     taught_links: Array
     links: Array
     taught_root: Array
@@ -46,17 +46,22 @@ class Room(NamedTuple):
     root: Array
     tool: Array
     goal: Array
-    aim: Array
     here: Array
     turns: Array
     frames: Array
     J: Array
-    L: Array
+    there: Array
+    M: Array
+    U: Array
+    D: Array
+    B: Array
     e: Array
-    spare: Array
-    spare_twist: Array
-    x: Array
+    y: Array
     step: Array
+    spare: Array
+    order: Array
+    x: Array
+    settings: Array
     constants: Array
     came: Array
     goes: Array
@@ -64,40 +69,55 @@ class Room(NamedTuple):
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    poses, turns = 18 * (n + 2) + 7 * 16, 24 * (n // 8 + 1)
     many = six.CONSTANTS + straight.LANES * (six.N + straight.ROWS)
-    return poses + turns + 6 * n + 6 * n + max(n, 6) ** 2 + 18 + 2 * n + many
+    small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 6 * TWISTS + SETTINGS
+    return 18 * n + 18 * n + n + small + many
 
 
 @lean
-def room_in(work: Array, n: int, free: bool) -> Room:
+def room_in(work: Array, n: int) -> Room:
     """Divide ``work``."""
-    m = 9 * (n + 2)
-    taught, actual, at = work[:m].reshape(n + 2, 9), work[m : 2 * m].reshape(n + 2, 9), 2 * m
-    poses, at = work[at : at + 112].reshape(7, 4, 4), at + 112
+    links, at = work[: 18 * n].reshape(2, n, 9), 18 * n
+    poses, at = work[at : at + 16 * POSES].reshape(POSES, 4, 4), at + 16 * POSES
     turns, at = work[at : at + turns_size(n)], at + turns_size(n)
     frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
-    J, at = work[at : at + 6 * n].reshape(n, 6), at + 6 * n
-    size = equations.unknowns(n, free)
-    L, at = work[at : at + size * size].reshape(size, size), at + size * size
-    twists, at = work[at : at + 18].reshape(3, 6), at + 18
-    joints, at = work[at : at + 2 * n].reshape(2, n), at + 2 * n
+    J, at = work[at : at + 12 * n].reshape(2, n, 6), at + 12 * n
+    squares, at = work[at : at + 36 * SQUARES].reshape(SQUARES, 6, 6), at + 36 * SQUARES
+    twists, at = work[at : at + 6 * TWISTS].reshape(TWISTS, 6), at + 6 * TWISTS
+    x, at = work[at : at + n], at + n
+    settings, at = work[at : at + SETTINGS], at + SETTINGS
     constants, at = work[at : at + six.CONSTANTS], at + six.CONSTANTS
     came, at = work[at : at + straight.LANES * six.N], at + straight.LANES * six.N
     return Room(
-        taught, actual, taught[:n], actual[:n], poses[0], poses[1], poses[2], poses[3], poses[4],
-        poses[5], poses[6], turns, frames, J, L, twists[0], twists[1], twists[2],
-        joints[0], joints[1], constants, came, work[at : at + straight.LANES * straight.ROWS],
+        links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
+        turns, frames, J[0], J[1], squares[0], squares[1], squares[2], squares[3],
+        twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
+        constants, came, work[at : at + straight.LANES * straight.ROWS],
     )  # fmt: skip
 
 
 @lean
-def settle(models: Array, s: float, room: Room) -> None:
-    """Models at blend s, and their ends."""
+def settle(
+    models: Array, largest: Array, steepness: float, per_error: float, free: bool, room: Room
+) -> None:
+    """Put models (2, n + 2, 9), reference and actual, and the damping's settings into a room."""
     n = room.links.shape[0]
-    k.blend(models[0], models[1], s, room.taught)
-    k.blend(models[2], models[3], s, room.actual)
-    newton.pose(room.taught[n], room.taught_root)
-    newton.pose(room.taught[n + 1], room.taught_tool)
-    newton.pose(room.actual[n], room.root)
-    newton.pose(room.actual[n + 1], room.tool)
+    newton.copy(models[0, :n], room.taught_links)
+    newton.copy(models[1, :n], room.links)
+    newton.pose(models[0, n], room.taught_root)
+    newton.pose(models[0, n + 1], room.taught_tool)
+    newton.pose(models[1, n], room.root)
+    newton.pose(models[1, n + 1], room.tool)
+    room.settings[STEEPNESS], room.settings[PER_ERROR] = steepness, per_error
+    turning = not free and n == six.N
+    for i in range(n):
+        turning = turning and room.links[i, 8] < 0.5
+    room.settings[IS_STRAIGHT] = 1.0 if turning else 0.0
+    if not turning:
+        return
+    for i in range(six.N):
+        room.constants[six.LARGEST + i] = largest[i]
+    room.constants[six.DAMPING], room.constants[six.DAMPING + 1] = steepness, per_error
+    taught, tool = room.taught_tool, room.tool
+    six.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
+    six.constants(room.links, room.root, tool, taught, six.ACTUAL, room.constants)

@@ -1,7 +1,7 @@
-"""Compiled solution of the joint correction: one point, or a trajectory.
+"""Compiled solution of the joint correction: one point, a point through all stages, or many.
 
-Most points of six joints are solved by `straight`; the others, and all other arms, here.
-``models`` and ``work``: see `room`.
+Most points of six joints are solved by `straight`; the others, and all other arms, here. ``work``
+is that of `room`, with settled models. Equations: see `joint_correction`.
 """
 
 import numpy as np
@@ -10,193 +10,151 @@ from numpy.typing import NDArray
 from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
-from robocal_ros.correction import equations, straight
 from robocal_ros.correction import kernels as k
+from robocal_ros.correction import straight
 from robocal_ros.correction import straight_kinematics as six
-from robocal_ros.correction.room import Room, room_in, settle
+from robocal_ros.correction.room import IS_STRAIGHT, PER_ERROR, STEEPNESS, Room, room_in, settle
 
 Array = NDArray[np.float64]
 
-MOST_ITERATIONS = 10
-# How often a step is repeated with the same matrix, from the second one on.
-REPEATS = 3
-# A step that is at most this share of the one before, with the same matrix: what follows is too.
-CALM = 2e-3
-# A residual (m, rad) below which one more step with the last matrix reaches the rounding floor.
+MOST_ITERATIONS = 16
+# A residual (m, rad) of which nothing is left to do.
 SMALL_RESIDUAL = 1e-12
-# A step (rad, m) that shrinks below the rounding floor by the next one with the same matrix.
-FLOOR = 1e-13
-# A step below which the next one is under the rounding floor (convergence is quadratic).
-SMALL_STEP = 1e-9
-# Longest second step with the first one's matrix, as a share of the first: in its direction (at
-# 0.25 the goal leaves the arm's reach), and in any.
-AHEAD, BESIDE = 0.2, 0.5
+# A step (rad, m) below which the next one with the same matrix ends at the rounding floor.
+SMALL_STEP = 1e-7
+FINAL_STEPS = 2
 # A solution this many times beyond the bound is another posture of the arm.
-MOST_OVER = 2.0
+MOST_OVER = 3.0
 
-# What `correct_point` writes after the n joints.
-POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, SHARE = range(7)
+# What is written after the n joints.
+POSITION_ERROR, ROTATION_ERROR, ITERATIONS, CONVERGED, TCP_SHIFT, TCP_ROTATION, WEAK = range(7)
 REPORT = 7
 
 
 @lean
-def _residual_at(q: Array, free: bool, room: Room) -> float:
-    """Residual of the pose at joints q."""
-    walk(q, room.links, room.root, room.turns, room.frames, room.here)
+def _residual_at(q: Array, free: bool, room: Room) -> None:
+    """Residual ``e`` of the pose ``here`` at joints q + x."""
+    for i in range(q.shape[0]):
+        room.x[i] += q[i]
+    walk(room.x, room.links, room.root, room.turns, room.frames, room.here)
+    for i in range(q.shape[0]):
+        room.x[i] -= q[i]
     newton.at_tool(room.here, room.tool)
-    return equations.residual(room.aim, room.here, room.tool, free, room.e)
+    k.residual(room.goal, room.here, room.tool, free, room.e)
 
 
 @lean
-def _moved(q: Array, free: bool, room: Room, out: Array) -> float:
-    """Residual of the pose at q + x, which goes to ``out``."""
-    n = q.shape[0]
-    for i in range(n):
-        out[i] = q[i] + room.x[i]
-    return _residual_at(out[:n], free, room)
+def _jacobian(free: bool, room: Room, J: Array) -> None:
+    """Columns of the Jacobian ``here``, without what is about a free axis."""
+    newton.columns(room.links, room.frames, room.here, J)
+    if free:
+        z0, z1, z2 = k.tool_axis(room.here, room.tool)
+        for i in range(J.shape[0]):
+            about = J[i, 3] * z0 + J[i, 4] * z1 + J[i, 5] * z2
+            J[i, 3] -= about * z0
+            J[i, 4] -= about * z1
+            J[i, 5] -= about * z2
 
 
 @lean
-def _next_step(free: bool, shorten: bool, room: Room) -> None:
-    equations.step(room.J, room.L, room.e, room.x, free, shorten, room.spare, room.step)
+def _damp(free: bool, room: Room) -> bool:
+    """Damping ``D`` for J and the residual at the taught joints; whether a direction is weak."""
+    n, M, D = room.x.shape[0], room.M, room.D
+    square = 0.0
+    for r in range(6):
+        square += room.e[r] * room.e[r]
+    square = k.lambda_square(square, room.settings[STEEPNESS], room.settings[PER_ERROR])
+    k.product(room.J, room.J, M)
+    absent = max(6 - n, 1 if free else 0)  # directions in which no joint moves the tool
+    if n >= 6:
+        for r in range(6):
+            for c in range(6):
+                D[r, c] = 0.0
+        if free:  # of which J knows nothing: a one fills its place
+            z = k.tool_axis(room.here, room.tool)
+            for r in range(3):
+                for c in range(3):
+                    D[3 + r, 3 + c] = z[r] * z[c]
+                    M[3 + r, 3 + c] += z[r] * z[c]
+        if k.WINDOW * square * (k.inverse_norm(M, room.B, room.spare) - absent) <= 1.0:
+            return False
+        k.product(room.J, room.J, M)
+    k.eigen(M, room.U)
+    return k.damping(M, room.U, square, D) > absent
 
 
 @lean
-def _first_steps(q: Array, largest: Array, free: bool, room: Room, out: Array) -> float:
-    """Newton's step and a second one with the same matrix, shortened near a singularity.
-
-    The aim becomes the pose that lies the returned share of the way. The second step tells how
-    far the first may be trusted: towards the edge of the reach (where sigma x + kappa x^2 / 2 = e
-    has a solution while the second step is at most a quarter of the first, in its direction), and
-    where the arm bends too much for Newton's method.
-    """
-    n, x, step = q.shape[0], room.x, room.step
-    _next_step(free, False, room)
-    share = k.share(step, largest)
-    if share < 1.0:
-        k.part_of_the_way(room.here, room.e, share, room.aim)
-    for i in range(n):
-        x[i] = share * step[i]
-    _moved(q, free, room, out)
-    _next_step(free, False, room)
-    length, second, along = 1e-300, 0.0, 0.0
-    for i in range(n):
-        length += x[i] * x[i]
-        second += step[i] * step[i]
-        along += x[i] * step[i]
-    trust = min(1.0, AHEAD * length / max(along, 1e-300))
-    trust = min(trust, BESIDE * np.sqrt(length / max(second, 1e-300)))
-    if trust < 1.0:
-        share *= trust
-        newton.copy(room.goal, room.aim)
-        _residual_at(q, free, room)
-        k.part_of_the_way(room.here, room.e, share, room.aim)
-    for i in range(n):
-        x[i] = trust * x[i] + trust * trust * step[i]
-    return share
-
-
-@lean
-def _add_step(free: bool, shorten: bool, room: Room) -> float:
-    """One step with a factored matrix; returns its largest component."""
-    _next_step(free, shorten, room)
+def _add_step(q: Array, free: bool, room: Room) -> float:
+    """One step with the factored matrix; returns its largest component in the joints."""
+    step, size = room.step, 0.0
+    for r in range(6):
+        step[r] = room.e[r]
+        for c in range(6):
+            step[r] -= room.D[r, c] * room.y[c]
+    k.substitute(room.B, room.order, step)
+    for r in range(6):
+        room.y[r] += step[r]
     for i in range(room.x.shape[0]):
-        room.x[i] += room.step[i]
-    return newton.largest_of(room.step)
+        value, before = 0.0, room.x[i]
+        for r in range(6):
+            value += room.J[i, r] * room.y[r]
+        room.x[i] = value
+        size = max(size, abs(value - before))
+    _residual_at(q, free, room)
+    return size
 
 
 @lean
-def _take(q: Array, x: Array, largest: Array, converged: bool, out: Array) -> bool:
-    """Joints ``q + x``; where that is no solution within reach, the point stays as it came."""
-    n = q.shape[0]
-    for i in range(n):
-        converged = converged and abs(x[i]) <= MOST_OVER * largest[i]
-    for i in range(n):
-        out[i] = q[i] + x[i] if converged else q[i]
-    return converged
-
-
-@lean
-def _finish(q: Array, free: bool, room: Room, out: Array) -> None:
-    """Steps with the last matrix down to the rounding floor."""
-    repeats, size = 0, _add_step(free, False, room)
-    while size > FLOOR and repeats < REPEATS:
-        _moved(q, free, room, out)
-        repeats, size = repeats + 1, _add_step(free, False, room)
-
-
-@lean
-def _newton(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
-    """Newton's steps from ``q``, whose pose is ``here`` and whose residual is ``e``."""
-    n, size = q.shape[0], 0.0
-    for i in range(n):
-        room.x[i] = 0.0
-    # The shortest of many solutions is sought once, in the second iteration: so what is found does
-    # not hang on how many there are.
-    least = 2 if equations.wide(n, free) else 1
-    share, iterations, calm = 1.0, 0, False
-    converged = newton.largest_of(room.e) <= SMALL_RESIDUAL
-    while not converged and iterations < MOST_ITERATIONS:
-        newton.columns(room.links, room.frames, room.here, room.J)
-        if not equations.factor(room.J, room.here, room.tool, free, room.L):
-            if iterations == 0:
-                share, converged = 0.0, True
-            break
-        if iterations == 0:
-            share = _first_steps(q, largest, free, room, out)
-            size = newton.largest_of(room.step)
-            calm = least == 1 and share == 1.0 and size <= CALM * newton.largest_of(room.x)
-        else:
-            size = _add_step(free, iterations == 1, room)
-        iterations += 1
-        converged = _moved(q, free, room, out) <= SMALL_RESIDUAL and iterations >= least
-        repeats = 0
-        while (calm or iterations > 1) and repeats < REPEATS and not converged:
-            # more steps with the same matrix: each raises the order, for little
-            repeats, before = repeats + 1, size
-            size = _add_step(free, False, room)
-            calm = size <= CALM * before
-            converged = _moved(q, free, room, out) <= SMALL_RESIDUAL
-        if converged or (iterations > 1 and size <= SMALL_STEP):
-            _finish(q, free, room, out)
-            converged = True
-        calm = False
-    out[n + CONVERGED] = _take(q, room.x, largest, converged, out)
-    out[n + ITERATIONS] = iterations
-    out[n + SHARE] = share if out[n + CONVERGED] else 0.0
+def _newton(q: Array, free: bool, room: Room) -> int:
+    """Multipliers y and shift x = J^T y with e(q + x) = D y; iterations, 0 where none is found."""
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        if iteration > 1:
+            _jacobian(free, room, room.there)
+        k.product(room.J if iteration == 1 else room.there, room.J, room.B)
+        for r in range(6):
+            for c in range(6):
+                room.B[r, c] += room.D[r, c]
+        if not k.eliminate(room.B, room.order):
+            return 0
+        size = _add_step(q, free, room)
+        if size <= SMALL_STEP:
+            for _ in range(FINAL_STEPS):
+                _add_step(q, free, room)
+            return iteration
+        if not size < 10.0:
+            return 0
+    return 0
 
 
 @lean
 def _correct(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
-    """One point with settled models: ``out`` (n + 7), joints, then the report."""
+    """One point: ``out`` (n + 7), joints, then the report."""
     n, e = q.shape[0], room.e
     walk(q, room.taught_links, room.taught_root, room.turns, room.frames, room.goal)
     newton.at_tool(room.goal, room.taught_tool)
     k.swap_tool(room.goal, room.taught_tool, room.tool)
-    newton.copy(room.goal, room.aim)
+    for i in range(n):
+        room.x[i] = 0.0
+    for r in range(6):
+        room.y[r] = 0.0
     _residual_at(q, free, room)
     out[n + TCP_SHIFT], out[n + TCP_ROTATION] = newton.length(e, 0), newton.length(e, 3)
-    _newton(q, largest, free, room, out)
-    if out[n + SHARE] < 1.0:
-        newton.copy(room.goal, room.aim)
-        _residual_at(out[:n], free, room)
-    out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = newton.length(e, 0), newton.length(e, 3)
-
-
-@lean
-def _is_straight(largest: Array, free: bool, room: Room) -> bool:
-    """Whether the settled models are for `straight`; its constants then."""
-    n = room.links.shape[0]
-    if free or n != six.N:
-        return False
-    turning = True
+    out[n + ITERATIONS], out[n + CONVERGED], out[n + WEAK] = 0.0, 1.0, 0.0
+    if newton.largest_of(e) > SMALL_RESIDUAL or not newton.largest_of(e) < np.inf:
+        _jacobian(free, room, room.J)
+        out[n + WEAK] = 1.0 if _damp(free, room) else 0.0
+        out[n + ITERATIONS] = _newton(q, free, room)
+        fine = out[n + ITERATIONS] > 0.0
+        for i in range(n):
+            fine = fine and abs(room.x[i]) <= MOST_OVER * largest[i]
+        if not fine:
+            for i in range(n):
+                room.x[i] = 0.0
+            _residual_at(q, free, room)
+            out[n + CONVERGED] = 0.0
     for i in range(n):
-        turning &= room.links[i, 8] < 0.5
-        room.constants[six.LARGEST + i] = largest[i]
-    taught, tool = room.taught_tool, room.tool
-    six.constants(room.taught_links, room.taught_root, taught, taught, 0, room.constants)
-    six.constants(room.links, room.root, tool, taught, six.ACTUAL, room.constants)
-    return turning
+        out[i] = q[i] + room.x[i]
+    out[n + POSITION_ERROR], out[n + ROTATION_ERROR] = newton.length(e, 0), newton.length(e, 3)
 
 
 @lean
@@ -214,7 +172,7 @@ def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
         out[i] = goes[i * lanes + lane]
     out[n + POSITION_ERROR] = goes[straight.POSITION_LEFT * lanes + lane]
     out[n + ROTATION_ERROR] = goes[straight.ROTATION_LEFT * lanes + lane]
-    out[n + ITERATIONS], out[n + SHARE] = straight.ITERATIONS, 1.0
+    out[n + ITERATIONS], out[n + WEAK] = straight.ITERATIONS, 0.0
     out[n + CONVERGED] = goes[straight.FINE * lanes + lane]
     out[n + TCP_SHIFT] = goes[straight.TCP_SHIFT * lanes + lane]
     out[n + TCP_ROTATION] = goes[straight.TCP_ROTATION * lanes + lane]
@@ -222,58 +180,51 @@ def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
 
 
 @lean
-def _straight_one(q: Array, room: Room, out: Array) -> bool:
-    _put(q, 0, 1, room)
-    straight.correct_one(room.constants, room.came, room.goes)
-    return _take_over(room, 0, 1, out)
+def _correct_one(q: Array, largest: Array, free: bool, room: Room, out: Array) -> None:
+    if room.settings[IS_STRAIGHT] > 0.5:
+        _put(q, 0, 1, room)
+        straight.correct_one(room.constants, room.came, room.goes)
+        if _take_over(room, 0, 1, out):
+            return
+    _correct(q, largest, free, room, out)
 
 
 @lean
-def _alike(s: Array) -> bool:
-    """Whether points can be solved at once: as many as there are lanes, with one blend."""
-    same = s.shape[0] == straight.LANES
-    for i in range(s.shape[0]):
-        same &= s[i] == s[0]
-    return bool(same)
-
-
-@lean
-def correct_point(
-    q: Array, models: Array, s: float, largest: Array, free: bool, work: Array, out: Array
+def prepare(
+    models: Array, largest: Array, steepness: float, per_error: float, free: bool, work: Array
 ) -> None:
-    """`correct_batch` for one point (n,)."""
-    room = room_in(work, q.shape[0], free)
-    settle(models, s, room)
-    if not (_is_straight(largest, free, room) and _straight_one(q, room, out)):
-        _correct(q, largest, free, room, out)
+    """Settle a correction's models (2, n + 2, 9) in its ``work``."""
+    n = models.shape[1] - 2
+    settle(models, largest, steepness, per_error, free, room_in(work, n))
 
 
 @lean
-def correct_batch(
-    q: Array, models: Array, s: Array, largest: Array, free: bool, work: Array, out: Array
-) -> None:
+def correct_staged(q: Array, largest: Array, free: bool, works: Array, out: Array) -> None:
+    """One point (n,) through k stages with ``works`` (k, size); ``out`` (k, n + 7)."""
+    n = q.shape[0]
+    for stage in range(works.shape[0]):
+        room = room_in(works[stage], n)
+        start = q if stage == 0 else out[stage - 1, :n]
+        _correct_one(start, largest[stage], free, room, out[stage])
+
+
+@lean
+def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array) -> None:
     """Joints that put the actual tool where the reference tool is at ``q`` (m, n).
 
-    ``s`` (m,) blends; ``largest`` (n,) bounds the joint shift; ``free``: the turn about the
-    tool's z is free. ``out`` (m, n + 7): joints, then the report. See
-    `joint_correction.JointCorrection`.
+    ``largest`` (n,) bounds the joint shift; ``free``: the turn about the tool's z is free.
+    ``out`` (m, n + 7): joints, then the report.
     """
-    room, first, is_straight = room_in(work, q.shape[1], free), 0, False
-    while first < q.shape[0]:
-        if first == 0 or s[first] != s[first - 1]:
-            settle(models, s[first], room)
-            is_straight = _is_straight(largest, free, room)
-        lanes = straight.LANES if _alike(s[first : first + straight.LANES]) else 1
-        if is_straight and lanes > 1:
-            for lane in range(lanes):
-                _put(q[first + lane], lane, lanes, room)
+    room, first = room_in(work, q.shape[1]), 0
+    if room.settings[IS_STRAIGHT] > 0.5:
+        while q.shape[0] - first >= straight.LANES:
+            for lane in range(straight.LANES):
+                _put(q[first + lane], lane, straight.LANES, room)
             straight.correct_lanes(room.constants, room.came, room.goes)
-        for lane in range(lanes):
-            i = first + lane
-            if is_straight and lanes > 1:
-                solved = _take_over(room, lane, lanes, out[i])
-            else:
-                solved = is_straight and _straight_one(q[i], room, out[i])
-            if not solved:
-                _correct(q[i], largest, free, room, out[i])
-        first += lanes
+            for lane in range(straight.LANES):
+                i = first + lane
+                if not _take_over(room, lane, straight.LANES, out[i]):
+                    _correct(q[i], largest, free, room, out[i])
+            first += straight.LANES
+    for i in range(first, q.shape[0]):
+        _correct_one(q[i], largest, free, room, out[i])

@@ -2,7 +2,7 @@
 
 Newton's method as in `solution`, three factored matrices with two steps each, written with single
 numbers: the compiler works on several points at a time in vector registers. Each gets the
-bits that it gets alone. Where that does not do (a bound or a singularity near, a shift so large
+bits that it gets alone. Where that does not do (a direction may be weak, or a shift is so large
 that it needs more steps) a point is left to `solution`.
 """
 
@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel, lean
 from robocal_ros.core.kinematics.sines import LARGEST_ANGLE
+from robocal_ros.correction.kernels import WINDOW, lambda_square
 from robocal_ros.correction.straight_kinematics import (
     ACTUAL,
+    DAMPING,
     LARGEST,
     Frame,
     Frames,
@@ -104,6 +106,32 @@ def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
 
 
 @lean
+def _inverse_norm(factor: Factor) -> float:
+    """Square of the inverse Jacobian's Frobenius norm: no singular value is below 1 / its root."""
+    _, _, _, _, _, _, i, r, t, u = factor
+    a01 = r[0]
+    a12 = r[5]
+    a02 = r[1] - r[0] * a12
+    a23 = t[3]
+    a13 = t[0] - r[5] * a23
+    a03 = r[2] - r[0] * a13 - r[1] * a23
+    a34 = u[0]
+    a24 = t[4] - t[3] * a34
+    a14 = t[1] - r[5] * a24 - t[0] * a34
+    a04 = r[3] - r[0] * a14 - r[1] * a24 - r[2] * a34
+    a45 = u[2]
+    a35 = u[1] - u[0] * a45
+    a25 = t[5] - t[3] * a35 - t[4] * a45
+    a15 = t[2] - r[5] * a25 - t[0] * a35 - t[1] * a45
+    a05 = r[4] - r[0] * a15 - r[1] * a25 - r[2] * a35 - r[3] * a45
+    n1, n2 = 1.0 + a01 * a01, 1.0 + a02 * a02 + a12 * a12
+    n3 = 1.0 + a03 * a03 + a13 * a13 + a23 * a23
+    n4 = 1.0 + a04 * a04 + a14 * a14 + a24 * a24 + a34 * a34
+    n5 = 1.0 + a05 * a05 + a15 * a15 + a25 * a25 + a35 * a35 + a45 * a45
+    return i[0] + i[1] * n1 + i[2] * n2 + i[3] * n3 + i[4] * n4 + i[5] * n5
+
+
+@lean
 def _step(factor: Factor, e: Six) -> Six:
     """Joint step for a twist."""
     a0, a1, a2, a3, a4, a5, i, r, t, u = factor
@@ -172,7 +200,8 @@ def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool]:
     fine &= _dot(first, first) > AT_GOAL * AT_GOAL * N
     factor, regular = _factor(c, frames)
     x = _step(factor, first)
-    fine &= regular & _within(c, x, 1.0)
+    square = lambda_square(_dot(first, first), c[DAMPING], c[DAMPING + 1])
+    fine &= regular & (WINDOW * square * _inverse_norm(factor) <= 1.0)
     e, near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
     step = _step(factor, e)
     length, along = _dot(x, x), _dot(x, step)

@@ -20,8 +20,9 @@ Frames = tuple[Frame, Frame, Frame, Frame, Frame, Frame, Frame]
 N = 6
 # of a model's constants: nine for each joint, twelve of the root's frame, three of the tool's place
 ROOT, TOOL, MODEL = 54, 66, 69
-# of all: the taught model, the actual one, the turn from the taught tool to it, the largest shifts
-ACTUAL, SWAP, LARGEST, CONSTANTS = MODEL, 2 * MODEL, 2 * MODEL + 9, 2 * MODEL + 15
+# of all: the taught model, the actual one, the turn from the taught tool to it, the largest
+# shifts, and the damping's steepness and its rise
+ACTUAL, SWAP, LARGEST, DAMPING, CONSTANTS = (2 * MODEL + k for k in (-MODEL, 0, 9, 15, 17))
 # The angle by its sine's series: largest square of the sine.
 SERIES = 1e-3
 
