@@ -17,22 +17,6 @@ Array = NDArray[np.float64]
 ROUNDING = 1e-12  # of packed models that are the same
 
 
-class _Shim:
-    def __init__(self, s):
-        self._s = s
-
-    def correct(self, q):
-        r = self._s.correct(np.ascontiguousarray(q), np.ones(len(q)))
-        object.__setattr__(r, "weak", ~r.whole)
-        return r
-
-    def uncorrect(self, q):
-        return self._s.uncorrect(q, np.ones(len(q)))
-
-    def rates(self, q, v, a, result):
-        return self._s.rates(q, v, a, np.ones(len(q)), np.zeros(len(q)), result)
-
-
 class DesiredOffset:
     """Corrected less taught joints, as the model and the tool in use want it.
 
@@ -63,13 +47,9 @@ class DesiredOffset:
         if not np.allclose(packed, self._actual, rtol=0.0, atol=ROUNDING):
             self._actual = packed
             same = np.allclose(packed, self._reference, rtol=0.0, atol=ROUNDING)
-            self.known = (
-                None
-                if same
-                else _Shim(
-                    correction_between(self._reference, packed, packed, self._arm, self._config)
-                )
-            )
+            self.known = None
+            if not same:
+                self.known = correction_between(self._reference, packed, self._arm, self._config)
         self.stage = self.known if on else None
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
