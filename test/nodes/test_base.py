@@ -280,7 +280,9 @@ def test_endless_reasons_neither_flood_the_log_nor_the_memory() -> None:
     assert logged == MOST_REASONS + 1
 
 
-@pytest.mark.parametrize("module", ["nodes.base", "nodes.conversions", "nodes.recorder_node"])
+@pytest.mark.parametrize(
+    "module", ["nodes.base", "nodes.conversions", "nodes.recorder_node", "nodes.source_guard"]
+)
 def test_what_every_node_imports_brings_no_session_and_no_kernels(module: str) -> None:
     """They cost each start of each node 80 ms."""
     program = f"import sys, robocal_ros.{module}; print(*sys.modules)"
