@@ -83,7 +83,7 @@ class CorrectionGate:
                 raise RefusedError(
                     Reason.OLD_REVISION,
                     f"revision {model.revision} with other numbers after {self.revision}, and not "
-                    "newer by its stamp; ~/enable takes it over",
+                    "newer by its stamp; ~/take_over takes it over",
                 )
         arm = self._arm_of(model)
         if len(places):
