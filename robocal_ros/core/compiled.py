@@ -2,18 +2,30 @@
 
 Numba forgets kept machine code when the file of its function changes, but not when the function
 of another file changes that was built into it. Here all kernels are forgotten together.
+
+Kept code is written to the first of these that can be written: ``NUMBA_CACHE_DIR``, ``__pycache__``
+beside the source, the user's cache folder, a private folder in the temporary one. It is read from
+there and from ``__pycache__``, which may be read-only: what was compiled at the installation serves
+every user. Where nothing can be written or read, kernels are compiled at each start.
 """
 
 import hashlib
+import inspect
+import os
+import stat
+import tempfile
+import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import numba
+from numba.core import caching as untyped
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+caching: Any = untyped  # numba is typed here and there
 THIS_FILE = Path(__file__)
 PACKAGE = THIS_FILE.parents[1]
 MARK = b"\nfrom robocal_ros.core.compiled import "  # how a module that has kernels is known
@@ -45,12 +57,127 @@ def _compiled(
     function: Function, inline: Literal["never", "always"], lean: bool = False
 ) -> Function:
     options: dict[str, Any] = {"inline": inline, "forceinline": lean, "_nrt": not lean}
-    compiler: Any = numba.njit(cache=True, nogil=True, error_model="numpy", **options)
+    compiler: Any = numba.njit(nogil=True, error_model="numpy", **options)
     made = compiler(function)
     if made is not function:  # as it is with NUMBA_DISABLE_JIT
-        # Kept code is valid while this equals what stands beside it; numba puts the file's age.
-        made._cache._cache_file._source_stamp = _digest_of_sources()
+        made._cache = _KeptCode(function)
     return cast(Function, made)
+
+
+def is_cold() -> bool:
+    """Whether no kernel that was loaded so far has kept machine code: the first call compiles."""
+    return bool(_made) and not any(kept.is_there() for kept in _made)
+
+
+def _private_folder() -> Path:
+    """A folder of this user alone, since code that is read from it is run.
+
+    Raises
+    ------
+    OSError
+        When there is none.
+    """
+    folder = Path(tempfile.gettempdir()) / f"robocal_kernels_{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    state = folder.lstat()
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
+        raise PermissionError(f"{folder} is not this user's alone")
+    return folder
+
+
+class _LastLocator(caching._CacheLocator):  # type: ignore[misc]
+    """A place for kept code where neither source folder nor home can be written.
+
+    The temporary folder; where that cannot be written either, the source's, to be read only.
+    """
+
+    def __init__(self, function: Any, file: str) -> None:
+        self._lineno = function.__code__.co_firstlineno
+        try:
+            self._path = _private_folder() / self.get_suitable_cache_subpath(file)
+            self.ensure_cache_path()
+        except OSError:
+            self._path = Path(file).parent / "__pycache__"
+
+    def get_cache_path(self) -> str:
+        return str(self._path)
+
+    def get_source_stamp(self) -> str:
+        return _digest_of_sources()
+
+    def get_disambiguator(self) -> str:
+        return str(self._lineno)
+
+    @classmethod
+    def from_function(cls, function: Any, file: str) -> "_LastLocator":
+        return cls(function, file)
+
+
+class _Places(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (*caching.CompileResultCacheImpl._locator_classes, _LastLocator)
+
+
+class _KeptCode(caching.FunctionCache):  # type: ignore[misc]
+    """Kept machine code of one kernel, read beside the source too.
+
+    It is valid while the digest of the sources equals what stands in it; numba puts that of one
+    file. Whatever is wrong with it, a kernel can be called.
+    """
+
+    _impl_class = _Places
+    _cache_file: Any
+
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        own, digest = self._cache_file, _digest_of_sources()
+        own._source_stamp = digest
+        beside = str(Path(inspect.getfile(function)).parent / "__pycache__")
+        shipped = caching.IndexDataCacheFile(beside, self._impl.filename_base, digest)
+        self._files = [own] if beside == self._cache_path else [shipped, own]
+        _made.append(self)
+
+    def is_there(self) -> bool:
+        """Whether there is code of this source."""
+        return any(_index(file) for file in self._files)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load what is kept; a file that a power cut left in pieces counts as none."""
+        for file in self._files:  # the last one is what is written to
+            self._cache_file = file
+            try:
+                found = super().load_overload(sig, target_context)
+            except Exception:
+                continue
+            if found is not None:
+                return found
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what was compiled, where that is possible."""
+        self._cache_file = self._files[-1]
+        try:
+            if not _index(self._cache_file):
+                self.flush()  # also over an index in pieces
+            super().save_overload(sig, data)
+        except Exception as error:
+            if not _warned:
+                _warned.append(
+                    f"the machine code of kernels cannot be kept in {self._cache_path} ({error}): "
+                    "each start compiles; set NUMBA_CACHE_DIR to a folder that can be written"
+                )
+                warnings.warn(_warned[0], RuntimeWarning, stacklevel=2)
+
+
+_made: list[_KeptCode] = []
+_warned: list[str] = []
+
+
+def _index(file: Any) -> Any:
+    """Index of kept code, empty where there is none that can be read."""
+    try:
+        return file._load_index()
+    except Exception:
+        return {}
 
 
 @cache

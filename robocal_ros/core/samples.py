@@ -22,6 +22,7 @@ CORRECTED = "robocal_corrected"  # frame_id of commands that carry a joint corre
 SPHERE_CLOUD = "sphere_cloud"
 REFERENCE_SPHERE = "reference_sphere_center"
 MEASURED_POINT = "measured_point"  # the input that a point comes from where nothing else is said
+UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
 TAUGHT = "robocal_taught"  # frame_id of joint states from which the correction was removed
 
 

@@ -11,6 +11,7 @@ Attributes of a subclass must not be named ``_parameters``, ``_clock``, ``_logge
 ``_services``, ``_callbacks`` or ``_context``: those are rclpy's own.
 """
 
+import sys
 import traceback
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -95,6 +96,12 @@ class HouseNode(EndpointNode):
     def _configure(self) -> None:
         self.settings = self._table.read()
         self._table.locked = True
+        compiled = sys.modules.get("robocal_ros.core.compiled")  # of nodes that have kernels
+        if compiled is not None and compiled.is_cold():
+            self.get_logger().info(
+                "no machine code of the kernels is kept for this software and processor: they are "
+                "compiled now, which takes up to two minutes once"
+            )
         self.configure()
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:

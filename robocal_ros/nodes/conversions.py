@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -12,18 +12,17 @@ from robocal_msgs.msg import (
     CalibrationQuality,
     CalibrationSummary,
     KinematicModel,
-    SessionEvent,
 )
 from std_msgs.msg import Header
 
 from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics.parameters import COLUMNS
 from robocal_ros.core.proposals import Entry
-from robocal_ros.sessions.accuracy import Accuracy
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.records import arguments_text, outcome_text
+
+if TYPE_CHECKING:  # most nodes have no thermal session
+    from robocal_ros.sessions.accuracy import Accuracy
+    from robocal_ros.sessions.events import Outcome
 
 NS = 1_000_000_000
 _ERRORS = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
@@ -91,7 +90,7 @@ def kinematic_model(
 
 
 def verdict_message(
-    outcome: Outcome, *, robot: str, serial: str, stamp: Header, cycle_id: str = ""
+    outcome: "Outcome", *, robot: str, serial: str, stamp: Header, cycle_id: str = ""
 ) -> CalibrationQuality:
     """A verdict and why; of a candidate the errors are -1, until they are told, else 0."""
     message = CalibrationQuality(
@@ -112,7 +111,7 @@ def verdict_message(
     return message
 
 
-def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header) -> Any:
+def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Header) -> Any:
     """The verdict on a thermal model; without one the figures are 0 and the reason says why.
 
     Raises
@@ -138,7 +137,7 @@ def quality_message(outcome: Outcome, *, robot: str, serial: str, stamp: Header)
 
 
 def accuracy_message(
-    found: Accuracy, tolerance_m: float, *, robot: str, serial: str, stamp: Header
+    found: "Accuracy", tolerance_m: float, *, robot: str, serial: str, stamp: Header
 ) -> AccuracyState:
     """How accurate the robot is believed to be, see `Accuracy.document`."""
     told = found.document(tolerance_m)
@@ -158,17 +157,6 @@ def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, flo
         setattr(message, f"{whose}_{name}", float(errors[name]))
 
 
-def event_message(command: Command, outcome: Outcome | None, sequence: int) -> SessionEvent:
-    """A command and what came of it, None for the configuration."""
-    return SessionEvent(
-        stamp=time_message(command.stamp_ns or 0),
-        sequence=sequence,
-        command=command.name,
-        arguments=arguments_text(command),
-        outcome="{}" if outcome is None else outcome_text(outcome),
-    )
-
-
 def summary_message(entry: Entry) -> CalibrationSummary:
     """A line of the history; an error that was not judged is 0."""
     last = entry.decisions[-1] if entry.decisions else None
@@ -184,11 +172,6 @@ def summary_message(entry: Entry) -> CalibrationSummary:
         reason=last.reason if last else "",
         candidate_rms_mm=entry.candidate_rms_mm or 0.0,
     )
-
-
-def trigger_text(number: int, status: Code, message: str) -> str:
-    """The answer of a Trigger twin: id, code and words, in this order, one blank between."""
-    return f"{number} {status.name} {message}"
 
 
 def _require_finite(what: str, values: Sequence[float]) -> None:

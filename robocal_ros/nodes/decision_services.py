@@ -9,7 +9,8 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.nodes.conversions import summary_message, trigger_text
+from robocal_ros.nodes.conversions import summary_message
+from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.sessions.decisions import NEWEST, ONLY
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command, Outcome
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -20,11 +20,15 @@ from std_srvs.srv import Trigger
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.sessions.ignored import MOST_REASONS, kind_of
 
 LOG_EVERY_S = 5.0
 MOST_WAITING = 10_000  # messages of an input that are taken at once
+
+
+def trigger_text(number: int, status: Code, message: str) -> str:
+    """The answer of a Trigger twin: id, code and words, in this order, one blank between."""
+    return f"{number} {status.name} {message}"
 
 
 class NotActiveError(RobocalError):

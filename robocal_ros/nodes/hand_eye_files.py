@@ -12,9 +12,8 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.nodes.decision_services import answer
-from robocal_ros.nodes.endpoints import EndpointNode
+from robocal_ros.nodes.endpoints import EndpointNode, trigger_text
 from robocal_ros.sessions.events import LOAD, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_data import MOST_POINTS, DataSet, data_set_begun

@@ -14,9 +14,9 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.nodes.conversions import transform_message, trigger_text
+from robocal_ros.nodes.conversions import transform_message
 from robocal_ros.nodes.decision_services import answer, twin
-from robocal_ros.nodes.endpoints import EndpointNode
+from robocal_ros.nodes.endpoints import EndpointNode, trigger_text
 from robocal_ros.nodes.hand_eye_files import Ask, HandEyeFiles
 from robocal_ros.nodes.hand_eye_outputs import MOUNTS, TARGETS
 from robocal_ros.nodes.hand_eye_plan import HandEyePlan

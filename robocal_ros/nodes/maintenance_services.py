@@ -12,10 +12,9 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.nodes.decision_services import TWIN
 from robocal_ros.nodes.deferred_action import DeferredActionServer
-from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
+from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError, trigger_text
 from robocal_ros.nodes.maintenance_outputs import MaintenanceOutputs, result_message
 from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK
 from robocal_ros.sessions.maintenance import CycleResult, MaintenanceSession, Status

@@ -9,8 +9,8 @@ from std_srvs.srv import Trigger
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, StorageError
 from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
+from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.nodes.recorded_topics import Recorded, RecordedTopics
 from robocal_ros.nodes.run import run

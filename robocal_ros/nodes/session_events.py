@@ -6,8 +6,9 @@ from typing import Any
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from robocal_msgs.msg import SessionEvent
 
-from robocal_ros.nodes import conversions
+from robocal_ros.nodes.conversions import time_message
 from robocal_ros.sessions.events import CONFIGURE, Command, Outcome
+from robocal_ros.sessions.records import arguments_text, outcome_text
 
 # A recorder that comes later still gets the events.
 EVENTS = QoSProfile(
@@ -32,7 +33,7 @@ class SessionEvents:
         """Record a command and what came of it, None for the configuration."""
         self._sequence += 1
         self._since = 0 if command.name == CONFIGURE else self._since + 1
-        self._events.publish(conversions.event_message(command, outcome, self._sequence))
+        self._events.publish(event_message(command, outcome, self._sequence))
 
     @property
     def need_configuration(self) -> bool:
@@ -42,3 +43,14 @@ class SessionEvents:
         configuration among them.
         """
         return self._since >= EVENTS.depth // 2
+
+
+def event_message(command: Command, outcome: Outcome | None, sequence: int) -> SessionEvent:
+    """A command and what came of it, None for the configuration."""
+    return SessionEvent(
+        stamp=time_message(command.stamp_ns or 0),
+        sequence=sequence,
+        command=command.name,
+        arguments=arguments_text(command),
+        outcome="{}" if outcome is None else outcome_text(outcome),
+    )

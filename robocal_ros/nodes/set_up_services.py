@@ -17,7 +17,8 @@ from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.thermal.cycle_planning import POSES, plan_cycle
 from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.pose_planning import SensorField
-from robocal_ros.nodes.conversions import transform_message, trigger_text
+from robocal_ros.nodes.conversions import transform_message
+from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.sessions.events import CALIBRATE_SENSOR, Command, Outcome
 from robocal_ros.sessions.setting_up import SENSOR
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -2,8 +2,8 @@
 
 from rclpy.node import Node
 
+from robocal_ros.core.samples import UNCORRECTED
 from robocal_ros.sessions.observations import JOINTS
-from robocal_ros.sessions.replay import UNCORRECTED
 
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"  # not yet discovered
 

@@ -13,9 +13,8 @@ from std_srvs.srv import Trigger
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.proposals import TOOL
-from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.nodes.decision_services import DecisionServices
-from robocal_ros.nodes.endpoints import EndpointNode
+from robocal_ros.nodes.endpoints import EndpointNode, trigger_text
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.tool_results import FULL, QUICK, REFERENCE
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import JointBlock, stamp_ns
+from robocal_ros.core.samples import UNCORRECTED, JointBlock, stamp_ns
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
@@ -15,7 +15,6 @@ from robocal_ros.sessions.temperatures import TEMPERATURES
 
 EVENTS = "session_events"
 NOT_BITS = "not to the last bit"
-UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
 
 
 class Recorded(Protocol):

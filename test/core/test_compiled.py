@@ -1,11 +1,13 @@
 """Kept machine code never outlives an edit, also of a function in another file."""
 
 import ast
+import json
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -88,3 +90,127 @@ def imports(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             found.add(node.module.split(".")[0])
     return found
+
+
+CALL = """
+import json, sys, tempfile, warnings
+from pathlib import Path
+from typing import Any
+if len(sys.argv) > 1:
+    tempfile.tempdir = sys.argv[1]
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    import numpy as np
+    from robocal_ros.core import compiled
+    from robocal_ros.core.kinematics.newton import copy
+    cold = compiled.is_cold()
+    out = np.empty((2, 3))
+    copy(np.ones((2, 3)), out)
+print(json.dumps({
+    "right": bool((out == 1.0).all()), "cold": cold, "hits": sum(copy.stats.cache_hits.values()),
+    "path": str(copy.stats.cache_path), "told": [str(w.message) for w in told],
+}))
+"""
+NOWHERE = "/proc/nowhere"  # nobody makes a folder there, root neither
+
+
+def call(folder: Path, *before: str, **given: str) -> dict[str, Any]:
+    """Call a kernel of a tree where no home can be written; ``before``: command to run it with."""
+    kept = {n: v for n, v in os.environ.items() if n not in ("HOME", "NUMBA_CACHE_DIR")}
+    python = [sys.executable, "-P", "-c", CALL]
+    found = subprocess.run(
+        [*before, *python, *given.pop("arguments", "").split()],
+        env=kept | {"PYTHONPATH": str(folder), "XDG_CACHE_HOME": NOWHERE} | given,
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+    )
+    return dict(json.loads(found.stdout))
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """The package without kept code, in a folder with nothing else."""
+    folder = tmp_path / "tree"
+    shutil.copytree(PACKAGE, folder / "robocal_ros", ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+@pytest.fixture
+def read_only(tree: Path) -> list[str]:
+    """What runs a command with the tree read-only; skipped where that cannot be had."""
+    if os.geteuid():
+        for path in [tree, *tree.rglob("*")]:
+            if path.is_dir():
+                path.chmod(0o555)
+        return []
+    script = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
+    before = ["unshare", "--mount", "sh", "-c", script, str(tree)]
+    tried = subprocess.run([*before, "true"], capture_output=True, text=True, check=False)
+    if tried.returncode:
+        pytest.skip(f"this root may mount nothing: {tried.stderr.strip()}")
+    return before
+
+
+def test_a_read_only_tree_without_a_home_keeps_its_code_in_a_private_folder(
+    tree: Path, read_only: list[str], tmp_path: Path
+) -> None:
+    """Numba's own cache fails there at the import."""
+    first = call(tree, *read_only, TMPDIR=str(tmp_path))
+    assert (first["right"], first["cold"], first["hits"], first["told"]) == (True, True, 0, [])
+    (folder,) = tmp_path.glob("robocal_kernels_*")
+    assert first["path"].startswith(str(folder))
+    assert folder.stat().st_mode & 0o777 == 0o700
+    again = call(tree, *read_only, TMPDIR=str(tmp_path))
+    assert (again["right"], again["cold"], again["hits"]) == (True, False, 1)
+    folder.chmod(0o777)  # others could have put code there: it is not run
+    open_to_all = call(tree, *read_only, TMPDIR=str(tmp_path))
+    assert (open_to_all["right"], open_to_all["hits"]) == (True, 0)
+    assert any("cannot be kept" in words for words in open_to_all["told"])
+
+
+def test_code_that_was_compiled_at_the_installation_is_used_from_a_read_only_tree(
+    tree: Path, read_only: list[str], tmp_path: Path
+) -> None:
+    writable = tree.parent / "writable"
+    shutil.copytree(tree, writable)
+    for path in writable.rglob("*"):
+        path.chmod(0o755)
+    assert call(writable)["hits"] == 0
+    made = writable / "robocal_ros" / "core" / "kinematics" / "__pycache__"
+    beside = tree / "robocal_ros" / "core" / "kinematics"
+    beside.chmod(0o755)
+    shutil.copytree(made, beside / "__pycache__")
+    beside.chmod(0o555)
+    for temporary in (str(tmp_path), NOWHERE):  # with and without a place for new code
+        found = call(tree, *read_only, arguments=temporary)
+        assert (found["right"], found["cold"], found["hits"]) == (True, False, 1)
+
+
+def test_where_nothing_can_be_kept_kernels_work_and_it_is_told_once(
+    tree: Path, read_only: list[str]
+) -> None:
+    found = call(tree, *read_only, arguments=NOWHERE)
+    assert (found["right"], found["hits"]) == (True, 0)
+    (words,) = found["told"]
+    assert "cannot be kept" in words
+
+
+@pytest.mark.parametrize("content", [b"", b"junk"])
+def test_kept_code_that_a_power_cut_left_in_pieces_is_made_again(
+    tree: Path, content: bytes
+) -> None:
+    assert call(tree)["hits"] == 0
+    folder = tree / "robocal_ros" / "core" / "kinematics" / "__pycache__"
+    for end in ("nbi", "nbc"):
+        for path in folder.glob(f"newton.copy*.{end}"):
+            path.write_bytes(content)
+        assert call(tree)["right"]
+        assert call(tree)["hits"] == 1
+
+
+def test_a_full_disk_stops_no_kernel(tree: Path, small_disk: Path) -> None:
+    with pytest.raises(OSError, match="No space"):
+        (small_disk / "theirs").write_bytes(bytes(3_000_000))
+    found = call(tree, NUMBA_CACHE_DIR=str(small_disk))
+    assert found["right"]

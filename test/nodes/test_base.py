@@ -1,5 +1,7 @@
 """The house node, by a small node of its own kind."""
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -276,3 +278,16 @@ def test_endless_reasons_neither_flood_the_log_nor_the_memory() -> None:
     names = [f"joint {chr(ord('a') + i % 26)}{chr(ord('a') + i // 26)} missing" for i in range(600)]
     logged = sum(limit.allows("a", name, 100.0) for name in names)
     assert logged == MOST_REASONS + 1
+
+
+@pytest.mark.parametrize(
+    "module", ["nodes.base", "nodes.conversions", "nodes.recorder_node", "nodes.source_guard"]
+)
+def test_what_every_node_imports_brings_no_session_and_no_kernels(module: str) -> None:
+    """They cost each start of each node 80 ms."""
+    program = f"import sys, robocal_ros.{module}; print(*sys.modules)"
+    told = subprocess.run(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, check=True, text=True
+    )
+    heavy = {"numba", "scipy", "robocal_ros.sessions.thermal", "robocal_ros.sessions.accuracy"}
+    assert heavy.isdisjoint(told.stdout.split())
