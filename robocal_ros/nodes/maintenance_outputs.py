@@ -49,6 +49,7 @@ class MaintenanceOutputs:
         return MaintenanceStatus(
             header=conversions.header(now_ns, self._base),
             state=int(status.state),
+            beat=status.beat,
             cycle_id=status.cycle_id,
             doing="; ".join(filter(None, (status.doing or status.closed, status.trouble))),
             left_s=status.left_s,

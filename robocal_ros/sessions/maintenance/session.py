@@ -71,9 +71,13 @@ class MaintenanceSession:
 
     # ---- what happens ---------------------------------------------------------------------------
 
-    def gap(self, is_open: bool, now_s: float) -> None:
-        """Take a heartbeat of ``gap_open``."""
-        self._hands.gap.heard(is_open, now_s)
+    def beat(self, now_s: float) -> int:
+        """The next beat, to be published now; 5 Hz. A heartbeat echoes it."""
+        return self._hands.gap.count(now_s)
+
+    def gap(self, is_open: bool, echo: int | None, now_s: float) -> None:
+        """Take a heartbeat of ``gap_open``, with the beat that it echoes (None: it has none)."""
+        self._hands.gap.heard(is_open, echo, now_s)
 
     def doubt_gap(self, why: str) -> None:
         """The heartbeats do not count, and why; empty: they do."""
@@ -122,7 +126,7 @@ class MaintenanceSession:
         """
         if not 0 < len(cycle_id) <= MOST_ID:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
-        if (known := self._known(cycle_id)) is not None:
+        if (known := self.result(cycle_id)) is not None:
             return known
         hands, memory = self._hands, self._memory
         hands.now_s = now_s
@@ -250,7 +254,9 @@ class MaintenanceSession:
 
     def result(self, cycle_id: str) -> CycleResult | None:
         """How a cycle ended, or how far it is; None where it is not known."""
-        return self._known(cycle_id)
+        if (running := self.running) is not None and running.cycle_id == cycle_id:
+            return running
+        return self._memory.cycles.get(cycle_id)
 
     @property
     def running(self) -> CycleResult | None:
@@ -284,11 +290,6 @@ class MaintenanceSession:
             raise TooFewSamplesError(f"{robot.unheard}: nobody knows whether the robot is at home")
         if away := robot.beside_home():
             raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
-
-    def _known(self, cycle_id: str) -> CycleResult | None:
-        if (result := self.running) is not None and result.cycle_id == cycle_id:
-            return result
-        return self._memory.cycles.get(cycle_id)
 
     def _decided(self, outcome: Outcome) -> None:
         if not outcome.repeated:
