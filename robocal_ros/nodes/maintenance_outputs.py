@@ -21,6 +21,8 @@ def result_message(result: CycleResult | None) -> MaintenanceResult:
         return MaintenanceResult()
     return MaintenanceResult(
         cycle_id=result.cycle_id,
+        stamp=conversions.time_message(result.stamp_ns),
+        run=result.run,
         code=int(result.code),
         message=result.message,
         complete=result.complete,

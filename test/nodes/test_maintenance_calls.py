@@ -102,10 +102,18 @@ def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
     graph.spin_until(lambda: plc.run("4711").result.code == Code.ACCEPT, "it ends")
     ended = plc.run("4711")
     assert (ended.success, ended.result.complete) == (True, True)
+    assert (ended.before_start, ended.result.run) == (False, 1)
+    assert abs(ended.result.stamp.sec - time.time()) < 60.0
     plc.node.trigger_deactivate()
     plc.node.trigger_activate()
     graph.spin_for(0.3)
-    assert plc.run("4711") == ended
+    again = plc.run("4711")
+    assert (again.success, again.before_start, again.result) == (True, True, ended.result)
+    old = f"cycle '4711' is one of before this start of the node, run {ended.result.run}, "
+    assert again.message.startswith(old)
+    assert "nothing runs now; it ended so: nothing was due" in again.message
+    assert plc.trigger("status").startswith(f"0 ACCEPT {old}")
+    assert old in plc.call(GetMaintenance, "status", cycle_id="4711").message
     known = plc.call(GetMaintenance, "status", cycle_id="4711")
     assert known.result == ended.result
     assert known.state.state == MaintenanceStatus.IDLE

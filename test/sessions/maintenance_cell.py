@@ -173,7 +173,7 @@ class Cell:
 
     def open_gap(self) -> None:
         self.is_open = self.beating = True
-        self.pass_time(0.3)
+        self.pass_time(3.0 * BEAT_S)  # a beat, its reading, its echo
 
     def run(self, cycle_id: str, gap_s: float) -> Code:
         """Call; a run that truly begins is noted."""

@@ -49,6 +49,7 @@ class MaintenanceSession:
     Attributes
     ----------
     ways : the ways that the robot may take.
+    memory : what outlives a restart; read it only.
     """
 
     def __init__(
@@ -60,13 +61,13 @@ class MaintenanceSession:
         record: Callable[[Command, Outcome], None] = lambda command, outcome: None,
     ) -> None:
         self.config, self.ways = config, Ways(nominal, config)
-        self._memory = Memory.load(keeper)
+        self.memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
         self._hands = Hands(config, self.ways)
         self._hands.doubt()  # whoever ran before may have left the tool's driver armed
         self._book = CycleBook()
         self._record = record
-        self._conductor = Conductor(self._hands, self._memory, self._tell)
+        self._conductor = Conductor(self._hands, self.memory, self._tell)
         self._heard = Heard(config)
 
     # ---- what happens ---------------------------------------------------------------------------
@@ -128,7 +129,7 @@ class MaintenanceSession:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
         if (known := self.result(cycle_id)) is not None:
             return known
-        hands, memory = self._hands, self._memory
+        hands, memory = self._hands, self.memory
         hands.now_s = now_s
         if memory.fault:
             raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
@@ -143,9 +144,8 @@ class MaintenanceSession:
         except LimitError as error:
             self._conductor.fault(error.code, str(error))
             raise
-        memory.begin(cycle_id)
         run = Run(
-            cycle_id,
+            memory.begin(cycle_id, wall_ns),
             hands,
             self._book,
             self._decider,
@@ -209,12 +209,12 @@ class MaintenanceSession:
         StorageError
             When it cannot be kept; the fault stays.
         """
-        if not self._memory.fault:
+        if not self.memory.fault:
             return "there is no fault"
         self._hands.tool.require_disarmed()
         self._require_home()
-        words = f"acknowledged: {self._memory.fault}"
-        self._memory.clear_fault()
+        words = f"acknowledged: {self.memory.fault}"
+        self.memory.clear_fault()
         self._hands.doing = ""
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words
@@ -256,7 +256,7 @@ class MaintenanceSession:
         """How a cycle ended, or how far it is; None where it is not known."""
         if (running := self.running) is not None and running.cycle_id == cycle_id:
             return running
-        return self._memory.cycles.get(cycle_id)
+        return self.memory.cycles.get(cycle_id)
 
     @property
     def running(self) -> CycleResult | None:
@@ -267,7 +267,7 @@ class MaintenanceSession:
     @property
     def state(self) -> State:
         """What it is at."""
-        if self._memory.fault:
+        if self.memory.fault:
             return State.FAULT
         if self._conductor.run is None:
             return State.IDLE
@@ -275,14 +275,14 @@ class MaintenanceSession:
 
     def status(self, now_s: float) -> Status:
         """Everything at once."""
-        return status_of(self.state, self.running, self._memory, self._hands, self._decider, now_s)
+        return status_of(self.state, self.running, self.memory, self._hands, self._decider, now_s)
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""
         thermal, tool, heard = self._decider.head(THERMAL), self._decider.head(TOOL), self._heard
         told = heard.drift(now_s), heard.uncorrected(thermal, tool, now_s)
         number = thermal.calibration_id or 0
-        return accuracy_of(self.config, *told, self._memory, tool, number, wall_ns)
+        return accuracy_of(self.config, *told, self.memory, tool, number, wall_ns)
 
     def _require_home(self) -> None:
         robot = self._hands.robot
