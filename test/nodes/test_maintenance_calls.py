@@ -6,6 +6,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,21 +33,22 @@ from robocal_ros.storage.robots import load_robot
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 PERIOD_S = 0.05
 NODE = "/maintenance_node"
+ROOT = Path(__file__).parents[2]
 
 
 class Plc:
     """The probe: heartbeat, a robot that stands, and calls."""
 
-    def __init__(self, graph: Any, start: Callable[[], Any]) -> None:
+    def __init__(self, graph: Any, start: Callable[[], Any], *, bridge: bool = True) -> None:
         self.graph = graph
         self.echo: int | None = None
-        self.is_open, self.beating, self.q = True, True, np.radians(HOME_DEG)
+        self.is_open, self.beating, self.q = True, bridge, np.radians(HOME_DEG)
         self.names = list(load_robot("ur10").joint_names)
         self.states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
         self.statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
         self.events = graph.collect(SessionEvent, f"{NODE}/session_events", EVENTS)
         self.node = start()
-        self.gap = graph.publisher(GapOpen, "gap_open")
+        self.gap = graph.publisher(GapOpen, "gap_open") if bridge else None
         self.joints = graph.publisher(JointState, "joint_states")
         self.sent = 0
         graph.probe.create_timer(PERIOD_S, self._beat)
@@ -54,7 +56,7 @@ class Plc:
         graph.spin_until(lambda: self.statuses and self._ready(self.statuses[-1]), "it is ready")
 
     def _ready(self, status: MaintenanceStatus) -> bool:
-        return bool(status.at_home and not status.doing)
+        return bool(status.at_home and not (status.doing and self.beating))
 
     def _beat(self) -> None:
         self.sent += 1
@@ -459,6 +461,53 @@ def test_a_bool_is_told_and_counts_only_where_the_parameter_says_so(graph):
     )
     graph.spin_until(lambda: statuses[-1].doing == "", "it counts", 30.0)
     assert "gap_bool: gap_open is taken as std_msgs/Bool, which bears no echo" in node.output
+
+
+BRIDGE = """
+import sys, threading, time
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from robocal_msgs.msg import GapOpen, MaintenanceStatus
+
+class Plc(dict):
+    read = dict.get
+    write = dict.__setitem__
+
+plc = Plc(beat=0, echo=0, gap=True)
+
+def program():  # of the PLC; put in STOP by a line on the standard input
+    while not stop.is_set():
+        plc["echo"] = plc["beat"]
+        time.sleep(0.02)
+
+"""
+MAIN = """
+import os
+stop = threading.Event()
+threading.Thread(target=program, daemon=True).start()
+rclpy.init()
+node = GapBridge()
+while rclpy.ok():
+    rclpy.spin_once(node, timeout_sec=0.1)
+    if os.path.exists(sys.argv[1]):
+        stop.set()
+"""
+
+
+def test_the_bridge_of_the_page_opens_the_gap_while_the_program_runs(graph, tmp_path):
+    page = (ROOT / "docs/plc.md").read_text()
+    bridge = page.split("```python\n")[1].split("```")[0]
+    script, stops = tmp_path / "bridge.py", tmp_path / "stop"
+    script.write_text(BRIDGE + bridge + MAIN)
+    plc = Plc(graph, lambda: process(graph), bridge=False)
+    graph.start(script, {}, {}, str(stops))
+    graph.spin_until(lambda: plc.statuses[-1].doing == "", "the gap is open", 30.0)
+    assert plc.run("a").success
+    stops.touch()
+    words = "which is no beat of the last 0.5 s"
+    graph.spin_until(lambda: words in plc.statuses[-1].doing, "the program stands")
+    assert plc.run("b").status == Code.CONFLICT
 
 
 def test_the_status_comes_five_times_a_second_and_counts_up(plc, graph):
