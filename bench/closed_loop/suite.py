@@ -130,8 +130,10 @@ class Suite:
 
     def gap(self, is_open: bool, now_s: float) -> None:
         """Take a heartbeat of the PLC, which the maintenance and the tool's driver both hear."""
-        self._gap.heard(is_open, now_s)
-        self.maintenance.gap(is_open, now_s)
+        beat = self.maintenance.beat(now_s)
+        self._gap.saw(beat, now_s)
+        self._gap.heard(is_open, beat, now_s)
+        self.maintenance.gap(is_open, beat, now_s)
 
     def _closed(self, now_s: float) -> str:
         self._gap.look(now_s)

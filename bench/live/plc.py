@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 from rclpy.exceptions import InvalidHandle
-from robocal_msgs.msg import AccuracyState, CorrectionStatus, MaintenanceStatus
+from robocal_msgs.msg import AccuracyState, CorrectionStatus, GapOpen, MaintenanceStatus
 from robocal_msgs.srv import GetMaintenance, RunMaintenanceCycle
-from std_msgs.msg import Bool, String
+from std_msgs.msg import String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -56,13 +56,16 @@ class Plc:
     def __init__(self, controller: CellController, tell: Callable[[str], None]) -> None:
         self._controller, self._tell = controller, tell
         self._is_open, self._beats = False, True
-        self._gap = controller.publisher(Bool, "gap_open")
+        self._gap = controller.publisher(GapOpen, "gap_open")
         self._program = controller.publisher(JointTrajectory, PROGRAM)
         self._accuracy: deque[AccuracyState] = deque(maxlen=1)
         self._correction: deque[CorrectionStatus] = deque(maxlen=1)
         controller.listen(AccuracyState, "accuracy_state", self._accuracy, qos.LATCHED)
         status = "/joint_correction_node/status"
         controller.listen(CorrectionStatus, status, self._correction, qos.LATCHED)
+        self._maintenance: deque[MaintenanceStatus] = deque(maxlen=1)
+        beats = "/maintenance_node/status"
+        controller.listen(MaintenanceStatus, beats, self._maintenance, qos.LATCHED)
         self._heart = threading.Thread(target=self._beat, daemon=True)
         self._heart.start()
         self._names = list(load_robot(ROBOT).joint_names)
@@ -74,8 +77,11 @@ class Plc:
         """As a PLC does it: whatever else goes on here."""
         while self._beats:
             with suppress(InvalidHandle):  # the graph ends
-                self._gap.publish(Bool(data=self._is_open))
+                self._gap.publish(GapOpen(open=self._is_open, echo=self._newest_beat()))
             time.sleep(BEAT_S)
+
+    def _newest_beat(self) -> int:
+        return self._maintenance[-1].beat if self._maintenance else 0
 
     def close(self) -> None:
         """End the heartbeat."""

@@ -7,7 +7,6 @@ from typing import Any
 from geometry_msgs.msg import PointStamped, PoseStamped
 from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from sensor_msgs.msg import JointState, PointCloud2
-from std_msgs.msg import Bool
 
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.samples import joint_sample, stamp_ns
@@ -29,7 +28,7 @@ from robocal_ros.nodes.source_guard import SourceGuard
 from robocal_ros.nodes.steady_clock import SteadyClock
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.maintenance import MaintenanceSession, State, Status
+from robocal_ros.sessions.maintenance import MaintenanceSession, State
 from robocal_ros.sessions.maintenance.requests import Answer, Request
 from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -42,7 +41,6 @@ ACCURACY_S = 1.0
 HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks after the robot
 NS = 1_000_000_000
 ENDS = "the node was deactivated"
-GAP_OPEN = "gap_open"
 ACCURACY, CORRECTION = "thermal_node/accuracy", "joint_correction_node/status"
 MEASUREMENTS = {
     POINT: PointStamped,
@@ -85,8 +83,7 @@ class MaintenanceNode(HouseNode):
         )
         self._guard = SourceGuard(self, JOINTS)
         self.add_input(JointState, JOINTS, self._take_joints, qos.STREAM)
-        heartbeat = self.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
-        self._sources = GapSources(self, heartbeat)
+        self._sources = GapSources(self, settings["gap_bool"], self._take_gap)
         self.add_input(AccuracyState, ACCURACY, self._take_accuracy, qos.LATCHED)
         self.add_input(CorrectionStatus, CORRECTION, self._take_correction, qos.LATCHED)
         for topic, kind in MEASUREMENTS.items():
@@ -102,7 +99,6 @@ class MaintenanceNode(HouseNode):
         self._session = MaintenanceSession(
             self._nominal, self._history, self._config, self._keeper, self._record
         )
-        self._shown: Status | None = None
         for step, worst_s in self._session.worst_cases().items():
             self.get_logger().info(f"{step}: {worst_s:.1f} s at the most, way home included")
         self._show()
@@ -144,10 +140,10 @@ class MaintenanceNode(HouseNode):
         q = sample.position[sample.order(self._nominal.joint_names)]
         session.reading(sample.stamp_ns / NS, q, self._steady.now_s())
 
-    def _take_gap(self, message: Any) -> None:
+    def _take_gap(self, is_open: bool, echo: int | None) -> None:
         if self._session is not None:
             self._session.doubt_gap(self._sources.doubt())
-            self._session.gap(message.data, self._steady.now_s())
+            self._session.gap(is_open, echo, self._steady.now_s())
             self._tick()  # a gap that closes stops the robot now
 
     def _take_measurement(self, message: Any) -> None:
@@ -202,17 +198,16 @@ class MaintenanceNode(HouseNode):
         self._outputs.events.tell(stamped, replace(outcome, command=stamped))
 
     def _show(self) -> None:
-        """Say what changed; tell the callers of the action."""
+        """Count the next beat, and say it with the status; tell the callers of the action."""
         self._guard.look()
         session = self._session
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
-        status = session.status(self._steady.now_s())
-        shown = replace(status, left_s=round(status.left_s))
-        if shown != self._shown:
-            self._shown = shown
-            self._outputs.status(status, self.now_ns())
+        now_s = self._steady.now_s()
+        status = session.status(now_s)  # which may take its time: the history is read
+        status = replace(status, beat=session.beat(self._steady.now_s()))
+        self._outputs.status(status, self.now_ns())
         self._calls.look(status)
 
     def _show_accuracy(self) -> None:

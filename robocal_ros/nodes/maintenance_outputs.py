@@ -21,6 +21,8 @@ def result_message(result: CycleResult | None) -> MaintenanceResult:
         return MaintenanceResult()
     return MaintenanceResult(
         cycle_id=result.cycle_id,
+        stamp=conversions.time_message(result.stamp_ns),
+        run=result.run,
         code=int(result.code),
         message=result.message,
         complete=result.complete,
@@ -49,6 +51,7 @@ class MaintenanceOutputs:
         return MaintenanceStatus(
             header=conversions.header(now_ns, self._base),
             state=int(status.state),
+            beat=status.beat,
             cycle_id=status.cycle_id,
             doing="; ".join(filter(None, (status.doing or status.closed, status.trouble))),
             left_s=status.left_s,

@@ -84,7 +84,7 @@ class MaintenanceServices:
                 raise NotActiveError(f"the node is {self._node.state}")
             self._session().run(request.cycle_id, request.gap_s, now.steady_s, now.wall_ns)
         except RobocalError as error:
-            self._end(goal, CycleResult(request.cycle_id, error.code, str(error)))
+            self._end(goal, CycleResult(request.cycle_id, error.code, str(error)), str(error))
             return
         self._goals.append(goal)
         self.look()
@@ -102,7 +102,7 @@ class MaintenanceServices:
             result = self._session().result(goal.request.cycle_id)
             if result is not None and result.code is not Code.NONE:
                 self._goals.remove(goal)
-                self._end(goal, result)
+                self._end(goal, result, self._session().memory.words_of(result))
             elif status is not None:
                 message = self._outputs.status_message(status, self._node.now_ns())
                 goal.publish_feedback(RunMaintenance.Feedback(state=message))
@@ -110,14 +110,14 @@ class MaintenanceServices:
     def break_off(self, reason: str) -> None:
         """The node goes: its callers are told."""
         for goal in self._goals:
-            self._end(goal, CycleResult(goal.request.cycle_id, Code.CONFLICT, reason))
+            self._end(goal, CycleResult(goal.request.cycle_id, Code.CONFLICT, reason), reason)
         self._goals.clear()
 
-    def _end(self, goal: ServerGoalHandle, result: CycleResult) -> None:
+    def _end(self, goal: ServerGoalHandle, result: CycleResult, words: str) -> None:
         done = result.code is Code.ACCEPT
         answer = RunMaintenance.Result(
             success=done,
-            message=result.message,
+            message=words,
             status=int(result.code),
             result=result_message(result),
         )
@@ -130,7 +130,9 @@ class MaintenanceServices:
         now = self._clocks()
         result = self._session().run(request.cycle_id, request.gap_s, now.steady_s, now.wall_ns)
         response.success, response.status = True, int(Code.ACCEPT)
-        response.message = result.message or f"cycle '{result.cycle_id}' runs"
+        memory = self._session().memory
+        response.before_start = result.cycle_id in memory.earlier
+        response.message = memory.words_of(result) or f"cycle '{result.cycle_id}' runs"
         response.result = result_message(result)
         return response
 
@@ -144,6 +146,8 @@ class MaintenanceServices:
             raise InputError(f"cycle '{request.cycle_id}' is not known: it never ran, or long ago")
         response.success, response.status = True, int(Code.ACCEPT)
         response.message = status.fault or status.doing or status.state.name
+        if result is not None and request.cycle_id in session.memory.earlier:
+            response.message = f"{response.message}; {session.memory.words_of(result)}"
         if status.trouble:
             response.success, response.status = False, int(Code.STORAGE_FAILED)
             response.message = status.trouble
@@ -202,7 +206,7 @@ class MaintenanceServices:
             return 0, Code.STORAGE_FAILED, status.trouble
         if status.last is None:
             return waiting, Code.CONFLICT, "no cycle has ended yet"
-        return waiting, status.last.code, status.last.message
+        return waiting, status.last.code, session.memory.words_of(status.last)
 
     def _cancel_run(self) -> tuple[int, Code, str]:
         if self._session().cancel("cancelled by a Trigger"):

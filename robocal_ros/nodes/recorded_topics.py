@@ -10,15 +10,17 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from robocal_ros.core.errors import InputError
 from robocal_ros.nodes.replay_topics import message_class
 from robocal_ros.storage.bag_types import definition
+from robocal_ros.storage.recorded_names import recorded_name
 
 DEPTH = 1000
 
 
 @dataclass
 class Recorded:
-    """A topic that is subscribed."""
+    """A topic that is subscribed, and its name in the recording."""
 
     topic: str
+    name: str
     msgtype: str
     reliable: bool
     latched: bool
@@ -37,7 +39,7 @@ class RecordedTopics:
     Attributes
     ----------
     found : by resolved name.
-    latched : those that are offered latched; grows.
+    latched : those that are offered latched, by both their names; grows.
     unknown : topics whose type cannot be recorded, and why.
     """
 
@@ -83,9 +85,11 @@ class RecordedTopics:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        recorded = self.found[topic] = Recorded(topic, msgtype, reliable, latched)
+        recorded = self.found[topic] = Recorded(
+            topic, recorded_name(topic, msgtype), msgtype, reliable, latched
+        )
         if latched:
-            self.latched.add(topic)
+            self.latched |= {topic, recorded.name}
 
         def receive(data: bytes) -> None:
             recorded.messages += 1

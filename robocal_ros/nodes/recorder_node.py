@@ -135,7 +135,7 @@ class RecorderNode(HouseNode):
             return
         try:
             recording = self._recording or self._begin()
-            recording.write(recorded.topic, recorded.msgtype, data, self.now_ns())
+            recording.write(recorded.name, recorded.msgtype, data, self.now_ns())
         except StorageError as error:
             self._lost += 1
             self._lost_since = self._lost_since or utc()

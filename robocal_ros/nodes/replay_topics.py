@@ -11,6 +11,12 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.storage.recorded_names import (
+    MOVES_ENDS,
+    MOVES_TYPES,
+    VOUCHES_ENDS,
+    VOUCHES_TYPES,
+)
 
 DEPTH = 1000
 LATCHED_DEPTH = 100
@@ -21,12 +27,8 @@ VOUCHES = "it says that a robot may move now"
 LEFT_OUT = {  # unless they are named, by type or by the last part of the name
     "robocal_msgs/msg/SessionEvent": OWN,
     "diagnostic_msgs/msg/DiagnosticArray": OWN,
-    "trajectory_msgs/msg/JointTrajectory": MOVES,
-    "trajectory_msgs/msg/MultiDOFJointTrajectory": MOVES,
-    "std_msgs/msg/Float64MultiArray": MOVES,  # as forward_command_controller takes them
-    "robocal_msgs/msg/ToolStep": MOVES,
-    "joint_targets": MOVES,
-    "gap_open": VOUCHES,
+    **dict.fromkeys(MOVES_TYPES | MOVES_ENDS, MOVES),
+    **dict.fromkeys(VOUCHES_TYPES | VOUCHES_ENDS, VOUCHES),
 }
 
 

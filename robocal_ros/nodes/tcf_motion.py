@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from std_msgs.msg import Bool
+from robocal_msgs.msg import MaintenanceStatus
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
@@ -11,7 +11,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
 from robocal_ros.motion.gap import Gap
-from robocal_ros.motion.gap_sources import GapSources
+from robocal_ros.motion.gap_sources import GAP_BOOL, SHORTEST_STALE_S, STATUS, GapSources
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.settings import (
     MOTION,
@@ -37,14 +37,17 @@ SETTINGS = (
     Setting(
         "gap_stale_s",
         0.5,
-        "Nothing moves unless gap_open is true and no older; 0: it is not listened to, and "
-        "maintenance_node does not measure with it",
+        "Nothing moves unless gap_open is true, and neither it nor the beat that it echoes older; "
+        "0: it is not listened to, and maintenance_node does not measure with it",
         unit="s",
         low=0.0,
         high=0.5,
+        check=lambda stale_s: (
+            f"0, or {SHORTEST_STALE_S:g} s at least" if 0.0 < stale_s < SHORTEST_STALE_S else None
+        ),
     ),
+    GAP_BOOL,
 )
-GAP_OPEN = "gap_open"
 UNHEARD = "gap_open is not listened to: gap_stale_s is 0"
 
 
@@ -72,8 +75,11 @@ class TcfMotion:
         stale_s = settings["gap_stale_s"]
         self._gap = Gap(stale_s) if stale_s > 0.0 else None
         if self._gap is not None:
-            heartbeat = node.add_input(Bool, GAP_OPEN, self._take_gap, qos.HEARTBEAT)
-            self._sources = GapSources(node, heartbeat)
+            is_bool = settings["gap_bool"]
+            self._sources = GapSources(node, is_bool, self._take_gap)
+            if not is_bool:
+                # Not latched: a beat of before is not taken for one of now.
+                node.add_input(MaintenanceStatus, STATUS, self._take_beat, qos.RELIABLE)
         else:
             node.get_logger().warning(self.deaf())
         node.add_service(SetBool, "~/arm", self._arm, inactive=True)
@@ -134,10 +140,14 @@ class TcfMotion:
         if self.driver is not None and outcome.document is None:
             self.driver.run_failed(outcome.message, self._steady.now_s())
 
-    def _take_gap(self, message: Any) -> None:
+    def _take_beat(self, message: Any) -> None:
+        if self._gap is not None:
+            self._gap.saw(message.beat, self._steady.now_s())
+
+    def _take_gap(self, is_open: bool, echo: int | None) -> None:
         if self._gap is not None:
             self._gap.doubt(self._sources.doubt())
-            self._gap.heard(message.data, self._steady.now_s())
+            self._gap.heard(is_open, echo, self._steady.now_s())
             self._tick()
 
     def _slept(self, for_s: float) -> None:

@@ -6,7 +6,7 @@ A message read from a bag has the attributes of the ROS message of its type.
 import warnings
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self
@@ -24,6 +24,7 @@ from robocal_ros.storage.mcap_files import Block, Lost, McapFile, open_file, rea
 from robocal_ros.storage.merging import in_order
 from robocal_ros.storage.message_readers import message_reader
 from robocal_ros.storage.messages import Messages
+from robocal_ros.storage.recorded_names import graph_name
 
 __all__ = ["BagInfo", "BagMessage", "BagReader", "BagWriter", "TopicInfo", "bag_info", "read_bag"]
 
@@ -70,6 +71,9 @@ class BagInfo:
 class BagReader:
     """A bag's messages in log-time order; a context manager.
 
+    Topics have the names that they had on the graph, also where they were recorded under another
+    one (`recorded_names`).
+
     Parameters
     ----------
     path : str or Path
@@ -86,6 +90,9 @@ class BagReader:
         self._path = Path(path)
         paths, notes = _bag_files(self._path)
         self._files = [open_file(file) for file in paths]
+        for file in self._files:
+            for number, channel in file.channels.items():
+                file.channels[number] = replace(channel, topic=graph_name(channel.topic))
         if all(file.is_barren for file in self._files):
             raise InputError(
                 f"the recording broke off at byte {self._files[0].broke_off} before any message; "

@@ -12,11 +12,10 @@ from command import robocal_json
 from geometry_msgs.msg import PointStamped
 from rclpy.action import ActionClient
 from robocal_msgs.action import RunMaintenance
-from robocal_msgs.msg import AccuracyState, MaintenanceStatus, SessionEvent
+from robocal_msgs.msg import AccuracyState, GapOpen, MaintenanceStatus, SessionEvent
 from robocal_msgs.srv import CaptureReference
 from sensor_msgs.msg import JointState
 from shift import BALL, NOISE_M, T_SENSOR_BASE
-from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.kinematics.inverse import inverse
@@ -89,7 +88,7 @@ class LiveCell:
         graph.probe.create_subscription(JointState, "joint_states", self._joints, qos.STREAM)
         self.drive = graph.probe.create_publisher(JointTrajectory, ROBOT, 10)
         self.sphere = graph.probe.create_publisher(PointStamped, "sphere_center", 10)
-        self.gap = graph.probe.create_publisher(Bool, "gap_open", 10)
+        self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
         threading.Thread(target=self._beats, daemon=True).start()
         graph.probe.create_timer(SENSE_S, self._sense)
         csv, laser = folder / "beams.csv", folder / "laser.yaml"
@@ -144,7 +143,8 @@ class LiveCell:
         while self.graph.context.ok():
             if self.beating:
                 with contextlib.suppress(Exception):  # the test ends
-                    self.gap.publish(Bool(data=self.is_open))
+                    beat = self.statuses[-1].beat if self.statuses else 0
+                    self.gap.publish(GapOpen(open=self.is_open, echo=beat))
             time.sleep(self.beat_s)
 
     def _sense(self) -> None:

@@ -6,6 +6,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from rclpy.action import ActionClient, CancelResponse
 from robocal_msgs.action import RunMaintenance
-from robocal_msgs.msg import AccuracyState, MaintenanceStatus, SessionEvent
+from robocal_msgs.msg import AccuracyState, GapOpen, MaintenanceStatus, SessionEvent
 from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenanceCycle
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
@@ -32,20 +33,22 @@ from robocal_ros.storage.robots import load_robot
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 PERIOD_S = 0.05
 NODE = "/maintenance_node"
+ROOT = Path(__file__).parents[2]
 
 
 class Plc:
     """The probe: heartbeat, a robot that stands, and calls."""
 
-    def __init__(self, graph: Any, start: Callable[[], Any]) -> None:
+    def __init__(self, graph: Any, start: Callable[[], Any], *, bridge: bool = True) -> None:
         self.graph = graph
-        self.is_open, self.beating, self.q = True, True, np.radians(HOME_DEG)
+        self.echo: int | None = None
+        self.is_open, self.beating, self.q = True, bridge, np.radians(HOME_DEG)
         self.names = list(load_robot("ur10").joint_names)
         self.states = graph.collect(AccuracyState, "accuracy_state", qos.LATCHED)
         self.statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
         self.events = graph.collect(SessionEvent, f"{NODE}/session_events", EVENTS)
         self.node = start()
-        self.gap = graph.publisher(Bool, "gap_open")
+        self.gap = graph.publisher(GapOpen, "gap_open") if bridge else None
         self.joints = graph.publisher(JointState, "joint_states")
         self.sent = 0
         graph.probe.create_timer(PERIOD_S, self._beat)
@@ -53,7 +56,7 @@ class Plc:
         graph.spin_until(lambda: self.statuses and self._ready(self.statuses[-1]), "it is ready")
 
     def _ready(self, status: MaintenanceStatus) -> bool:
-        return bool(status.at_home and not status.doing)
+        return bool(status.at_home and not (status.doing and self.beating))
 
     def _beat(self) -> None:
         self.sent += 1
@@ -62,7 +65,14 @@ class Plc:
         message.header.stamp = Time(sec=1000 + ns // 10**9, nanosec=ns % 10**9)
         self.joints.publish(message)
         if self.beating:
-            self.gap.publish(Bool(data=self.is_open))
+            self.gap.publish(GapOpen(open=self.is_open, echo=self.beat))
+
+    @property
+    def beat(self) -> int:
+        """The newest that was read; or what the bridge repeats."""
+        if self.echo is not None:
+            return self.echo
+        return int(self.statuses[-1].beat) if self.statuses else 0
 
     def call(self, kind: type, name: str, **fields: Any) -> Any:
         return self.graph.call(kind, f"{NODE}/{name}", **fields)
@@ -94,10 +104,18 @@ def test_a_cycle_runs_once_however_often_it_is_called(plc, graph):
     graph.spin_until(lambda: plc.run("4711").result.code == Code.ACCEPT, "it ends")
     ended = plc.run("4711")
     assert (ended.success, ended.result.complete) == (True, True)
+    assert (ended.before_start, ended.result.run) == (False, 1)
+    assert abs(ended.result.stamp.sec - time.time()) < 60.0
     plc.node.trigger_deactivate()
     plc.node.trigger_activate()
     graph.spin_for(0.3)
-    assert plc.run("4711") == ended
+    again = plc.run("4711")
+    assert (again.success, again.before_start, again.result) == (True, True, ended.result)
+    old = f"cycle '4711' is one of before this start of the node, run {ended.result.run}, "
+    assert again.message.startswith(old)
+    assert "nothing runs now; it ended so: nothing was due" in again.message
+    assert plc.trigger("status").startswith(f"0 ACCEPT {old}")
+    assert old in plc.call(GetMaintenance, "status", cycle_id="4711").message
     known = plc.call(GetMaintenance, "status", cycle_id="4711")
     assert known.result == ended.result
     assert known.state.state == MaintenanceStatus.IDLE
@@ -322,7 +340,7 @@ def test_a_node_that_is_deactivated_says_so(plc, graph):
     call.call_async(RunMaintenanceCycle.Request(cycle_id="a", gap_s=30.0))
     graph.spin_until(lambda: plc.node._session.running, "it runs")
     plc.node._show()
-    assert plc.node._shown.state is State.RUNNING
+    assert plc.node._session.state is State.RUNNING
     plc.node.trigger_deactivate()
     graph.spin_until(lambda: plc.statuses[-1].last.cycle_id == "a", "the last word")
     assert plc.statuses[-1].state == MaintenanceStatus.IDLE
@@ -369,7 +387,7 @@ def test_a_figure_that_cannot_be_is_no_drift(graph, name):
 
 
 def test_a_second_publisher_of_the_heartbeat_closes_the_gap(plc, graph):
-    other = graph.probe.create_publisher(Bool, "gap_open", 10)
+    other = graph.probe.create_publisher(GapOpen, "gap_open", 10)
     words = "gap_open has 2 publishers (probe, probe): let one alone publish it"
     graph.spin_until(lambda: plc.statuses[-1].doing == words, "it is told")
     refused = plc.run("4711")
@@ -383,7 +401,7 @@ def test_a_second_publisher_of_the_heartbeat_closes_the_gap(plc, graph):
 def test_a_heartbeat_that_cannot_be_heard_is_told(graph):
     graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
     statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
-    graph.probe.create_publisher(Bool, "gap_open", qos.own(qos.SENSOR))
+    graph.probe.create_publisher(GapOpen, "gap_open", qos.own(qos.SENSOR))
     words = "gap_open of probe is BEST_EFFORT and not heard: publish it RELIABLE"
     graph.spin_until(lambda: statuses and statuses[-1].doing == words, "it is told")
 
@@ -401,6 +419,105 @@ def test_heartbeats_that_waited_for_the_node_do_not_count(graph):
         assert refused.message.startswith("gap_open is silent for more than 0.5 s")
     plc.beating = True
     graph.spin_until(lambda: plc.run("e").success, "heartbeats count again")
+
+
+def test_a_bridge_that_repeats_the_last_value_of_a_dead_plc_closes_the_gap(plc, graph):
+    beat_s: dict[int, float] = {}
+    note = plc.graph.probe.create_subscription(
+        MaintenanceStatus,
+        f"{NODE}/status",
+        lambda message: beat_s.setdefault(int(message.beat), time.monotonic()),
+        10,
+    )
+    graph.spin_for(1.0)
+    assert plc.run("a").success
+    plc.echo = plc.beat  # the program stands; its bridge goes on
+    read_s = beat_s.get(plc.echo, time.monotonic())
+    graph.spin_until(lambda: plc.node._session.status(plc.node._steady.now_s()).closed, "closed")
+    assert time.monotonic() - read_s <= 0.7 + 0.1  # and a turn of the probe
+    refused = plc.run("b")
+    assert refused.status == Code.CONFLICT
+    assert f"gap_open echoes {plc.echo}, which is no beat of the last 0.5 s" in refused.message
+    plc.node.trigger_deactivate()
+    plc.node.trigger_activate()
+    graph.spin_for(1.0)
+    assert plc.run("b").status == Code.CONFLICT  # an echo of before this start
+    plc.echo = None
+    graph.spin_until(lambda: plc.run("b").success, "the program goes on")
+    graph.probe.destroy_subscription(note)
+
+
+def test_a_bool_is_told_and_counts_only_where_the_parameter_says_so(graph):
+    beats = graph.probe.create_publisher(Bool, "gap_open", 10)
+    graph.probe.create_timer(PERIOD_S, lambda: beats.publish(Bool(data=True)))
+    statuses = graph.collect(MaintenanceStatus, f"{NODE}/status", qos.LATCHED)
+    words = "gap_open of probe is std_msgs/msg/Bool and not heard: publish robocal_msgs/msg/GapOpen"
+    # Processes of their own: in one, a topic has one type.
+    node = process(graph)
+    graph.spin_until(lambda: statuses and statuses[-1].doing == words, "it is told", 30.0)
+    node.stop()
+    node = graph.start(
+        "maintenance_node", {"serial": "K7", "home_deg": str(HOME_DEG), "gap_bool": True}
+    )
+    graph.spin_until(lambda: statuses[-1].doing == "", "it counts", 30.0)
+    assert "gap_bool: gap_open is taken as std_msgs/Bool, which bears no echo" in node.output
+
+
+BRIDGE = """
+import sys, threading, time
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from robocal_msgs.msg import GapOpen, MaintenanceStatus
+
+class Plc(dict):
+    read = dict.get
+    write = dict.__setitem__
+
+plc = Plc(beat=0, echo=0, gap=True)
+
+def program():  # of the PLC; put in STOP by a line on the standard input
+    while not stop.is_set():
+        plc["echo"] = plc["beat"]
+        time.sleep(0.02)
+
+"""
+MAIN = """
+import os
+stop = threading.Event()
+threading.Thread(target=program, daemon=True).start()
+rclpy.init()
+node = GapBridge()
+while rclpy.ok():
+    rclpy.spin_once(node, timeout_sec=0.1)
+    if os.path.exists(sys.argv[1]):
+        stop.set()
+"""
+
+
+def test_the_bridge_of_the_page_opens_the_gap_while_the_program_runs(graph, tmp_path):
+    page = (ROOT / "docs/plc.md").read_text()
+    bridge = page.split("```python\n")[1].split("```")[0]
+    script, stops = tmp_path / "bridge.py", tmp_path / "stop"
+    script.write_text(BRIDGE + bridge + MAIN)
+    plc = Plc(graph, lambda: process(graph), bridge=False)
+    graph.start(script, {}, {}, str(stops))
+    graph.spin_until(lambda: plc.statuses[-1].doing == "", "the gap is open", 30.0)
+    assert plc.run("a").success
+    stops.touch()
+    words = "which is no beat of the last 0.5 s"
+    graph.spin_until(lambda: words in plc.statuses[-1].doing, "the program stands")
+    assert plc.run("b").status == Code.CONFLICT
+
+
+def test_the_status_comes_five_times_a_second_and_counts_up(plc, graph):
+    plc.statuses.clear()
+    begin = time.monotonic()
+    graph.spin_until(lambda: len(plc.statuses) >= 11, "ten periods")
+    took_s = time.monotonic() - begin
+    beats = [int(status.beat) for status in plc.statuses[:11]]
+    assert beats == list(range(beats[0], beats[0] + 11))
+    assert took_s > 1.8  # ten periods of 0.2 s, less one that had begun
 
 
 def test_a_heartbeat_from_before_the_host_was_suspended_is_old(plc, graph, monkeypatch):

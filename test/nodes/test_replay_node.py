@@ -31,6 +31,9 @@ NS = 1_000_000_000
 START_NS = 100 * NS
 HELD_BACK = {
     "/robot/gap_open": ("std_msgs/msg/Bool", "may move now"),
+    "/gap_open": ("robocal_msgs/msg/GapOpen", "may move now"),
+    "/lease": ("robocal_msgs/msg/MotionLease", "may move now"),
+    "/recorded/joint_commands": ("sensor_msgs/msg/JointState", "move a robot"),
     "/arm_controller/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", "move a robot"),
     "/forward/commands": ("std_msgs/msg/Float64MultiArray", "move a robot"),
     "/joint_targets": ("sensor_msgs/msg/JointState", "move a robot"),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import TransformStamped
 from robocal_msgs.action import MeasureTool
-from robocal_msgs.msg import CalibrationQuality, ToolFrame
+from robocal_msgs.msg import CalibrationQuality, GapOpen, MaintenanceStatus, ToolFrame
 from robocal_msgs.srv import Decide
 from std_srvs.srv import SetBool, Trigger
 from tf2_msgs.msg import TFMessage
@@ -68,6 +68,48 @@ def test_it_moves_nothing_without_a_heartbeat(graph: Any, tmp_path: Any) -> None
     refused = graph.call(SetBool, "/tcf_node/arm", data=True)
     assert not refused.success
     assert refused.message.startswith("gap_open was never heard")
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_it_moves_with_a_heartbeat_that_echoes_the_beats_of_maintenance_node(
+    graph: Any, tmp_path: Any, listens: bool
+) -> None:
+    """Beats, and a PLC that echoes the newest it has read; then one that echoes what it latched."""
+    cell = LiveCell(graph, tmp_path, TRUTH, motion="trajectory")
+    status = graph.publisher(MaintenanceStatus, "/maintenance_node/status", qos.LATCHED)
+    gap = graph.publisher(GapOpen, "/gap_open")
+    beat, latched = 4_294_967_290, None if listens else 4_294_967_290
+
+    def count() -> None:
+        nonlocal beat
+        beat = beat % (2**32 - 1) + 1
+        status.publish(MaintenanceStatus(beat=beat))
+
+    def echo() -> None:
+        gap.publish(GapOpen(open=True, echo=beat if latched is None else latched))
+
+    graph.probe.create_timer(0.2, count)
+    graph.probe.create_timer(0.1, echo)
+    why = ""
+
+    def armed() -> bool:
+        nonlocal why
+        cell.rest(0.05)
+        answer = graph.call(SetBool, "/tcf_node/arm", data=True)
+        why = answer.message
+        return bool(answer.success)
+
+    def refused() -> bool:
+        return not armed() and why.startswith(f"gap_open echoes {latched}, which is no beat")
+
+    if listens:
+        graph.spin_until(armed, "it is armed")
+        assert graph.call(SetBool, "/tcf_node/arm", data=False).success
+        latched = beat
+    graph.spin_until(refused, "the repeated echo closes the gap")
+    assert not armed()
+    latched = None
+    graph.spin_until(armed, "the PLC's program goes on")
 
 
 def test_triggers_do_the_same_for_a_plc(graph: Any, tmp_path: Any) -> None:

@@ -100,7 +100,7 @@ class Robot:
     def step(self) -> None:
         self.now_s += PERIOD_S
         if self.beating:
-            self.gap.heard(True, self.now_s)
+            self.gap.heard(True, self.gap.count(self.now_s), self.now_s)
         while self.coming and self.coming[0][0] <= self.now_s:
             self.receive(*self.coming.pop(0))
         self.q = self.motion.joints(np.array([self.now_s]))[0]

@@ -96,8 +96,10 @@ class MaintainedCell(Robot):
         self.thermal.add(JointSample(self.ns(self.now_s), self.arm.joint_names, self.q))
         if self.now_s >= self.beat_s + BEAT_S:
             self.beat_s = self.now_s
-            self.gap.heard(self.is_open, self.now_s)
-            self.maintenance.gap(self.is_open, self.now_s)
+            beat = self.maintenance.beat(self.now_s)
+            self.gap.saw(beat, self.now_s)
+            self.gap.heard(self.is_open, beat, self.now_s)
+            self.maintenance.gap(self.is_open, beat, self.now_s)
         if self.maintenance.running and self.now_s >= self.told_s + TELLS_S:
             self._tell_drift()
         if self.rests_s > 0.4 and self.now_s >= self.sensed_s + SENSE_S:

@@ -148,7 +148,9 @@ class Cell:
         self.tool = ToolNode()
         self.is_open, self.beating, self.beat_s, self.heard = False, True, -np.inf, False
         self.beats_every_s = BEAT_S
-        self.waiting: tuple[float, bool] | None = None  # a beat, and when it is delivered
+        # a heartbeat with its echo, and when it is delivered
+        self.waiting: tuple[float, bool, int] | None = None
+        self.counted_s, self.read = -np.inf, 0  # the newest beat: when it was counted; as read
         self.offset = np.zeros(ARM.n)
         self.clock_s = 0.0  # the joints' own clock, ahead of all others
         self.log: list[ask.Request] = []
@@ -171,7 +173,7 @@ class Cell:
 
     def open_gap(self) -> None:
         self.is_open = self.beating = True
-        self.pass_time(0.3)
+        self.pass_time(3.0 * BEAT_S)  # a beat, its reading, its echo
 
     def run(self, cycle_id: str, gap_s: float) -> Code:
         """Call; a run that truly begins is noted."""
@@ -213,7 +215,7 @@ class Cell:
             self._controller_goes_on()
             if self._beat_is_due():
                 self.beat_s = self.now_s
-                self.waiting = end_s + LATE_S, self.is_open
+                self.waiting = end_s + LATE_S, self.is_open, self.read
 
     def pass_time(self, seconds: float) -> None:
         for _ in range(round(seconds / TICK_S)):
@@ -249,11 +251,13 @@ class Cell:
 
     def _beat(self) -> None:
         if self.waiting is not None and self.now_s >= self.waiting[0]:
-            self.heard, self.waiting = self.waiting[1], None
-            self.session.gap(self.heard, self.now_s)
+            (_, self.heard, echo), self.waiting = self.waiting, None
+            self.session.gap(self.heard, echo, self.now_s)
         if self._beat_is_due():
             self.beat_s, self.heard = self.now_s, self.is_open
-            self.session.gap(self.is_open, self.now_s)
+            self.session.gap(self.is_open, self.read, self.now_s)
+        if self.now_s >= self.counted_s + BEAT_S:  # the PLC reads it in its next cycle
+            self.counted_s, self.read = self.now_s, self.session.beat(self.now_s)
         if self.drift is not None:
             self.session.drift(self.drift, self.now_s)
 

@@ -217,7 +217,7 @@ def test_nothing_runs_twice_not_after_a_restart_either(cell):
     count = len(cell.log)
     assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
     cell.restart()
-    cell.pass_time(0.3)
+    cell.open_gap()
     assert cell.session.run("c1", LONG_S, cell.now_s, cell.wall_ns) == first
     cell.pass_time(1.0)
     assert kinds(cell)[count:] == ["Disarm"]  # of the start

@@ -141,7 +141,7 @@ def test_the_drift_that_went_into_a_tool_counts_as_long_as_that_tool(history):
     cell.check = replace(passed(), deviation_mm=0.0, sigma_mm=0.0)
     assert cell.finish().complete
     cell.restart()
-    cell.pass_time(0.3)
+    cell.open_gap()
     cell.drift = None
     later = replace(KNOWN, error=ToolError(1e-5, 1.5e-5))
     cell.session.drift(later, cell.now_s)

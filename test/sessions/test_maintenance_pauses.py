@@ -51,10 +51,29 @@ def test_a_write_that_takes_its_time_breaks_no_cycle_off(cell, pause_s):
 
 
 def test_a_motion_begins_when_it_is_sent_not_when_it_was_planned(cell):
+    cell.beats_every_s = 0.5 * BEAT_S
+    cell.pass_time(1.0)
     cell.planning_s = 2.0 * DRIVING.late_s
     assert cell.run("c1", LONG_S) is Code.ACCEPT
     result = cell.finish()
     assert (result.code, result.complete) == (Code.ACCEPT, True), result.message
+
+
+@pytest.mark.parametrize(("beats_every_s", "pause_s"), [(0.2, 0.2), (0.1, 0.3)])
+def test_a_pause_of_its_own_that_a_cycle_bears_in_a_motion(history, beats_every_s, pause_s):
+    """As docs/plc.md, at any time between two heartbeats and between two beats."""
+    for late_s in np.arange(0.0, 2.0 * BEAT_S, TICK_S):
+        cell = opened(history)
+        cell.beats_every_s = beats_every_s
+        cell.pass_time(1.0)
+        assert cell.run("c1", LONG_S) is Code.ACCEPT
+        while "Move" not in kinds(cell):
+            cell.step()
+        cell.pass_time(0.4 + late_s)
+        assert cell.moved_s == cell.now_s
+        cell.pause(pause_s)
+        cell.pass_time(1.0)
+        assert cell.state is State.RUNNING, cell.session.status(cell.now_s).fault
 
 
 @pytest.mark.parametrize("pause_s", PAUSES_S)

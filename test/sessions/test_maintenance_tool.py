@@ -68,7 +68,7 @@ def test_a_tool_that_no_run_can_measure_degrades_until_a_check_passes(
     assert told.message in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
     cell.restart()
     assert level(cell) is AccuracyLevel.DEGRADED
-    cell.pass_time(0.3)
+    cell.open_gap()
     cell.log.clear()
     cell.check = passed()
     cell.run("c3", LONG_S)
@@ -133,7 +133,7 @@ def test_a_measured_tool_that_came_into_force_is_due_until_a_check_passes(cell):
     assert level(cell, 30 * DAY_NS) is AccuracyLevel.EXPIRED
     cell.restart()
     assert level(cell) is AccuracyLevel.DUE
-    cell.pass_time(0.3)
+    cell.open_gap()
     cell.check = passed()
     cell.run("c2", LONG_S)
     assert cell.finish().tool_answer == "pass"
@@ -213,7 +213,7 @@ def is_due_until_checked(cell: Cell, *, error_known: bool) -> None:
     assert (said.error is not None) == error_known
     cell.restart()
     assert level(cell) is AccuracyLevel.DUE
-    cell.pass_time(0.3)
+    cell.open_gap()
     cell.run("c2", LONG_S)
     assert cell.finish().tool_answer == "pass"
     assert modes(cell) == ["quick"]

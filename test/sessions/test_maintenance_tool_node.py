@@ -298,7 +298,7 @@ def test_a_disarm_that_is_not_confirmed_outlives_a_restart(cell):
     cell.pass_time(1.0)
     assert cell.state is State.FAULT
     cell.restart()
-    cell.pass_time(0.3)
+    cell.open_gap()
     assert not cell.session.status(cell.now_s).disarmed
     with pytest.raises(ConflictError, match="not confirmed"):
         cell.session.acknowledge("me")
@@ -312,7 +312,7 @@ def test_an_idle_cell_that_restarts_does_not_begin_before_a_disarm(cell):
     cell.tool.armed = True  # by an operator
     cell.services["disarm"] = SILENT
     cell.restart()
-    cell.pass_time(0.3)
+    cell.open_gap()
     assert cell.run("c1", LONG_S) is Code.CONFLICT
     cell.services.clear()
     cell.pass_time(1.0)

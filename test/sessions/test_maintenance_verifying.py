@@ -69,11 +69,11 @@ def test_what_a_check_found_outlives_a_run_that_breaks_off_on_the_way_home(histo
     answered(cell)
     broken_off(cell, how)
     assert cell.finish().code is not Code.ACCEPT
-    record = cell.session._memory.tool
+    record = cell.session.memory.tool
     assert record.words == answer.message
     cell.pass_time(3.0)  # a stop comes before the disk
     cell.restart()
-    assert cell.session._memory.tool == record
+    assert cell.session.memory.tool == record
     if how == "cancelled":
         assert level(cell) is AccuracyLevel.DEGRADED
 
@@ -210,7 +210,7 @@ def test_a_tool_whose_check_does_not_fit_is_accepted_in_the_next_gap(history, re
     number = postponed(cell)
     if restarted:
         cell.restart()
-        cell.pass_time(0.3)
+        cell.open_gap()
     cell.check = passed()
     short = run(cell, "c3", 15.0)
     assert (short.accepted, short.left) == ((), (f"acceptance of tool candidate {number}",))

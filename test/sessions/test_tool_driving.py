@@ -82,7 +82,7 @@ def test_no_step_begins_on_a_heartbeat_from_before_a_pause(robot):
 
 
 def test_a_closed_gap_is_not_armed_in(robot):
-    robot.gap.heard(False, robot.now_s)
+    robot.gap.heard(False, robot.gap.beat, robot.now_s)
     with pytest.raises(ConflictError, match="gap_open is false: nothing may move"):
         robot.driver.arm(robot.now_s)
 

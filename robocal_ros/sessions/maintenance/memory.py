@@ -5,10 +5,13 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import StateLostError, StorageError
 
 REMEMBERED = 200  # ended cycles
+VERSION = 2  # of the document; one without a version is the first, which knew no runs and stamps
 
 
 class Keeper(Protocol):
@@ -34,6 +37,8 @@ class CycleResult:
 
     Attributes
     ----------
+    stamp_ns : when it ended, by the wall clock; began, while it runs, and of one that was killed.
+    run : the how many-th since the state folder was made; 0: of a version that did not count.
     code : ACCEPT when it ran as planned, with the robot at home; NONE while it runs.
     complete : nothing that was due is left for the next gap; ``left`` names what is.
     thermal_code, thermal_id : of the end of the thermal cycle; NONE where it did not end.
@@ -55,6 +60,8 @@ class CycleResult:
     tool_answer: str = ""
     accepted: tuple[int, ...] = ()
     tool_found_code: Code = Code.NONE
+    stamp_ns: int = 0
+    run: int = 0
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""
@@ -108,7 +115,9 @@ class Memory:
     Attributes
     ----------
     fault_code, fault : what stopped the maintenance until it is acknowledged; empty: nothing.
-    running : the cycle that is open.
+    running, began_ns : the cycle that is open.
+    runs : cycles that have begun, ever.
+    earlier : ids of the cycles that had ended before this start.
     """
 
     keeper: Keeper
@@ -117,6 +126,9 @@ class Memory:
     fault_code: Code = Code.NONE
     fault: str = ""
     running: str = ""
+    began_ns: int = 0
+    runs: int = 0
+    earlier: frozenset[str] = frozenset()
 
     @classmethod
     def load(cls, keeper: Keeper) -> "Memory":
@@ -140,14 +152,23 @@ class Memory:
         memory = cls._of_document(keeper, document)
         if memory.running:
             words = f"the node ended while cycle '{memory.running}' ran: see where the robot is"
-            result = CycleResult(memory.running, Code.CONFLICT, words)
+            result = CycleResult(
+                memory.running,
+                Code.CONFLICT,
+                words,
+                stamp_ns=memory.began_ns,
+                run=memory.runs,
+            )
             memory.end(result, Code.CONFLICT, words)
             memory.save()
+        memory.earlier = frozenset(memory.cycles)
         return memory
 
     @classmethod
     def _of_document(cls, keeper: Keeper, document: Mapping[str, Any]) -> "Memory":
         try:
+            if not 1 <= (version := int(document.get("version", 1))) <= VERSION:
+                raise ValueError(f"version {version}")
             results = [CycleResult.of_document(each) for each in document["cycles"]]
             return cls(
                 keeper,
@@ -156,6 +177,8 @@ class Memory:
                 Code(document["fault_code"]),
                 str(document["fault"]),
                 str(document["running"]),
+                int(document.get("began_ns", 0)),
+                int(document.get("runs", 0)),
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise StorageError(
@@ -163,23 +186,36 @@ class Memory:
                 "to the version that wrote it, or see where the robot is and move it away"
             ) from error
 
-    def begin(self, cycle_id: str) -> None:
-        """A cycle runs from now on."""
-        self.running = cycle_id
+    def begin(self, cycle_id: str, wall_ns: int) -> CycleResult:
+        """A cycle runs from now on; its result, as yet."""
+        self.running, self.began_ns, self.runs = cycle_id, wall_ns, self.runs + 1
         try:
             self.save()
         except Exception:
-            self.running = ""
+            self.running, self.runs = "", self.runs - 1
             raise
+        return CycleResult(cycle_id, stamp_ns=wall_ns, run=self.runs)
 
     def end(self, result: CycleResult, fault_code: Code = Code.NONE, fault: str = "") -> None:
         """It has ended, for good; `save` keeps that."""
         self.running = ""
         self.cycles[result.cycle_id] = result
+        self.earlier -= {result.cycle_id}
         while len(self.cycles) > REMEMBERED:
             del self.cycles[next(iter(self.cycles))]
         if fault:
             self.fault_code, self.fault = fault_code, fault
+
+    def words_of(self, result: CycleResult) -> str:
+        """How a cycle ended; of one from before this start it is said that it is old."""
+        if result.cycle_id not in self.earlier:
+            return result.message
+        ended = str(np.datetime64(result.stamp_ns, "ns").astype("datetime64[s]")) + "Z"
+        when = f", run {result.run}, {ended}" if result.run else ""
+        return (
+            f"cycle '{result.cycle_id}' is one of before this start of the node{when}; nothing "
+            f"runs now; it ended so: {result.message}"
+        )
 
     def note_tool(self, **known: Any) -> None:
         """The tool was measured; `save` keeps it."""
@@ -203,10 +239,13 @@ class Memory:
         """Keep all of it."""
         self.keeper.save(
             {
+                "version": VERSION,
                 "cycles": [result.document() for result in self.cycles.values()],
                 "tool": asdict(self.tool),
                 "fault_code": int(self.fault_code),
                 "fault": self.fault,
                 "running": self.running,
+                "began_ns": self.began_ns,
+                "runs": self.runs,
             }
         )

@@ -31,6 +31,7 @@ class Run:
 
     Parameters
     ----------
+    result : of the cycle that begins.
     drift : what the thermal node says of itself now; None: it is silent.
 
     Attributes
@@ -41,7 +42,7 @@ class Run:
 
     def __init__(
         self,
-        cycle_id: str,
+        result: CycleResult,
         hands: Hands,
         book: CycleBook,
         decider: Decider,
@@ -49,7 +50,7 @@ class Run:
         decided: Callable[[Outcome], None],
         drift: Callable[[], Drift | None],
     ) -> None:
-        self.result = CycleResult(cycle_id)
+        self.result = result
         self._hands, self._decider, self._decided = hands, decider, decided
         self._drift = drift
         self._thermal = ThermalPart(hands, book)
@@ -77,7 +78,7 @@ class Run:
     def ended(self, code: Code, message: str) -> CycleResult:
         """The result, at its end."""
         self._fold()
-        self.result = replace(self.result, code=code, message=message)
+        self.result = replace(self.result, code=code, message=message, stamp_ns=self.wall_ns)
         return self.result
 
     def script(self) -> Script[None]:

@@ -49,6 +49,7 @@ class MaintenanceSession:
     Attributes
     ----------
     ways : the ways that the robot may take.
+    memory : what outlives a restart; read it only.
     """
 
     def __init__(
@@ -60,20 +61,24 @@ class MaintenanceSession:
         record: Callable[[Command, Outcome], None] = lambda command, outcome: None,
     ) -> None:
         self.config, self.ways = config, Ways(nominal, config)
-        self._memory = Memory.load(keeper)
+        self.memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
         self._hands = Hands(config, self.ways)
         self._hands.doubt()  # whoever ran before may have left the tool's driver armed
         self._book = CycleBook()
         self._record = record
-        self._conductor = Conductor(self._hands, self._memory, self._tell)
+        self._conductor = Conductor(self._hands, self.memory, self._tell)
         self._heard = Heard(config)
 
     # ---- what happens ---------------------------------------------------------------------------
 
-    def gap(self, is_open: bool, now_s: float) -> None:
-        """Take a heartbeat of ``gap_open``."""
-        self._hands.gap.heard(is_open, now_s)
+    def beat(self, now_s: float) -> int:
+        """The next beat, to be published now; 5 Hz. A heartbeat echoes it."""
+        return self._hands.gap.count(now_s)
+
+    def gap(self, is_open: bool, echo: int | None, now_s: float) -> None:
+        """Take a heartbeat of ``gap_open``, with the beat that it echoes (None: it has none)."""
+        self._hands.gap.heard(is_open, echo, now_s)
 
     def doubt_gap(self, why: str) -> None:
         """The heartbeats do not count, and why; empty: they do."""
@@ -122,9 +127,9 @@ class MaintenanceSession:
         """
         if not 0 < len(cycle_id) <= MOST_ID:
             raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
-        if (known := self._known(cycle_id)) is not None:
+        if (known := self.result(cycle_id)) is not None:
             return known
-        hands, memory = self._hands, self._memory
+        hands, memory = self._hands, self.memory
         hands.now_s = now_s
         if memory.fault:
             raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
@@ -139,9 +144,8 @@ class MaintenanceSession:
         except LimitError as error:
             self._conductor.fault(error.code, str(error))
             raise
-        memory.begin(cycle_id)
         run = Run(
-            cycle_id,
+            memory.begin(cycle_id, wall_ns),
             hands,
             self._book,
             self._decider,
@@ -205,12 +209,12 @@ class MaintenanceSession:
         StorageError
             When it cannot be kept; the fault stays.
         """
-        if not self._memory.fault:
+        if not self.memory.fault:
             return "there is no fault"
         self._hands.tool.require_disarmed()
         self._require_home()
-        words = f"acknowledged: {self._memory.fault}"
-        self._memory.clear_fault()
+        words = f"acknowledged: {self.memory.fault}"
+        self.memory.clear_fault()
         self._hands.doing = ""
         self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
         return words
@@ -250,7 +254,9 @@ class MaintenanceSession:
 
     def result(self, cycle_id: str) -> CycleResult | None:
         """How a cycle ended, or how far it is; None where it is not known."""
-        return self._known(cycle_id)
+        if (running := self.running) is not None and running.cycle_id == cycle_id:
+            return running
+        return self.memory.cycles.get(cycle_id)
 
     @property
     def running(self) -> CycleResult | None:
@@ -261,7 +267,7 @@ class MaintenanceSession:
     @property
     def state(self) -> State:
         """What it is at."""
-        if self._memory.fault:
+        if self.memory.fault:
             return State.FAULT
         if self._conductor.run is None:
             return State.IDLE
@@ -269,14 +275,14 @@ class MaintenanceSession:
 
     def status(self, now_s: float) -> Status:
         """Everything at once."""
-        return status_of(self.state, self.running, self._memory, self._hands, self._decider, now_s)
+        return status_of(self.state, self.running, self.memory, self._hands, self._decider, now_s)
 
     def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
         """How accurate the robot is believed to be with model and tool in force."""
         thermal, tool, heard = self._decider.head(THERMAL), self._decider.head(TOOL), self._heard
         told = heard.drift(now_s), heard.uncorrected(thermal, tool, now_s)
         number = thermal.calibration_id or 0
-        return accuracy_of(self.config, *told, self._memory, tool, number, wall_ns)
+        return accuracy_of(self.config, *told, self.memory, tool, number, wall_ns)
 
     def _require_home(self) -> None:
         robot = self._hands.robot
@@ -284,11 +290,6 @@ class MaintenanceSession:
             raise TooFewSamplesError(f"{robot.unheard}: nobody knows whether the robot is at home")
         if away := robot.beside_home():
             raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
-
-    def _known(self, cycle_id: str) -> CycleResult | None:
-        if (result := self.running) is not None and result.cycle_id == cycle_id:
-            return result
-        return self._memory.cycles.get(cycle_id)
 
     def _decided(self, outcome: Outcome) -> None:
         if not outcome.repeated:

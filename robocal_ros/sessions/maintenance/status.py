@@ -38,6 +38,7 @@ class Status:
     last : how the last cycle ended; None before any.
     thermal_pending, tool_pending : newest candidates that wait for a decision; 0: none.
     fault_code, fault : NONE and empty without one.
+    beat : counts up with each status that is published; the PLC's heartbeat echoes it.
     closed : why the gap counts as closed; empty while it is open.
     trouble : why nobody knows what waits; empty: the pending ids are true.
     """
@@ -53,6 +54,7 @@ class Status:
     tool_pending: int
     fault_code: Code
     fault: str
+    beat: int
     closed: str = ""
     trouble: str = ""
 
@@ -86,6 +88,7 @@ def status_of(
         tool_pending=tool,
         fault_code=memory.fault_code,
         fault=memory.fault,
+        beat=hands.gap.beat,
         closed=hands.gap.closed(now_s),
         trouble=trouble,
     )

@@ -1,0 +1,95 @@
+"""A recording of a cell, played by another player beside live nodes: it moves nothing."""
+
+from pathlib import Path
+from typing import Any
+
+from rclpy.qos import QoSProfile
+from robocal_msgs.msg import GapOpen, MotionLease, ToolStep
+from rosbags.highlevel import AnyReader
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, Float64MultiArray
+from tool_cell_live import written_laser
+from tool_driver import noisy_cell
+from trajectory_msgs.msg import JointTrajectory
+
+from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.nodes.cell_sim_node import CellSimNode
+from robocal_ros.nodes.maintenance_node import MaintenanceNode
+from robocal_ros.nodes.recorder_node import RecorderNode
+from robocal_ros.nodes.replay_topics import chosen_topics, message_class
+from robocal_ros.nodes.tcf_node import TcfNode
+from robocal_ros.storage.bag_recording import recordings
+from robocal_ros.storage.bags import BagReader
+from robocal_ros.storage.recorded_names import RECORDED, graph_name, recorded_name
+
+COMMANDS = {  # what moves a robot, or says that it may be moved, by the name on the graph
+    "/gap_open": GapOpen,
+    "/robot/gap_open": Bool,
+    "/joint_trajectory": JointTrajectory,
+    "/joint_trajectory_controller/joint_trajectory": JointTrajectory,
+    "/maintenance_node/joint_trajectory": JointTrajectory,
+    "/joint_targets": JointState,
+    "/joint_correction_node/joint_targets": JointState,
+    "/joint_commands": Float64MultiArray,
+    "/forward/commands": Float64MultiArray,
+    "/tcf_node/next_step": ToolStep,
+    "/motion_lease": MotionLease,
+}
+READINGS = {"/joint_states": JointState}
+HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
+
+
+def recording(graph: Any, folder: Path) -> Path:
+    """What the recorder makes of a message on each topic."""
+    topics = COMMANDS | READINGS
+    node = graph.add(RecorderNode, {"topics": list(topics), "folder": str(folder)})
+    publishers = {name: graph.publisher(kind, name) for name, kind in topics.items()}
+    for name, kind in topics.items():
+        publishers[name].publish(kind())
+    graph.spin_until(lambda: node.health().values["messages"] == len(topics), "all is recorded")
+    node.trigger_deactivate()
+    for publisher in publishers.values():
+        graph.probe.destroy_publisher(publisher)
+    (found,) = recordings(folder)
+    return found
+
+
+def test_what_another_player_publishes_reaches_no_node(graph: Any, tmp_path: Path) -> None:
+    bag = recording(graph, tmp_path / "recordings")
+    laser = written_laser(tmp_path, noisy_cell())
+    graph.add(JointCorrectionNode, {})
+    graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
+    graph.add(TcfNode, {"motion": "trajectory", "laser": laser})
+    graph.add(CellSimNode, {})
+    heard = {topic for topic in COMMANDS if graph.probe.count_subscribers(topic)}
+    assert {"/gap_open", "/joint_trajectory", "/joint_targets"} <= heard  # as named on the graph
+    with AnyReader([bag]) as reader:  # as a player does: each message under its recorded name
+        played = {c.topic: c.msgtype for c in reader.connections}
+        assert len(played) == len(COMMANDS | READINGS)
+        publishers = {
+            topic: graph.probe.create_publisher(message_class(msgtype), topic, QoSProfile(depth=10))
+            for topic, msgtype in played.items()
+        }
+        for connection, _, cdr in reader.messages():
+            publishers[connection.topic].publish(bytes(cdr))
+    assert {t for t in played if graph.probe.count_subscribers(t)} == set(READINGS)
+    assert {RECORDED + topic for topic in COMMANDS} == played.keys() - READINGS.keys()
+
+
+def test_our_own_reader_gives_the_names_of_the_graph(graph: Any, tmp_path: Path) -> None:
+    bag = recording(graph, tmp_path / "recordings")
+    with BagReader(bag) as reader:
+        topics = {name: found.msgtype for name, found in reader.info.topics.items()}
+        assert topics.keys() == (COMMANDS | READINGS).keys()
+        assert {m.topic for m in reader.messages(list(COMMANDS))} == COMMANDS.keys()
+    chosen, left = chosen_topics(topics, [], [])
+    assert chosen.keys() == READINGS.keys()
+    assert left.keys() == COMMANDS.keys()
+
+
+def test_a_name_is_moved_once_and_back() -> None:
+    once = recorded_name("/gap_open", "std_msgs/msg/Bool")
+    assert (once, recorded_name(once, "std_msgs/msg/Bool")) == ("/recorded/gap_open",) * 2
+    assert graph_name(once) == "/gap_open"
+    for topic in ("/joint_states", "/recorded", "/recordedly/x"):
+        assert recorded_name(topic, "sensor_msgs/msg/JointState") == graph_name(topic) == topic
