@@ -22,6 +22,8 @@ class Reason(StrEnum):
     DEGREES = "positions look like degrees"
     BURST = "too many points"
     TWO_SOURCES = "two publishers at once"
+    OTHER_COMMANDER = "somebody else commands the robot"
+    LEASED = "the robot is leased for a measurement"
     JOINT_LIMIT = "a joint limit is exceeded"
     VELOCITY_LIMIT = "a velocity limit is exceeded"
     TCP_BOUND = "the arm's correction at the tool exceeds its bound"
@@ -46,6 +48,8 @@ _CODES = {
     Reason.STALE_JOINTS: Code.STALE,
     Reason.START_MISMATCH: Code.CONFLICT,
     Reason.TWO_SOURCES: Code.CONFLICT,
+    Reason.OTHER_COMMANDER: Code.CONFLICT,
+    Reason.LEASED: Code.CONFLICT,
 }
 
 

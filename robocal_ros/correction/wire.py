@@ -161,6 +161,28 @@ def _number(data: bytes, at: int) -> int:
     return int.from_bytes(data[at : at + 4], "little")
 
 
+def joint_names(data: bytes) -> tuple[str, ...]:
+    """The joints that a serialized message names; none where it cannot be read."""
+    if data[: len(HEAD)] != HEAD:
+        return ()
+    try:
+        return _names(data, _string(data, FRAME)[1])[0]
+    except (struct.error, UnicodeDecodeError):
+        return ()
+
+
+def _names(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
+    """Names and where the next number begins."""
+    (count,) = struct.unpack_from("<I", data, at)
+    if count > len(data):
+        raise struct.error("more names than the message is long")
+    names, at = [], at + 4
+    for _ in range(count):
+        name, at = _string(data, at)
+        names.append(name)
+    return tuple(names), at
+
+
 def _layout(data: bytes) -> _Layout | None:
     """Find where things are; None for what is not a whole regular message with positions."""
     if data[: len(HEAD)] != HEAD:
@@ -168,13 +190,7 @@ def _layout(data: bytes) -> _Layout | None:
     try:
         frame_id, at = _string(data, FRAME)
         names_begin = at
-        (count,) = struct.unpack_from("<I", data, at)
-        names, at = [], at + 4
-        if count > len(data):
-            return None
-        for _ in range(count):
-            name, at = _string(data, at)
-            names.append(name)
+        names, at = _names(data, at)
         names_end, counts, places = at, [], []
         for _ in range(3):
             (count,) = struct.unpack_from("<I", data, at)
@@ -192,7 +208,7 @@ def _layout(data: bytes) -> _Layout | None:
     return _Layout(
         head,
         frame_id,
-        tuple(names),
+        names,
         names_begin,
         names_end,
         tuple(counts),
