@@ -15,6 +15,7 @@ import numba
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 THIS_FILE = Path(__file__)
+PACKAGE = THIS_FILE.parents[1]
 MARK = b"\nfrom robocal_ros.core.compiled import "  # how a module that has kernels is known
 
 
@@ -54,10 +55,10 @@ def _compiled(
 
 @cache
 def _digest_of_sources() -> str:
-    """Digest of this file and of all modules of the core that have kernels."""
+    """Digest of this file and of all modules of the package that have kernels."""
     digest = hashlib.sha256(THIS_FILE.read_bytes())
-    for path in sorted(THIS_FILE.parent.rglob("*.py")):
+    for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_bytes()
         if MARK in text:
-            digest.update(f"\0{path.relative_to(THIS_FILE.parent)}\0".encode() + text)
+            digest.update(f"\0{path.relative_to(PACKAGE)}\0".encode() + text)
     return digest.hexdigest()

@@ -231,7 +231,7 @@ def _velocity_limits(settings: Mapping[str, Any]) -> NDArray[np.float64]:
     given, count = np.array(settings["velocity_limits"]), robot.arm.n
     if len(given) != count and given.any():
         raise InputError(f"velocity_limits has {len(given)} numbers, the arm {count} joints")
-    return np.where(given > 0.0, given, robot.max_velocity)
+    return np.where(given > 0.0, given, np.nan_to_num(robot.max_velocity, nan=np.inf))
 
 
 def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:

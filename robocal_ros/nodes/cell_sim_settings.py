@@ -231,7 +231,7 @@ def _tool_cell(settings: Mapping[str, Any]) -> CellPlan:
         station=BeamStation(beams_of(laser_pose(settings), angle, gap_m), noise=noise),
         tool=_tool(settings, arm.T_flange_tool),
         q_start=np.where(arm.prismatic, given * MM, np.radians(given)),
-        fastest=load_description(settings["robot"]).max_velocity,
+        fastest=np.nan_to_num(load_description(settings["robot"]).max_velocity, nan=np.inf),
     )
 
 

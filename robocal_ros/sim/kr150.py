@@ -22,8 +22,8 @@ STATIC_LENGTH_M = 4e-4
 STATIC_ANGLE_RAD = float(np.radians(0.02))
 ECCENTRICITY_RAD = float(np.radians(10.0 / 3600.0))
 REPEATABILITY_RAD = 1e-5  # 0.02 mm per axis at the tool
-# As ROS-Industrial's kuka_kr150_support gives them for the next generation (KR 150 R3100-2).
-FASTEST_RAD_S = np.radians([105.0, 107.0, 114.0, 190.0, 180.0, 260.0])
+# As in config/robots/kr150_r3100.yaml, with the source.
+FASTEST_RAD_S = np.radians([105.0, 107.0, 114.0, 179.0, 172.0, 219.0])
 
 # Heat sits at joints 2 to 4; duty 1 is the rated programme.
 WARM_UP = WarmUp(

@@ -27,6 +27,9 @@ MM = 1e-3
 GEOMETRY = {"d_mm": MM, "theta_deg": RAD, "a_mm": MM, "alpha_deg": RAD, "beta_deg": RAD}
 COMMON_KEYS = ("name", "type", "sign", *GEOMETRY)
 UNITS = {False: ("deg", RAD), True: ("mm", MM)}
+# Makers publish joint speeds and hardly ever accelerations: where the file gives none, the joint is
+# taken to reach its full speed in this time.
+FULL_SPEED_IN_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,9 @@ class RobotDescription:
 
     Attributes
     ----------
-    max_velocity, max_acceleration : (n,) rad/s and rad/s² (prismatic: m), infinite when unknown.
+    max_velocity : (n,) rad/s (prismatic: m/s), NaN where the file gives none.
+    max_acceleration : (n,) rad/s² (prismatic: m/s²), NaN where neither it nor a speed is given.
+    acceleration_assumed : (n,) bool, where the file gives none: it is max_velocity / 0.5 s.
     notes : what the file leaves open, in words.
     """
 
@@ -43,6 +48,7 @@ class RobotDescription:
     path: Path
     max_velocity: Array
     max_acceleration: Array
+    acceleration_assumed: NDArray[np.bool_]
     notes: tuple[str, ...]
 
 
@@ -88,8 +94,15 @@ def load_description(name: str | Path) -> RobotDescription:
         T_flange_tool=_pose(top, "tool"),
     )
     velocity = np.array([joint.max_velocity for joint in joints])
-    acceleration = np.array([joint.max_acceleration for joint in joints])
-    return RobotDescription(arm, path, velocity, acceleration, _open_limits(arm))
+    given = np.array([joint.max_acceleration for joint in joints])
+    return RobotDescription(
+        arm=arm,
+        path=path,
+        max_velocity=velocity,
+        max_acceleration=np.where(np.isnan(given), velocity / FULL_SPEED_IN_S, given),
+        acceleration_assumed=np.isnan(given),
+        notes=_open_limits(arm),
+    )
 
 
 def robot_folders() -> list[Path]:
@@ -135,7 +148,7 @@ def save_robot(
 
     Parameters
     ----------
-    like : robot file that the arm was made from; its joint speeds are kept.
+    like : robot file that the arm was made from; the joint speeds that it gives are kept.
     comment : lines to begin the file with.
 
     Raises
@@ -182,7 +195,7 @@ class _Joint:
         if self.lower >= self.upper:
             fields.fail(f"is not below {limits[1]}", limits[0])
         self.max_velocity, self.max_acceleration = (
-            fields.positive(key, np.inf) * factor for key in rates
+            fields.positive(key, np.nan) * factor for key in rates
         )
 
 
@@ -230,8 +243,8 @@ def _joint_document(arm: SerialArm, joint: int, convention: str) -> dict[str, An
 def _add_speeds(documents: list[dict[str, Any]], like: RobotDescription) -> None:
     for joint, document in enumerate(documents):
         unit, factor = UNITS[bool(like.arm.prismatic[joint])]
-        speeds = {
-            f"max_velocity_{unit}_s": float(like.max_velocity[joint]),
-            f"max_acceleration_{unit}_s2": float(like.max_acceleration[joint]),
-        }
-        document |= {key: _shown(v, factor) for key, v in speeds.items() if np.isfinite(v)}
+        if np.isfinite(speed := float(like.max_velocity[joint])):
+            document[f"max_velocity_{unit}_s"] = _shown(speed, factor)
+        if not like.acceleration_assumed[joint]:
+            acceleration = float(like.max_acceleration[joint])
+            document[f"max_acceleration_{unit}_s2"] = _shown(acceleration, factor)

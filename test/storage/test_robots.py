@@ -52,7 +52,9 @@ def test_every_key_is_read_in_si(tmp_path: Path) -> None:
     np.testing.assert_allclose(arm.lower, [-np.pi / 2, -0.005], rtol=1e-15)
     np.testing.assert_allclose(arm.upper, [np.pi, 0.5], rtol=1e-15)
     np.testing.assert_allclose(description.max_velocity, [np.pi / 2, 0.25], rtol=1e-15)
-    np.testing.assert_allclose(description.max_acceleration, [np.pi, np.inf], rtol=1e-15)
+    # the second joint's is the rule's: full speed in 0.5 s
+    np.testing.assert_allclose(description.max_acceleration, [np.pi, 0.5], rtol=1e-15)
+    assert description.acceleration_assumed.tolist() == [False, True]
     np.testing.assert_allclose(arm.T_base_root[:3, 3], [1e-3, 2e-3, 3e-3], rtol=1e-15)
     np.testing.assert_allclose(arm.T_base_root[:3, 0], [0, 1, 0], atol=1e-15)
     assert arm.T_flange_tool[:3, 3].tolist() == [0, 0, 0.05]
@@ -80,6 +82,30 @@ def test_shipped_robots_have_limits_around_their_check_pose(name: str) -> None:
     q = np.radians(pose.get(name, (0, 0, 0, 0, 0, 0)))
     assert np.all((description.arm.lower <= q) & (q <= description.arm.upper))
     assert len(description.arm.parameters) == 24
+
+
+@pytest.mark.parametrize("name", [*SHIPPED, "p1r2p3"])
+def test_shipped_robots_have_speeds_and_accelerations(name: str) -> None:
+    description = load_description(name)
+    assert np.all(description.max_velocity > 0.0)
+    np.testing.assert_allclose(description.max_acceleration, 2.0 * description.max_velocity)
+    assert description.acceleration_assumed.all()  # none is published
+    comment = description.path.read_text().split("robot:")[0]
+    assert "0.5 s" in comment.replace("\n# ", " ")
+
+
+def test_the_makers_speeds_are_in_the_files() -> None:
+    kuka = np.degrees(load_description("kr150_r3100").max_velocity)
+    np.testing.assert_allclose(kuka, [105, 107, 114, 179, 172, 219])
+    ur = np.degrees(load_description("ur10").max_velocity)
+    np.testing.assert_allclose(ur, [120, 120, 180, 180, 180, 180])
+
+
+def test_a_speed_that_is_not_given_is_nan_and_invents_no_acceleration(tmp_path: Path) -> None:
+    text = GOOD.replace(", max_velocity_mm_s: 250", "").replace("max_velocity_deg_s: 90, ", "")
+    description = load_description(write(tmp_path, text))
+    assert np.isnan(description.max_velocity).all()
+    np.testing.assert_allclose(description.max_acceleration, [np.pi, np.nan], rtol=1e-15)
 
 
 def test_missing_limits_are_told_not_invented(tmp_path: Path) -> None:
@@ -182,6 +208,8 @@ def test_joint_speeds_are_kept(tmp_path: Path) -> None:
     copy = load_description(tmp_path / "copy.yaml")
     assert copy.max_velocity.tolist() == description.max_velocity.tolist()
     assert copy.max_acceleration.tolist() == description.max_acceleration.tolist()
+    assert copy.acceleration_assumed.tolist() == [False, True]
+    assert "max_acceleration_mm_s2" not in (tmp_path / "copy.yaml").read_text()
 
 
 def test_infinite_limits_and_sliding_joints_are_saved(tmp_path: Path) -> None:
