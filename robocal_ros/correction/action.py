@@ -1,10 +1,12 @@
 """The action FollowJointTrajectory before a controller: taught goals in, corrected ones out.
 
 Each goal is corrected and forwarded; it ends as the controller ends it. Nothing here waits: goals
-are ended from callbacks, so that a cancel passes at once in whatever executor the node runs.
-docs/joint_correction_action.md tells it to users.
+are ended from callbacks, so that a cancel passes at once in whatever executor the node runs. No
+callback lets an exception out: in rclpy's events executor one of an action's client ends the
+process. docs/joint_correction_action.md tells it to users.
 """
 
+import functools
 import time
 import traceback
 from collections.abc import Callable
@@ -23,7 +25,6 @@ from rclpy.task import Future
 
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.samples import TAUGHT
-from robocal_ros.correction.courses import Course
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.nodes.deferred_action import DeferredActionServer
 from robocal_ros.nodes.endpoints import EndpointNode
