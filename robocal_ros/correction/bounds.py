@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection
+from robocal_ros.correction.limiter import SLIDING, TURNING, OffsetLimits
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.staged import StagedResult
 
@@ -63,16 +64,16 @@ class CorrectionConfig:
     ----------
     thermal, tool : bounds of the arm's drift and of the tool's change. The tool's tilt is that of
         a tip 10 mm aside by a bend 150 mm above it.
-    blend_rad_s, blend_m_s : fastest change of a joint's correction (prismatic: m/s).
-    longest_step_s : a pause in a stream advances the blend by no more than this.
+    turning, sliding : fastest change of the offset of a joint, by its kind.
+    velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none.
+    acceleration_limits : (n,) rad/s^2 (prismatic: m/s^2), with which a stream that ends slows down.
     stream_gap_s : after a pause that is longer than this, and than two of its periods, a stream
-        begins anew, where the robot stands.
+        goes on only where the robot can be there soon.
     start_rad, start_m : how far from where a command begins the robot may stand.
     joint_state_age_s : readings that are older do not tell where the robot is.
     flange_frame, tool_frame : parent and child of an acceptable tool frame; an empty child: any.
     policy : what is done with a command whose correction would exceed a bound or a limit.
     model_age_s : a model with an older stamp is not corrected with; 0: any age.
-    velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none; None: no joint has one.
     free_axis : the tool may turn about its z.
     shadow : commands and readings pass as they came; the correction is only shown.
     """
@@ -83,9 +84,10 @@ class CorrectionConfig:
     tool: ShiftBounds = field(
         default_factory=lambda: ShiftBounds(10e-3, _degrees(4.0), _degrees(5.0))
     )
-    blend_rad_s: float = field(default_factory=lambda: _degrees(0.5))
-    blend_m_s: float = 1e-3
-    longest_step_s: float = 0.02
+    turning: OffsetLimits = TURNING
+    sliding: OffsetLimits = SLIDING
+    velocity_limits: Array = field(default_factory=lambda: np.array([np.inf]), compare=False)
+    acceleration_limits: Array = field(default_factory=lambda: np.array([np.inf]), compare=False)
     stream_gap_s: float = 0.1
     start_rad: float = field(default_factory=lambda: _degrees(0.02))
     start_m: float = 5e-5
@@ -94,13 +96,8 @@ class CorrectionConfig:
     tool_frame: str = ""
     policy: Policy = Policy.REFUSE
     model_age_s: float = 0.0
-    velocity_limits: Array | None = field(default=None, compare=False)
     free_axis: bool = False
     shadow: bool = False
-
-    def blend_rates(self, arm: SerialArm) -> Array:
-        """(n,) fastest change of each joint's correction, rad/s (prismatic: m/s)."""
-        return np.where(arm.prismatic, self.blend_m_s, self.blend_rad_s)
 
     def start_near(self, arm: SerialArm) -> Array:
         """(n,) how far from where a command begins each joint may stand, rad (prismatic: m)."""

@@ -133,6 +133,15 @@ def _require_finite(values: Any, what: str) -> None:
         raise RefusedError(Reason.NOT_FINITE, f"{what}: {list(values)}")
 
 
+def require_finite(names: tuple[str, ...], values: Array | None) -> None:
+    """Refuse values (m, k) of which one is NaN or infinite."""
+    if values is None or np.isfinite(values).all():
+        return
+    point, column = np.argwhere(~np.isfinite(values))[0]
+    name = names[column] if column < len(names) else f"column {column + 1}"
+    raise RefusedError(Reason.NOT_FINITE, f"{name} (point {point + 1})")
+
+
 def require_few(points: int) -> None:
     """Refuse a trajectory of so many points that nothing else would be heard meanwhile."""
     if points > MOST_POINTS:

@@ -112,7 +112,7 @@ class CorrectionMessages:
             offset=doubles(offset.offset),
             model_revision=offset.revision or 0,
             tool_revision=offset.tool_revision or 0,
-            blend=offset.s,
+            withheld=doubles(offset.withheld),
             shadow=self._shadow,
         )
 

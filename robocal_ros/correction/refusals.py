@@ -21,6 +21,8 @@ class Reason(StrEnum):
     OWN_OUTPUT = "comes from a joint correction already"
     DEGREES = "positions look like degrees"
     BURST = "too many points"
+    NO_POINTS = "a trajectory without points"
+    TOO_SHORT = "too short for the offset to change"
     TWO_SOURCES = "two publishers at once"
     OTHER_COMMANDER = "somebody else commands the robot"
     LEASED = "the robot is leased for a measurement"
@@ -34,6 +36,10 @@ class Reason(StrEnum):
     OLD_REVISION = "older than the revision in use"
     TOOL_BOUND = "the tool's change exceeds its bound"
     BAD_TOOL = "the tool's frame is not usable"
+    OTHER_COMMANDER = "somebody else commands the robot"
+    LEASED = "the robot is leased for a measurement"
+    STOPPED = "stopped"
+    NO_SPEED_LIMITS = "the robot has no speed limits"
 
 
 _CODES = {

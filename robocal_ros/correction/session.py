@@ -1,40 +1,48 @@
 """Session of the joint correction: taught joints in, corrected ones out, and back. No clock.
 
-It is off until enabled. Enabling, disabling, a new model and a new tool all go through a blend
-of model and tool parameters that moves no joint faster than a bound. What it cannot or must not
-correct is refused with a reason, counted, and nothing is put out for it: `RefusedError`.
+It is off until enabled. Whatever changes (enabling, a model, a tool, a posture, a refusal), the
+offset of what goes out moves within the limits of `limiter`, and what goes out within the joints'
+speeds. What it cannot or must not correct is refused with a reason and counted: `RefusedError`.
+A refusal ends a stream that runs: the robot is slowed down (`tail`).
 """
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.commands import Commands
-from robocal_ros.correction.corrector import Corrector
-from robocal_ros.correction.courses import Course
-from robocal_ros.correction.incoming import CorrectionGuard, JointBook
+from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import (
     JointCommand,
     OfferedModel,
     OfferedTool,
     TrajectoryCommand,
+    require_finite,
 )
-from robocal_ros.correction.memory import blank
 from robocal_ros.correction.offers import CorrectionGate
-from robocal_ros.correction.plain_streams import Limits, PlainReadings, PlainTargets
-from robocal_ros.correction.readings import Readings
+from robocal_ros.correction.output import Output, SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
-from robocal_ros.correction.starts import Starts
+from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.status import CorrectionStatus, Offset
-from robocal_ros.correction.wire import JointWire
+from robocal_ros.correction.streams import Phase, TargetStream
+from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 Answer = TypeVar("Answer")
+
+# A message this much older than the last one comes from a clock that was set back.
+CLOCK_RESET_NS = 1_000_000_000
+MOST_SOURCES = 64  # of so many drivers the order in time is watched one by one
+# What is dropped without ending a stream: it is not the stream's.
+DROPPED = {Reason.TIME_BACKWARDS, Reason.OWN_OUTPUT, Reason.TWO_SOURCES}
 
 
 class CorrectionSession:
@@ -58,41 +66,80 @@ class CorrectionSession:
         config: CorrectionConfig | None = None,
     ) -> None:
         config = config or CorrectionConfig()
-        self._reference = reference
-        self._gate = CorrectionGate(nominal, reference, serial, config)
-        self._block, memory = blank(reference.n)
-        self._guard = CorrectionGuard(memory)
-        self._config = config
-        self._joints = JointBook(reference, config.joint_state_age_s, memory)
-        self._corrector = Corrector(reference, config, memory)
-        self._enabled = False
-        self._starts = Starts(reference, config, self._corrector, memory)
-        self._commands = Commands(
-            config, self._joints, self._guard, self._corrector, self._starts, memory
+        n = reference.n
+        config = replace(
+            config,
+            velocity_limits=np.broadcast_to(config.velocity_limits, (n,)).astype(np.float64),
+            acceleration_limits=np.broadcast_to(config.acceleration_limits, (n,)).astype(np.float64),
         )
-        self._readings = Readings(self._joints, self._guard, self._corrector, config.shadow)
-        limits = Limits(reference, config, self._joints.doubtful)
-        self._plain = limits, self._block, self._guard, self._corrector
+        self._reference, self._config = reference, config
+        self._gate = CorrectionGate(nominal, reference, serial, config)
+        self._state = RobotState(reference, config.joint_state_age_s, config.start_near(reference))
+        self._desired = DesiredOffset(reference, config)
+        self._output = Output(reference, config, self._state)
+        self._stream = TargetStream(reference, config, self._desired, self._output)
+        self._paths = TrajectoryCorrector(
+            reference, config, self._state, self._desired, self._output
+        )
+        self._enabled = False
+        self._taught = np.full(n, np.nan)  # readings, un-corrected
+        self._goal = np.full(n, np.nan)  # taught joints that were commanded last
+        self._held: dict[Reason, str] = {}
+        self._stamps: dict[tuple[str, tuple[str, ...]], int] = {}
+        self._refused: Counter[Reason] = Counter()
+        self._last_refusal = ""
+        self._overtaken = 0
+        self._most = np.zeros(n)
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
     def enable(self, on: bool) -> None:
-        """Ask for the correction, or for its end; either blends in.
+        """Correct from now on, or no more: the offset changes with the next commands.
 
-        Time stamps start afresh; after a mismatch the next command may begin where the robot is;
-        a model or a tool that waits to be looked at is taken over, if it is not too large.
+        Raises
+        ------
+        RefusedError
+            When a robot without speed limits is to be corrected.
         """
+        without = [
+            name
+            for name, limit in zip(
+                self._reference.joint_names, self._config.velocity_limits, strict=True
+            )
+            if not np.isfinite(limit)
+        ]
+        if on and without and not self._config.shadow:
+            self.refuse(
+                Reason.NO_SPEED_LIMITS,
+                f"{', '.join(without)}: give them in the robot file or in velocity_limits",
+            )
         self._enabled = on
-        self._guard.forget_stamps()
-        self._starts.restart()
+        self._want()
+
+    def acknowledge(self) -> None:
+        """End a START_MISMATCH: the next command may begin where the robot stands."""
+        self._output.acknowledge()
+        self._stamps.clear()
+
+    def take_over(self) -> None:
+        """Look again at a model or a tool that was refused for its revision or its size."""
         for look in (lambda: self._gate.look_again(self._places()), self._gate.tools.look_again):
             with contextlib.suppress(RefusedError):  # counted, and in the status
-                self._guard.counted(look)
+                self.counted(look)
         self._want()
+
+    def hold(self, reason: Reason, detail: str, now_s: float) -> None:
+        """While this lasts no command is taken; a stream that runs is ended in order."""
+        self._held[reason] = detail
+        self._stream.end(RefusedError(reason, detail), now_s)
+
+    def release(self, reason: Reason) -> None:
+        """It is over."""
+        self._held.pop(reason, None)
 
     def offer_model(self, model: OfferedModel) -> None:
         """Take over an accepted model of this robot; refused models change nothing."""
-        self._guard.counted(lambda: self._gate.take_model(model, self._places()))
+        self.counted(lambda: self._gate.take_model(model, self._places()))
         self._want()
 
     def offer_tool(self, tool: OfferedTool) -> None:
@@ -101,25 +148,23 @@ class CorrectionSession:
         It is taken over when the robot stands (see `look`) or with the next trajectory, and at
         once while nothing was commanded yet.
         """
-        self._guard.counted(lambda: self._gate.take_tool(tool))
-        if not self._starts.started:
+        self.counted(lambda: self._gate.take_tool(tool))
+        if not np.isfinite(self._goal).any():
             self._adopt_tool()
 
     def look(self, now_s: float, now_ns: int) -> None:
         """To be called now and then: a tool waits for a robot that stands, a model grows old.
 
-        ``now_ns`` is the clock that stamps the models; what it does moves no blend.
+        ``now_ns`` is the clock that stamps the models.
         """
         if self._gate.watch_age(now_ns):
             self._want()
-        if self._gate.tools.waiting is not None and self._stands(now_s):
+        everything = np.arange(self._reference.n)
+        path = self._output.path
+        busy = self._stream.runs(now_s) or (path is not None and path.live(now_s))
+        waits = self._gate.tools.waiting is not None
+        if waits and not busy and self._state.stands(everything, now_s):
             self._adopt_tool()
-
-    def _stands(self, now_s: float) -> bool:
-        """Whether nothing is commanded, and the robot has not moved for its response time."""
-        near = self._config.start_near(self._reference)
-        busy = self._commands.streams(now_s) or self._starts.under_way(now_s)
-        return not busy and self._joints.at_rest(now_s, near)
 
     def _adopt_tool(self) -> None:
         self._gate.tools.adopt()
@@ -127,34 +172,55 @@ class CorrectionSession:
 
     def _places(self) -> Array:
         """Taught joints (k, n) where the robot is, and where it was sent."""
-        places = np.stack([self._joints.taught, self._commands.goal])
+        places = np.stack([self._taught, self._goal])
         return np.asarray(places[np.isfinite(places).all(axis=1)])
 
     def _want(self) -> None:
-        self._commands.settled = None
-        self._corrector.want(self._gate.actual, self._enabled)
+        self._desired.want(self._gate.actual, self._enabled)
 
     # ---- commands -------------------------------------------------------------------------------
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
-        """Correct one message of a stream of joint targets.
+        """Correct one message of a stream of joint targets; one to which nothing is added is returned.
 
-        The blend advances with ``now_s``, at most by the configured longest step.
+        Raises
+        ------
+        RefusedError
+            Counted. A stream that runs is ended by it: `tail` slows the robot down.
         """
-        return self._guard.counted(lambda: self._commands.target(command, now_s))
+        try:
+            self._require_order("target", command.stamp_ns, command.mark, ())
+            self._require_released()
+            index = self._state.index(command.names)
+            self._state.require_positions(command.names, index, command.position[None])
+            if command.velocity is not None:
+                require_finite(command.names, command.velocity[None])
+            q = self._state.complete(index, command.position[None], self._taught, now_s)[0]
+            if self._config.shadow:
+                self._shadow(q[None])
+                corrected = command
+            else:
+                corrected = self._stream.take(command, index, q, now_s)
+        except RefusedError as error:
+            if error.reason not in DROPPED:
+                self._stream.end(error, now_s)
+            raise self._count(error) from None
+        self._goal[:] = q
+        np.maximum(self._most, np.abs(self._output.limiter.withheld), out=self._most)
+        return corrected
+
+    def tail(self, now_s: float) -> JointCommand | None:
+        """What must go out now although no message came; None when nothing must.
+
+        To be called at the stream's period: a stream that is ended slows the robot down, one that
+        caught up when its last message came goes on to it.
+        """
+        return self._stream.tail(now_s)
 
     @property
-    def course(self) -> Course | None:
-        """The trajectory that was put out last, to tell what becomes of it; None after others."""
-        return self._commands.courses.current
-
-    def plain_targets(self, wire: JointWire) -> PlainTargets:
-        """A shorter way for the settled messages of a topic; each is to be offered there first."""
-        return PlainTargets(self._commands, *self._plain, wire)
-
-    def plain_readings(self, wire: JointWire) -> PlainReadings:
-        """As `plain_targets`, for readings."""
-        return PlainReadings(self._readings, *self._plain, wire)
+    def stream_period_s(self) -> float:
+        """Period of the stream's messages, NaN while it is not known."""
+        return self._stream.period_s
 
     def trajectory(
         self,
@@ -164,45 +230,104 @@ class CorrectionSession:
         *,
         may_be_rejected: bool = False,
     ) -> TrajectoryCommand:
-        """Correct a whole trajectory; the blend advances along its time from start.
+        """Correct a whole trajectory; the offset changes along its time from start.
 
         ``starts_in_s``: when it begins, counted from now (its header's stamp); negative for one
-        that is under way, 0 for one that begins as it is forwarded: see `Course.begin`. With
-        ``may_be_rejected`` the `course` says what became of it. A trajectory without points is a
-        stop: it passes as it came.
+        that is under way, 0 for one that begins as it is forwarded: see `SentPath.begin`. With
+        ``may_be_rejected`` the `path` is told what became of it.
         """
-        if len(command) == 0:
-            self._commands.stop(now_s)
-            return command
-        return self._guard.counted(
-            lambda: self._with_waiting_tool(
-                lambda: self._commands.trajectory(command, now_s, starts_in_s, may_be_rejected)
-            )
-        )
-
-    def _with_waiting_tool(self, act: Callable[[], Answer]) -> Answer:
-        """Begin something with the tool that waits, if there is one; a refusal lets it wait on."""
-        tools = self._gate.tools
-        before, waiting = tools.in_use, tools.waiting
-        if waiting is None:
-            return act()
-        self._adopt_tool()
+        waiting = self._gate.tools.waiting, self._gate.tools.in_use
         try:
-            return act()
-        except RefusedError:
-            tools.in_use, tools.waiting = before, waiting
-            self._want()
-            raise
+            self._require_order("trajectory", 0, command.mark, ())
+            self._require_released()
+            require_times(command)
+            index = self._state.index(command.names)
+            self._state.require_positions(command.names, index, command.position)
+            q = self._state.complete(index, command.position, self._taught, now_s)
+            if waiting[0] is not None:
+                self._adopt_tool()
+            if self._config.shadow:
+                self._shadow(q)
+                return command
+            if self._output.mismatch:
+                raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
+            corrected, path = self._paths.correct(command, index, q, now_s, starts_in_s)
+        except RefusedError as error:
+            if self._gate.tools.waiting is not waiting[0]:
+                self._gate.tools.waiting, self._gate.tools.in_use = waiting
+                self._want()
+            raise self._count(error) from None
+        path.replaced = self._output.path if may_be_rejected else None
+        path.scale(self._state.scaling, now_s)
+        self._output.path = path
+        self._stream.phase = Phase.IDLE
+        self._goal[:] = q[-1]
+        np.maximum(self._most, np.abs(path.withheld).max(axis=0), out=self._most)
+        return corrected
+
+    @property
+    def path(self) -> SentPath | None:
+        """The trajectory that was put out last, to tell what becomes of it; None after targets."""
+        return self._output.path
+
+    def reject(self, path: SentPath) -> None:
+        """The controller did not take a trajectory: what it took the place of goes on there."""
+        self._output.reject(path)
+
+    def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:
+        """A trajectory that stops what was put out last, as a controller takes it; None: it stands.
+
+        Its first point lies ``ahead_s`` ahead. A stream ends by `tail`.
+        """
+        stream = RefusedError(Reason.STOPPED, "a stop was asked for")
+        self._stream.end(stream, now_s)
+        command = self._paths.stop(now_s, ahead_s)
+        path = self._output.path
+        if command is not None and path is not None:
+            count, withheld = len(command), path.at(path.withheld, now_s)
+            offset = path.at(path.offsets, now_s)
+            self._output.path = SentPath(
+                index=path.index,
+                begin_s=now_s,
+                times=command.time_from_start_s,
+                out=command.position,
+                velocity=command.velocity,
+                offsets=np.tile(offset, (count, 1)),
+                rates=np.zeros((count, len(offset))),
+                withheld=np.tile(withheld, (count, 1)),
+                stage=path.stage,
+                led_from=path.place(now_s),
+                put_s=now_s,
+                at_once=True,
+            )
+        return command
+
+    def _shadow(self, q: Array) -> None:
+        with contextlib.suppress(RefusedError):  # counted, and in the status
+            self.counted(lambda: self._desired.at(q))
+        self._output.stage = self._desired.stage
+
+    def _require_released(self) -> None:
+        for reason, detail in self._held.items():
+            raise RefusedError(reason, detail)
 
     # ---- readings -------------------------------------------------------------------------------
 
     def reading(self, state: JointCommand, now_s: float, age_s: float = 0.0) -> JointCommand:
-        """Un-correct joint readings with the model that is being commanded at ``now_s``.
+        """Un-correct joint readings with what is being put out at ``now_s``.
 
-        ``age_s``: how old they were on arrival, by their stamp.
-        Joints of others pass as they are.
+        ``age_s``: how old they were on arrival, by their stamp. Joints of others pass as they are;
+        velocities of which one is not finite are none.
         """
-        return self._guard.counted(lambda: self._readings.take(state, now_s, age_s))
+        return self.counted(lambda: self._read(state, now_s, age_s))
+
+    def _read(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
+        self._require_order("reading", state.stamp_ns, state.mark, state.names)
+        index, column = self._state.find(state)
+        self._state.read(index, state.position[column], now_s, age_s)
+        q, position, velocity = self._uncorrected(state, index, column, now_s)
+        self._taught[:] = q
+        return replace(state, position=position, velocity=velocity, mark=TAUGHT)
 
     def taught(
         self, names: tuple[str, ...], position: Array, velocity: Array | None, now_s: float
@@ -214,40 +339,130 @@ class CorrectionSession:
         Raises
         ------
         RefusedError
-            When a value is not finite, a joint is named twice, or numbers differ.
+            When a position is not finite, a joint is named twice, or numbers differ.
         """
-        return self._readings.taught(names, position, velocity, now_s)
+        state = JointCommand(names, position, velocity)
+        index, column = self._state.find(state)
+        return self._uncorrected(state, index, column, now_s)[1:]
+
+    def _uncorrected(
+        self, state: JointCommand, index: Index, column: Index, now_s: float
+    ) -> tuple[Array, Array, Array | None]:
+        """All taught joints (n,), and the state's positions and velocities, un-corrected."""
+        measured, velocity = self._state.measured.copy(), state.velocity
+        measured[index] = state.position[column]
+        if velocity is not None and not (
+            len(velocity) == len(state.names) and np.isfinite(velocity).all()
+        ):
+            velocity = None  # a driver that has none says NaN, or gives fewer
+        if self._config.shadow:
+            return measured, state.position, velocity
+        taught, position = self._output.uncorrected(measured, now_s), state.position.copy()
+        position[column] = taught[index]
+        stage, _ = self._output.correction(now_s)
+        if velocity is not None and stage is not None and len(column):
+            speed = np.zeros((1, self._reference.n))
+            speed[0, index], velocity = velocity[column], velocity.copy()
+            found, result = speed.copy(), stage.correct(taught[None])
+            for _ in range(2):  # the correction's slope is small: its square is left
+                found += speed - stage.rates(taught[None], found, np.zeros_like(found), result)[0]
+            if np.isfinite(found).all():
+                velocity[column] = found[0, index]
+        return taught, position, velocity
+
+    def controller(
+        self, names: tuple[str, ...], position: Array, scaling: float | None, now_s: float
+    ) -> None:
+        """Where the controller says that it is, (k,) rad (prismatic: m), and its speed scaling.
+
+        What is not finite, or of another's joint, is left out; so is a scaling of None.
+        """
+        known = [i for i, name in enumerate(names) if name in self._reference.joint_names]
+        known = [i for i in known if i < len(position) and np.isfinite(position[i])]
+        index = self._state.index(tuple(names[i] for i in known)) if known else np.zeros(0, int)
+        before = self._state.scaling
+        self._state.controller(index, position[known], scaling, now_s)
+        if self._output.path is not None and self._state.scaling != before:
+            self._output.path.scale(self._state.scaling, now_s)
+
+    # ---- what is said of it ---------------------------------------------------------------------
 
     def offset(self, now_s: float) -> Offset:
-        """What is added to the taught joints now.
-
-        While targets stream: to the last of them; else where the robot was read last.
-        """
-        streams = self._commands.streams(now_s)
+        """What is added to the taught joints now, and what of it the limiter withholds."""
+        output, measured = self._output, self._state.measured
+        withheld = np.zeros(self._reference.n)
+        if self._config.shadow:
+            stage = self._desired.stage
+            places = self._places()
+            offset = np.zeros_like(withheld)
+            if stage is not None and len(places):
+                offset = stage.correct(places[-1:]).q[0] - places[-1]
+        elif self._stream.runs(now_s) and output.path is None:
+            offset, withheld = output.out - output.taught, output.limiter.withheld
+            offset = np.where(np.isfinite(offset), offset, 0.0)
+        else:
+            offset = measured - output.uncorrected(measured, now_s)
+            withheld = output.correction(now_s)[1]
         tool = self._gate.tools.in_use if self._enabled else None
         return Offset(
             names=self._reference.joint_names,
-            offset=self._commands.offset.copy() if streams else self._readings.offset(now_s),
+            offset=offset,
+            withheld=withheld,
             revision=self._gate.revision if self._enabled and not self._gate.stale else None,
             tool_revision=None if tool is None else tool.revision,
-            s=self._corrector.progress(now_s),
         )
 
     def counted(self, act: Callable[[], Answer]) -> Answer:
         """Do something for this session; a refusal is counted with its own."""
-        return self._guard.counted(act)
+        try:
+            return act()
+        except RefusedError as error:
+            raise self._count(error) from None
 
     def refuse(self, reason: Reason, detail: str) -> NoReturn:
         """Count a refusal with the session's own, and raise it."""
-        raise self._guard.count(RefusedError(reason, detail))
+        raise self._count(RefusedError(reason, detail))
 
-    def status(self) -> CorrectionStatus:
-        """What the session does."""
-        corrector, guard, tools = self._corrector, self._guard, self._gate.tools
+    def _count(self, refusal: RefusedError) -> RefusedError:
+        if refusal.reason is Reason.TIME_BACKWARDS:
+            self._overtaken += 1
+        self._refused[refusal.reason] += 1
+        self._last_refusal = str(refusal)
+        return refusal
+
+    def _require_order(
+        self, kind: str, stamp: int, mark: str, names: tuple[str, ...]
+    ) -> None:
+        """Refuse what carries a mark of a correction, or was overtaken by a newer one.
+
+        Readings have one order in time for each driver, by its joints.
+        """
+        if mark == CORRECTED or (mark == TAUGHT and kind == "reading"):
+            raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
+        if not stamp:
+            return
+        key = kind, tuple(sorted(names))
+        if key not in self._stamps and len(self._stamps) >= MOST_SOURCES:
+            key = kind, ()
+        last = self._stamps.get(key, 0)
+        if stamp < last and last - stamp <= CLOCK_RESET_NS:
+            detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
+            raise RefusedError(Reason.TIME_BACKWARDS, detail)
+        self._stamps[key] = stamp
+
+    def status(self, now_s: float | None = None) -> CorrectionStatus:
+        """What the session does; ``now_s``: while a trajectory is under way, at which instant."""
+        desired, tools, output = self._desired, self._gate.tools, self._output
+        at_s = np.inf if now_s is None else now_s
+        stage, withheld = output.correction(at_s)
+        settled = stage is desired.stage and bool(np.all(np.abs(withheld) <= SETTLED))
+        started = output.path is not None or bool(np.isfinite(output.out).any())
+        if not started:
+            settled = True
         return CorrectionStatus(
             enabled=self._enabled,
-            active=not corrector.idle,
-            settled=corrector.settled,
+            active=desired.stage is not None or stage is not None or not settled,
+            settled=settled,
             revision=self._gate.revision,
             serial=self._gate.serial,
             survey=self._gate.survey,
@@ -256,18 +471,32 @@ class CorrectionSession:
             tool_revision=None if tools.in_use is None else tools.in_use.revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
             stale=self._gate.stale,
-            tcp_shift_m=float(corrector.figures[0]),
-            largest_shift=float(corrector.figures[1]),
-            remaining_m=float(corrector.figures[2]),
-            held=corrector.held,
-            waits=corrector.waits,
-            mismatch=self._starts.mismatch,
-            reduced=corrector.reduced,
-            clamped=dict(corrector.clamped),
-            passed=dict(corrector.passed),
+            tcp_shift_m=desired.tcp_shift_m,
+            largest_shift=desired.largest,
+            remaining_m=desired.remaining_m,
+            withheld=withheld,
+            withheld_most=self._most.copy(),
+            withheld_m=self._at_tool(withheld),
+            withheld_most_m=self._at_tool(self._most),
+            lag_s=self._stream.lag_s,
+            overtaken=self._overtaken,
+            mismatch=output.mismatch,
+            held=dict(self._held),
+            reduced=desired.reduced,
+            clamped=dict(desired.clamped),
+            passed=dict(desired.passed),
             policy=self._config.policy,
             reference=f"{self._reference.name} {self._reference.model_hash}",
             shadow=self._config.shadow,
-            refused=dict(guard.refused),
-            last_refusal=guard.last_refusal,
+            refused=dict(self._refused),
+            last_refusal=self._last_refusal,
         )
+
+    def _at_tool(self, withheld: Array) -> float:
+        """How far the tool is moved by small offsets (n,) where the robot is, m."""
+        places = self._places()
+        if not len(places) or not withheld.any():
+            return 0.0
+        moved = self._reference.fk(np.stack([places[0], places[0] + withheld]))
+        tips = (moved @ self._reference.T_flange_tool)[:, :3, 3]
+        return float(np.linalg.norm(tips[1] - tips[0]))

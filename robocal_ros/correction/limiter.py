@@ -1,0 +1,213 @@
+"""The last thing in the command path: how the offset between what comes in and goes out may change.
+
+Whatever is upstream (a new model or tool, enabling, a refusal, a command of some joints, a
+singular posture, a restart), what goes out is what came in plus an offset, and for each joint the
+offset's rate and acceleration stay within limits over the time that really elapsed. At rest the
+limits are low, as what changes then is the correction itself; in motion they are higher, as the
+correction follows the posture.
+
+With the offset o, its rate v, the desired offset d and the withheld part e = o - d, each step of
+dt follows the desired rate w = d' and takes e back along its own direction,
+
+    v = w - e / T,    T = max_j |e_j| / u_j,    u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (1)
+
+where u_j is the fastest rate that half of the acceleration a still brings to rest within |e_j| in
+steps of dt, and no more than the limit at rest. Then each joint's v is held to its limits, and a
+joint that may reach d and stay with it does so exactly.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.compiled import kernel, lean
+
+Array = NDArray[np.float64]
+
+# rows of the limits (4, n) and of a limiter's state (3, n)
+REST_RATE, REST_ACCELERATION, RATE, ACCELERATION = range(4)
+OFFSET, OFFSET_RATE, DESIRED = range(3)
+# Time steps of a path are divided until they are at most so long, s.
+LONGEST_STEP_S = 0.02
+MOST_STEPS = 10_000
+# A joint that was given no faster than this stands, rad/s (prismatic: m/s).
+STILL = 1e-3
+
+
+@dataclass(frozen=True)
+class OffsetLimits:
+    """Fastest change of the offset of one joint: rad/s and rad/s^2 (prismatic: m/s, m/s^2).
+
+    Attributes
+    ----------
+    rest, rest_acceleration : while the joints are given no motion.
+    motion, motion_acceleration : while they are.
+    """
+
+    rest: float
+    rest_acceleration: float
+    motion: float
+    motion_acceleration: float
+
+    def __post_init__(self) -> None:
+        """Raise ``ValueError`` for limits in motion below those at rest, or none."""
+        if not (0.0 < self.rest <= self.motion) or not (
+            0.0 < self.rest_acceleration <= self.motion_acceleration
+        ):
+            raise ValueError(f"limits of the offset must be positive, and greatest in motion: {self}")
+
+    def row(self) -> tuple[float, float, float, float]:
+        """In the order of the limits' rows."""
+        return self.rest, self.rest_acceleration, self.motion, self.motion_acceleration
+
+
+TURNING = OffsetLimits(*np.radians([2.0, 20.0, 10.0, 200.0]).tolist())
+SLIDING = OffsetLimits(5e-3, 50e-3, 25e-3, 0.5)
+
+
+@lean
+def _range(rate: float, dt: float, moves: bool, limits: Array, j: int) -> tuple[float, float, float]:
+    """Least and largest rate of joint ``j`` after a step, and the acceleration that it may have.
+
+    One that is faster than the limit at rest as the motion ends slows down as in motion.
+    """
+    fastest, acceleration = limits[RATE, j], limits[ACCELERATION, j]
+    if not moves:
+        fastest = limits[REST_RATE, j]
+        if abs(rate) <= fastest:
+            acceleration = limits[REST_ACCELERATION, j]
+        else:
+            fastest = max(fastest, abs(rate) - acceleration * dt)
+    change = acceleration * dt
+    return max(-fastest, rate - change), min(fastest, rate + change), acceleration
+
+
+@lean
+def advance(
+    state: Array, desired: Array, dt: float, moves: bool, limits: Array, active: Array
+) -> None:
+    """One step of ``dt`` > 0 towards ``desired`` (n,), of the joints that are active (n,)."""
+    n, slowest = desired.shape[0], dt
+    for j in range(n):
+        if active[j] == 0.0:
+            continue
+        least, most, acceleration = _range(state[OFFSET_RATE, j], dt, moves, limits, j)
+        if abs(desired[j] - state[DESIRED, j]) > limits[RATE, j] * dt:
+            state[DESIRED, j] = desired[j]  # no motion of the posture: another correction
+        size = abs(state[OFFSET, j] - state[DESIRED, j])
+        if size > 0.0:
+            half = 0.5 * acceleration
+            u = half * (np.sqrt(dt * dt + 2.0 * size / half) - dt)
+            u = min(u, limits[REST_RATE, j])
+            slowest = max(slowest, size / u) if u > 0.0 else slowest
+    for j in range(n):
+        if active[j] == 0.0:
+            continue
+        rate, offset = state[OFFSET_RATE, j], state[OFFSET, j]
+        least, most, acceleration = _range(rate, dt, moves, limits, j)
+        follows = (desired[j] - state[DESIRED, j]) / dt
+        reaches = (desired[j] - offset) / dt
+        stays = abs(reaches - follows) <= acceleration * dt
+        if stays and least <= reaches <= most:
+            state[OFFSET, j], state[OFFSET_RATE, j] = desired[j], reaches
+        else:
+            v = follows - (offset - state[DESIRED, j]) / slowest
+            v = min(max(v, least), most)
+            state[OFFSET, j], state[OFFSET_RATE, j] = offset + v * dt, v
+        state[DESIRED, j] = desired[j]
+
+
+@kernel
+def step(
+    state: Array, desired: Array, dt: float, moves: bool, limits: Array, active: Array
+) -> None:
+    """`advance`, for one message of a stream."""
+    advance(state, desired, dt, moves, limits, active)
+
+
+@kernel
+def follow(
+    state: Array, desired: Array, times: Array, speed: Array, limits: Array, active: Array,
+    offsets: Array, rates: Array,
+) -> None:  # fmt: skip
+    """Offsets and rates (m, n) at the points of a path with the desired ones (m, n).
+
+    Parameters
+    ----------
+    times : (m,) of the points, from the instant of ``state`` on; one at 0 or before has that
+        state's offset.
+    speed : (m,) fastest joint on the way to each point.
+    """
+    m, n = desired.shape
+    at, before = 0.0, np.empty(n)
+    between = np.empty(n)
+    for k in range(m):
+        dt = times[k] - at
+        if dt > 0.0:
+            steps = min(int(np.ceil(dt / LONGEST_STEP_S)), MOST_STEPS)
+            for j in range(n):
+                before[j] = state[DESIRED, j]
+                # another correction than before comes at once, not as the posture moves
+                if abs(desired[k, j] - before[j]) > limits[RATE, j] * dt:
+                    before[j] = desired[k, j]
+            for i in range(steps):
+                part = (i + 1) / steps
+                for j in range(n):
+                    between[j] = desired[k, j]
+                    if i + 1 < steps:
+                        between[j] = before[j] + part * (desired[k, j] - before[j])
+                advance(state, between, dt / steps, speed[k] > STILL, limits, active)
+            at = times[k]
+        for j in range(n):
+            offsets[k, j], rates[k, j] = state[OFFSET, j], state[OFFSET_RATE, j]
+
+
+class OffsetLimiter:
+    """The offset of each joint, which never jumps.
+
+    Attributes
+    ----------
+    state : (3, n) offset, its rate and the desired offset, at the last step.
+    limits : (4, n).
+    """
+
+    def __init__(self, prismatic: NDArray[np.bool_], turning: OffsetLimits, sliding: OffsetLimits):
+        n = len(prismatic)
+        self.limits = np.ascontiguousarray(
+            np.where(prismatic, np.array(sliding.row())[:, None], np.array(turning.row())[:, None])
+        )
+        self.state = np.zeros((3, n))
+        self._all = np.ones(n)
+
+    def begin(self, index: NDArray[np.int64], offset: Array, desired: Array) -> None:
+        """Joints ``index`` (k,) stand with an offset (k,), at rest."""
+        self.state[OFFSET, index] = offset
+        self.state[OFFSET_RATE, index] = 0.0
+        self.state[DESIRED, index] = desired
+
+    @property
+    def withheld(self) -> Array:
+        """(n,) offset less the desired one."""
+        return np.asarray(self.state[OFFSET] - self.state[DESIRED])
+
+    def step(self, desired: Array, dt_s: float, speed: float, active: Array | None = None) -> None:
+        """One message of a stream, ``dt_s`` after the last one; ``speed`` of the fastest joint."""
+        if dt_s > 0.0:
+            chosen = self._all if active is None else active
+            step(self.state, desired, dt_s, speed > STILL, self.limits, chosen)
+
+    def follow(
+        self, desired: Array, times: Array, speed: Array, active: Array
+    ) -> tuple[Array, Array]:
+        """Offsets and rates (m, n) along a path; see `follow`. The state is that of its end."""
+        offsets, rates = np.empty_like(desired), np.empty_like(desired)
+        follow(self.state, desired, times, speed, self.limits, active, offsets, rates)
+        return offsets, rates
+
+
+def load_kernels(n: int) -> None:
+    """Call the compiled code once, so that the first command need not wait for it."""
+    limiter = OffsetLimiter(np.zeros(n, dtype=np.bool_), TURNING, SLIDING)
+    limiter.step(np.zeros(n), 0.004, 0.0)
+    limiter.follow(np.zeros((2, n)), np.arange(2.0), np.zeros(2), np.ones(n))

@@ -1,0 +1,287 @@
+"""What was put out last: where it leads the controller, and what it adds to the taught joints."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, OffsetLimiter
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.robot_state import RESPONSE_S, RobotState
+from robocal_ros.correction.staged import StagedCorrection
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+INSTANTS = 9  # of the response time, at which a robot may be that follows a path
+ROUNDING = 1e-9
+
+
+@dataclass
+class SentPath:
+    """A trajectory that was put out, and the controller's clock on it.
+
+    Attributes
+    ----------
+    index : (k,) its joints.
+    times : (m,) of its points, s; ``begin_s`` is their zero on the session's clock.
+    out, velocity : (m, k) as put out; ``velocity`` None for straight lines between the points.
+    offsets, rates, withheld : (m, n) offset, its rate, and what of it the limiter adds.
+    stage : the correction that it was made with; None for none.
+    led_from, put_s : (k,) where the controller leads in from, since when.
+    replaced : what it took the place of, until the controller is known to have accepted it.
+    """
+
+    index: Index
+    begin_s: float
+    times: Array
+    out: Array
+    velocity: Array | None
+    offsets: Array
+    rates: Array
+    withheld: Array
+    stage: StagedCorrection | None
+    led_from: Array
+    put_s: float
+    at_once: bool
+    replaced: "SentPath | None" = None
+    rejected: bool = False
+    _scaling: float = 1.0
+    _lost_s: float = 0.0  # by a clock that runs slower
+    _since_s: float = field(default=-np.inf)
+    _stopped_s: float = np.inf
+
+    def begin(self, now_s: float) -> None:
+        """It goes out now: one that begins at once begins now, not when it was corrected."""
+        if self.at_once:
+            self.begin_s = now_s
+
+    def accept(self) -> None:
+        """The controller took it: there is no way back."""
+        self.replaced = None
+
+    def end(self, now_s: float) -> None:
+        """It ended early: the controller stays where it is on it."""
+        self._stopped_s = min(self._stopped_s, now_s)
+
+    def scale(self, scaling: float, now_s: float) -> None:
+        """From now on the controller's clock runs so fast, 0 to 1."""
+        since = max(self._since_s, self.begin_s)
+        if now_s > since:
+            self._lost_s += (1.0 - self._scaling) * (now_s - since)
+        self._since_s, self._scaling = now_s, scaling
+
+    def time(self, now_s: float) -> float:
+        """Where the controller's clock is on it, s from its begin."""
+        now_s = min(now_s, self._stopped_s)
+        since = max(self._since_s, self.begin_s)
+        lost = self._lost_s + (1.0 - self._scaling) * max(now_s - since, 0.0)
+        return now_s - self.begin_s - lost
+
+    def live(self, now_s: float) -> bool:
+        """Whether the robot may still be moving by it."""
+        return self.time(now_s) <= self.times[-1] + RESPONSE_S and (
+            now_s <= self._stopped_s + RESPONSE_S
+        )
+
+    def place(self, now_s: float) -> Array:
+        """Where the controller is (k,): cubic between points with velocities, else straight."""
+        t = self.time(now_s)
+        if t < self.times[0]:
+            lead = self.times[0] + self.begin_s - self.put_s
+            part = np.clip((self.times[0] - t) / lead, 0.0, 1.0) if lead > 0.0 else 0.0
+            return np.asarray(self.out[0] + part * (self.led_from - self.out[0]))
+        k = int(np.searchsorted(self.times, t, side="right")) - 1
+        if k + 1 >= len(self.times):
+            return self.out[-1].copy()
+        dt = self.times[k + 1] - self.times[k]
+        s, way = (t - self.times[k]) / dt, self.out[k + 1] - self.out[k]
+        if self.velocity is None:
+            return np.asarray(self.out[k] + s * way)
+        v0, v1 = self.velocity[k] * dt, self.velocity[k + 1] * dt
+        curve = 3.0 * way - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * way)
+        return np.asarray(self.out[k] + s * (v0 + s * curve))
+
+    def at(self, rows: Array, now_s: float) -> Array:
+        """Rows (m, n) of it now (n,)."""
+        t = self.time(now_s)
+        return np.array([np.interp(t, self.times, column) for column in rows.T])
+
+    def follows(self, measured: Array, near: Array, now_s: float) -> bool:
+        """Whether a robot at ``measured`` (k,) is on it, within its response time."""
+        places = np.array([self.place(t) for t in now_s - np.linspace(0.0, RESPONSE_S, INSTANTS)])
+        beside = np.maximum(places.min(axis=0) - measured, measured - places.max(axis=0))
+        return bool(np.all(beside <= near))
+
+
+class Output:
+    """What was put out last for each joint.
+
+    Attributes
+    ----------
+    limiter : the offsets of a stream, and of the begin of what comes next.
+    stage : the correction of the last target; None for none.
+    taught, out : (n,) the last target, as it was followed, and what went out; NaN before any.
+    out_s : when.
+    path : the trajectory that was put out since; None after a target.
+    mismatch : why nothing goes out until it is acknowledged; empty when nothing is wrong.
+    """
+
+    def __init__(self, arm: SerialArm, config: CorrectionConfig, state: RobotState) -> None:
+        self._state, self._near = state, config.start_near(arm)
+        self._fastest = config.velocity_limits
+        self.limiter = OffsetLimiter(arm.prismatic, config.turning, config.sliding)
+        self.stage: StagedCorrection | None = None
+        self.taught, self.out = np.full((2, arm.n), np.nan)
+        self.out_s = -np.inf
+        self.path: SentPath | None = None
+        self.mismatch = ""
+
+    # ---- the offset -----------------------------------------------------------------------------
+
+    def correction(self, now_s: float) -> tuple[StagedCorrection | None, Array]:
+        """The correction in what is put out now, and what the limiter adds to it (n,)."""
+        if self.path is not None:
+            return self.path.stage, self.path.at(self.path.withheld, now_s)
+        return self.stage, self.limiter.withheld
+
+    def uncorrected(self, corrected: Array, now_s: float) -> Array:
+        """Taught joints (n,) of corrected ones; of readings in part as they are."""
+        stage, withheld = self.correction(now_s)
+        bare = corrected - withheld
+        if stage is None or not np.isfinite(bare).all():
+            return bare
+        return np.asarray(stage.uncorrect(bare[None])[0])
+
+    # ---- where a command may begin --------------------------------------------------------------
+
+    def place(self, index: Index, q: Array, now_s: float) -> tuple[Array, bool]:
+        """Where the controller is (k,), and whether that is known better than by readings.
+
+        Its reference where it tells it; else what it was sent, where the robot is there or on its
+        way; else where the robot stands. ``q`` (k,): joints without limits at the turn nearest.
+
+        Raises
+        ------
+        RefusedError
+            When readings are missing or old, or the robot moves and not by what was put out.
+        """
+        state = self._state
+        known = state.reference(index, now_s)
+        if known is not None:
+            return state.unwrapped(index, known, q), True
+        state.require_fresh(index, now_s)
+        measured, near = state.measured[index], self._near[index]
+        stands, path = state.stands(index, now_s), self.path
+        if path is None:
+            out, recent = self.out[index], now_s - self.out_s <= RESPONSE_S
+        else:
+            columns = [np.flatnonzero(path.index == i) for i in index]
+            whole = all(len(column) for column in columns)
+            out, recent = np.full(len(index), np.nan), False
+            if whole:
+                chosen = np.concatenate(columns)
+                out = path.place(now_s)[chosen]
+                seen = np.full(self._state.count, np.inf)
+                seen[path.index] = self._near[path.index]
+                on_it = path.follows(state.measured[path.index], seen[path.index], now_s)
+                recent = path.live(now_s) and on_it and not stands
+        beside = np.abs(state.unwrapped(index, measured, out) - out)
+        on_its_way = recent and bool(np.all(beside <= self._fastest[index] * RESPONSE_S + near))
+        if np.all(beside <= near) or (on_its_way and not stands):
+            return state.unwrapped(index, out, q), True
+        if stands:
+            return state.unwrapped(index, measured, q), False
+        name = state.names[index[int(np.argmax(np.nan_to_num(beside, nan=np.inf)))]]
+        raise self.refuse(f"the robot moves ({name}), and where its controller is is not known")
+
+    def begin_at(self, index: Index, q: Array, desired: Array, now_s: float) -> Array:
+        """Offsets (k,) with which joints may begin at once at taught ones ``q`` (n,).
+
+        The controller must be where they begin with an offset between none, the last one and the
+        ``desired`` (n,) one.
+
+        Raises
+        ------
+        RefusedError
+            As `place`, and when it is elsewhere.
+        """
+        place, exact = self.place(index, q[index], now_s)
+        offset, near = place - q[index], self._near[index]
+        kept = self.limiter.state[OFFSET, index]
+        known = np.array([kept, np.zeros(len(index)), desired[index]])
+        beside = np.maximum(known.min(axis=0) - offset, offset - known.max(axis=0))
+        if np.any(beside > near):
+            j = int(np.argmax(beside / near))
+            raise self.refuse(
+                f"{self._state.names[index[j]]} is at {place[j]:.6f}, and the command begins at "
+                f"{q[index[j]]:.6f}, corrected at {q[index[j]] + desired[index[j]]:.6f}"
+            )
+        if not exact:  # readings have noise and drives sag: one of these is what was commanded
+            miss = np.max(np.abs(known - offset) / near, axis=1)
+            if np.min(miss) <= 1.0:
+                offset = known[int(np.argmin(miss))].copy()
+        return np.asarray(offset)
+
+    def lead_in(self, now_s: float) -> tuple[Array, Array] | None:
+        """Taught joints (n,) and offset (n,) where a command may lead in from.
+
+        None where the robot is not where it was sent: then none is taken up.
+        """
+        everything = np.arange(self._state.count)
+        try:
+            place, _ = self.place(everything, self._state.measured, now_s)
+        except RefusedError:
+            return None
+        finally:
+            self.mismatch = ""
+        if self.path is None and not np.isfinite(self.out).any():
+            return place, np.zeros(len(place))
+        taught = self.uncorrected(place, now_s)
+        return taught, place - taught
+
+    def refuse(self, detail: str) -> RefusedError:
+        """A mismatch, which lasts until it is acknowledged."""
+        self.mismatch = f"{detail}; call ~/acknowledge when it may begin there"
+        return RefusedError(Reason.START_MISMATCH, self.mismatch)
+
+    def acknowledge(self) -> None:
+        """The next command may begin where the robot stands."""
+        if self.mismatch:
+            self.mismatch, self.path = "", None
+            self.taught[:], self.out[:] = np.nan, np.nan
+
+    # ---- what goes out --------------------------------------------------------------------------
+
+    def take_up(self, now_s: float) -> None:
+        """The offset goes on from the path that was put out last."""
+        if self.path is not None:
+            state, path = self.limiter.state, self.path
+            state[OFFSET] = path.at(path.offsets, now_s)
+            moving = path.time(now_s) < path.times[-1] and path.live(now_s)
+            state[OFFSET_RATE] = path.at(path.rates, now_s) if moving else 0.0
+            state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
+
+    def reject(self, path: SentPath) -> None:
+        """The controller did not take a path: what it took the place of goes on there."""
+        path.rejected = True
+        while self.path is not None and self.path.rejected:
+            self.path = self.path.replaced
+
+
+def hold_speeds(
+    names: Sequence[str], out: Array, dt_s: Array, fastest: Array, what: str = "would move"
+) -> None:
+    """Refuse steps (m, k) that take less than the joints' speeds (k,) allow in ``dt_s`` (m,)."""
+    speed = np.abs(out) / dt_s[:, None]
+    over = speed > fastest * (1.0 + ROUNDING)
+    if over.any():
+        point, j = np.argwhere(over)[0]
+        raise RefusedError(
+            Reason.VELOCITY_LIMIT,
+            f"{names[j]} {what} at {speed[point, j]:.6f}, allowed {fastest[j]:.6f} "
+            f"(point {point + 1})",
+        )

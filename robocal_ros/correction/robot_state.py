@@ -1,0 +1,187 @@
+"""What is known of the robot: its joints by name, where it was read, where its controller is."""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.inputs import JointCommand, require_finite
+from robocal_ros.correction.refusals import Reason, RefusedError
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+# A robot follows what it was sent within this: drives lag, messages travel, s.
+RESPONSE_S = 0.2
+TRACK_S = 0.01  # between two places that are kept, s
+REFERENCE_AGE_S = 0.1  # a controller's reference that is older is none, s
+MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
+# Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
+AHEAD_S = 0.5
+
+
+class RobotState:
+    """The arm's joints: where they were read, and where the controller is, by a steady clock.
+
+    Parameters
+    ----------
+    age_limit_s : readings that are older, by stamp or by arrival, tell nothing.
+    near : (n,) a robot that moved by less within `RESPONSE_S` stands, rad (prismatic: m).
+
+    Attributes
+    ----------
+    measured : (n,) last readings, NaN before the first.
+    scaling : how fast the controller's clock runs, 0 to 1; 1 where nobody says.
+    """
+
+    def __init__(self, arm: SerialArm, age_limit_s: float, near: Array) -> None:
+        self.names, self.count = arm.joint_names, arm.n
+        self._number = {name: i for i, name in enumerate(arm.joint_names)}
+        self._indices: dict[tuple[str, ...], Index] = {}
+        self._age_limit_s, self._near = age_limit_s, near
+        limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
+        turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
+        self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
+        self._doubtful = np.minimum(self._turns, self._tenfold)
+        self._continuous = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
+        self.measured = np.full(arm.n, np.nan)
+        self._read_s = np.full(arm.n, -np.inf)
+        self._track: deque[tuple[float, Array]] = deque()
+        self._reference, self._reference_s = np.full(arm.n, np.nan), -np.inf
+        self.scaling = 1.0
+
+    # ---- joints by name -------------------------------------------------------------------------
+
+    def index(self, names: tuple[str, ...]) -> Index:
+        """Numbers (k,) of the arm's joints; raises `RefusedError` for a name that is no such."""
+        index = self._indices.get(names)
+        if index is None:
+            unknown = [name for name in names if name not in self._number]
+            if unknown or not names:
+                detail = f"{', '.join(unknown) or 'no name'}; the arm has {', '.join(self.names)}"
+                raise RefusedError(Reason.UNKNOWN_JOINT, detail)
+            _require_single(names)
+            index = np.array([self._number[name] for name in names], dtype=np.int64)
+            self._indices = {names: index}
+        return index
+
+    def require_positions(self, names: tuple[str, ...], index: Index, position: Array) -> None:
+        """Refuse positions (m, k) that are not finite, too few, or can only be degrees."""
+        if position.shape[1] != len(names):
+            detail = f"{len(names)} names but {position.shape[1]} positions"
+            raise RefusedError(Reason.WRONG_SIZE, detail)
+        require_finite(names, position)
+        size = np.abs(position)
+        if not (size > self._doubtful[index]).any():
+            return
+        if np.any(size > self._turns[index]):
+            point, column = np.argwhere(size > self._turns[index])[0]
+            detail = f"{self.names[index[column]]} at {position[point, column]:g} rad"
+            raise RefusedError(Reason.DEGREES, detail)
+        if np.any(np.all(size > self._tenfold[index], axis=1)):
+            raise RefusedError(Reason.DEGREES, "all joints are beyond ten times their limits")
+
+    def complete(self, index: Index, position: Array, taught: Array, now_s: float) -> Array:
+        """All joints (m, n) of a command (m, k); those that it leaves out stay where they are.
+
+        ``taught`` (n,): un-corrected readings. Raises `RefusedError` where one that is left out
+        was never read, or not lately.
+        """
+        if len(index) == self.count:
+            q = np.empty_like(position)
+        else:
+            rest = np.setdiff1d(np.arange(self.count), index)
+            absent = [self.names[i] for i in rest if not np.isfinite(taught[i])]
+            if absent:
+                raise RefusedError(Reason.MISSING_JOINT, ", ".join(absent))
+            self.require_fresh(rest, now_s)
+            q = np.tile(taught, (len(position), 1))
+        q[:, index] = position
+        return q
+
+    def find(self, state: JointCommand) -> tuple[Index, Index]:
+        """Numbers of the arm's joints in readings, and their columns; joints of others are left."""
+        _require_single(state.names)
+        if len(state.position) != len(state.names):
+            detail = f"{len(state.names)} names but {len(state.position)} positions"
+            raise RefusedError(Reason.WRONG_SIZE, detail)
+        columns = [i for i, name in enumerate(state.names) if name in self._number]
+        index = np.array([self._number[state.names[i]] for i in columns], dtype=np.int64)
+        column = np.array(columns, dtype=np.int64)
+        names = tuple(state.names[i] for i in columns)
+        self.require_positions(names, index, state.position[None, column])
+        return index, column
+
+    # ---- where it is ----------------------------------------------------------------------------
+
+    def read(self, index: Index, position: Array, now_s: float, age_s: float) -> None:
+        """Take readings (k,) that were ``age_s`` old by their stamp when they came."""
+        self.measured[index] = position
+        if age_s < -AHEAD_S:  # where the robot is cannot be told by a clock that is wrong
+            age_s = np.inf
+        self._read_s[index] = now_s - max(age_s, 0.0)
+        track = self._track
+        if not track or now_s - track[-1][0] >= TRACK_S or now_s < track[-1][0]:
+            track.append((now_s, self.measured.copy()))
+            while len(track) > 1 and track[1][0] <= now_s - RESPONSE_S:
+                track.popleft()
+
+    def controller(
+        self, index: Index, reference: Array, scaling: float | None, now_s: float
+    ) -> None:
+        """Where the controller is: its reference (k,); ``scaling``: how fast its clock runs."""
+        self._reference[index], self._reference_s = reference, now_s
+        if scaling is not None:
+            self.scaling = float(np.clip(scaling, 0.0, 1.0))
+
+    def reference(self, index: Index, now_s: float) -> Array | None:
+        """The controller's own place (k,), where it is known and fresh."""
+        found = self._reference[index]
+        fresh = now_s - self._reference_s <= REFERENCE_AGE_S
+        return found if fresh and bool(np.isfinite(found).all()) else None
+
+    def require_fresh(self, index: Index, now_s: float) -> None:
+        """Refuse while one of these joints has not been read, or not lately."""
+        absent = [self.names[i] for i in index if not np.isfinite(self.measured[i])]
+        if absent:
+            detail = f"no joint state of {', '.join(absent)} has arrived"
+            raise RefusedError(Reason.STALE_JOINTS, detail)
+        i = index[int(np.argmin(self._read_s[index]))]
+        age_s = now_s - self._read_s[i]
+        if age_s > self._age_limit_s:
+            detail = f"{self.names[i]} was read {age_s:.3f} s ago, allowed {self._age_limit_s:g} s"
+            if not np.isfinite(age_s):
+                detail = f"the stamp of {self.names[i]} is over {AHEAD_S:g} s ahead of the clock"
+            raise RefusedError(Reason.STALE_JOINTS, detail)
+
+    def fresh(self, index: Index, now_s: float) -> bool:
+        """Whether all these joints were read lately."""
+        return bool(np.all(now_s - self._read_s[index] <= self._age_limit_s))
+
+    def stands(self, index: Index, now_s: float) -> bool:
+        """Whether these joints were read, and moved by less than ``near`` for the response time."""
+        track = self._track
+        if not track or track[0][0] > now_s - RESPONSE_S + TRACK_S or not self.fresh(index, now_s):
+            return False
+        places = np.array([q[index] for _, q in track])
+        return bool(np.all(np.abs(places - self.measured[index]) < self._near[index]))
+
+    def unwrapped(self, index: Index, position: Array, q: Array) -> Array:
+        """Positions (k,), those of joints without limits at the turn nearest to ``q`` (k,)."""
+        turns = np.where(self._continuous[index], np.round((q - position) / (2.0 * np.pi)), 0.0)
+        return np.asarray(position + 2.0 * np.pi * turns)
+
+
+def _require_single(names: tuple[str, ...]) -> None:
+    if len(set(names)) != len(names):
+        doubled = next(name for name in names if names.count(name) > 1)
+        raise RefusedError(Reason.DOUBLED_JOINT, doubled)
+
+
+def finite_velocity(state: JointCommand) -> JointCommand:
+    """Readings without velocities of which one is not finite: drivers that have none say NaN."""
+    if state.velocity is None or np.isfinite(state.velocity).all():
+        return state
+    return replace(state, velocity=None)

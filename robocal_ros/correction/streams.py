@@ -1,0 +1,256 @@
+"""A stream of joint targets: as new as its newest message, within the joints' speeds, ended in order."""
+
+from collections import deque
+from dataclasses import replace
+from enum import Enum
+from statistics import median
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import CORRECTED
+from robocal_ros.correction.bounds import CorrectionConfig, require_limits
+from robocal_ros.correction.desired import DesiredOffset
+from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.limiter import DESIRED, LONGEST_STEP_S, OFFSET, OFFSET_RATE
+from robocal_ros.correction.output import ROUNDING, Output, hold_speeds
+from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.staged import StagedResult
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
+RESUME_S = 1.0  # after a longer silence a stream is over
+INTERVALS = 7  # whose median is the period
+TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
+
+
+class Phase(Enum):
+    """What a stream does."""
+
+    IDLE = "nothing goes out"
+    RUNNING = "targets go out"
+    ENDING = "the robot is slowed down"
+
+
+class TargetStream:
+    """Targets of a stream, each corrected and put out at once.
+
+    Attributes
+    ----------
+    phase : what it does.
+    lag_s : how long the fastest joint needs from what was put out to what came in.
+    """
+
+    def __init__(
+        self, arm: SerialArm, config: CorrectionConfig, desired: DesiredOffset, output: Output
+    ) -> None:
+        self._arm, self._config = arm, config
+        self._desired, self._output = desired, output
+        self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
+        self.phase, self.lag_s = Phase.IDLE, 0.0
+        self._why: RefusedError | None = None
+        self._active = np.zeros(arm.n)  # 1 where a joint is commanded
+        self._goal, self._speed = np.full(arm.n, np.nan), np.zeros(arm.n)
+        self._came_s = -np.inf
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+        self._command: JointCommand | None = None
+        self._index = np.zeros(0, dtype=np.int64)
+        self._step_s = 0.0  # of the last output
+        self._before = np.full(arm.n, np.nan)  # what was put out before it
+        self._end_s, self._end_out, self._end_speed = 0.0, np.empty(0), np.empty(0)
+        self._lasts_s = 0.0
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    @property
+    def period_s(self) -> float:
+        """Of its messages; NaN before two have come."""
+        return median(self._intervals) if self._intervals else float("nan")
+
+    def runs(self, now_s: float) -> bool:
+        """Whether it is under way."""
+        if self.phase is Phase.ENDING:
+            return True
+        return self.phase is Phase.RUNNING and now_s - self._came_s <= self._gap_s()
+
+    def _gap_s(self) -> float:
+        """A longer silence is a pause."""
+        period = self.period_s
+        return max(self._config.stream_gap_s, 2.0 * period if period > 0.0 else 0.0)
+
+    def _longest_s(self) -> float:
+        """Time that a step may use of what has passed: no more goes out at once after a silence."""
+        period = self.period_s
+        return 2.0 * period if period > 0.0 else LONGEST_STEP_S
+
+    # ---- targets --------------------------------------------------------------------------------
+
+    def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
+        """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
+
+        Raises
+        ------
+        RefusedError
+            When it cannot be corrected, nothing may begin there, or it is too far ahead. `end`
+            is for the caller.
+        """
+        if self.phase is Phase.ENDING and self._why is not None:
+            raise RefusedError(self._why.reason, f"the stream is ended for: {self._why.detail}")
+        if self._output.mismatch:
+            raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
+        interval = now_s - self._came_s
+        if self.phase is Phase.RUNNING and interval > self._gap_s():
+            self._look_after_pause(q, interval)
+        if self.phase is Phase.IDLE:
+            self._active[:] = 0.0
+            self._intervals.clear()
+            self._speed[:] = 0.0
+        else:
+            self._note_arrival(index, q, interval)
+        new = index[self._active[index] == 0.0]
+        if len(new):
+            self._begin(new, q, now_s)
+        self._output.stage, self._output.path = self._desired.stage, None
+        self._active[:] = 0.0
+        self._active[index] = 1.0
+        self._goal[:], self._index = q, index
+        self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
+        result = self._advance(now_s)
+        if self.lag_s > CATCH_UP_S:
+            raise RefusedError(
+                Reason.VELOCITY_LIMIT,
+                f"the stream is {self.lag_s:.3f} s ahead at the joints' speeds, allowed "
+                f"{CATCH_UP_S:g} s",
+            )
+        return self._message(command, result)
+
+    def _note_arrival(self, index: Index, q: Array, interval: float) -> None:
+        self._speed[:] = 0.0
+        if interval > 0.0:
+            self._speed[index] = np.abs(q - self._goal)[index] / interval
+            self._intervals.append(interval)
+
+    def _look_after_pause(self, q: Array, pause_s: float) -> None:
+        """Go on after a pause only where the robot can be there soon; else a new begin."""
+        chosen = self._active > 0.0
+        spare = np.maximum(self._fastest - self._speed, 0.0)[chosen] * CATCH_UP_S
+        ahead = np.abs(q - self._output.taught)[chosen]
+        if pause_s > RESUME_S or np.any(ahead > spare + self._config.start_near(self._arm)[chosen]):
+            self.phase = Phase.IDLE
+
+    def _begin(self, new: Index, q: Array, now_s: float) -> None:
+        """Joints begin where the controller is."""
+        output = self._output
+        with self._desired.uncounted():
+            desired, _ = self._desired.at(q[None])
+        output.take_up(now_s)
+        offset = output.begin_at(new, q, desired[0], now_s)
+        output.limiter.begin(new, offset, desired[0, new])
+        output.taught[new], output.out[new] = q[new], q[new] + offset
+        self._before[new] = output.out[new]
+        if self.phase is Phase.IDLE:
+            output.out_s = now_s
+
+    def _advance(self, now_s: float) -> StagedResult | None:
+        """Put out what came in last, or as much of the way there as the speeds allow."""
+        output, limiter, index = self._output, self._output.limiter, self._index
+        elapsed = max(now_s - output.out_s, 0.0)
+        longest = min(elapsed, self._longest_s())
+        state, before = limiter.state.copy(), output.taught
+        q, fraction = self._goal, 1.0
+        for _ in range(TRIES):
+            desired, result = self._desired.at(q[None])
+            way = np.abs(q - before)[index]
+            speed = float(np.max(way)) / elapsed if elapsed > 0.0 else 0.0
+            limiter.step(desired[0], min(longest, LONGEST_STEP_S), speed, self._active)
+            limiter.state[DESIRED] = desired[0]
+            out = q + limiter.state[OFFSET]
+            allowed = self._fastest[index] * longest + ROUNDING
+            step = np.abs(out - output.out)[index]
+            if np.all(step <= allowed):
+                break
+            limiter.state[:] = state
+            fraction *= 0.999 * float(np.min(allowed / np.maximum(step, allowed * 1e-3)))
+            q = self._goal.copy()
+            q[index] = before[index] + fraction * (self._goal - before)[index]
+        else:
+            q, out, result = before.copy(), output.out.copy(), None
+            limiter.state[OFFSET_RATE] = 0.0
+        require_limits(out[None], self._arm)
+        self._before[:], self._step_s = output.out, elapsed
+        output.taught[index], output.out[index] = q[index], out[index]
+        output.out_s = now_s
+        ahead = np.abs(self._goal - output.taught)[index] / self._fastest[index]
+        self.lag_s = float(np.max(ahead)) if len(ahead) else 0.0
+        return result
+
+    def _message(self, command: JointCommand, result: StagedResult | None) -> JointCommand:
+        """What goes out for a command; itself where nothing is added."""
+        output, index = self._output, self._index
+        position = output.out[index]
+        velocity = command.velocity
+        if velocity is not None:
+            rate = output.limiter.state[OFFSET_RATE]
+            stage, withheld = output.stage, output.limiter.withheld[index]
+            if self.lag_s > 0.0 and self._step_s > 0.0:
+                velocity = (output.out - self._before)[index] / self._step_s
+            elif stage is not None and result is not None and not withheld.any():
+                speeds = np.zeros((1, self._arm.n))
+                speeds[0, index] = velocity
+                velocity = stage.rates(
+                    self._goal[None], speeds, np.zeros_like(speeds), result
+                )[0][0, index]
+            else:
+                velocity = velocity + rate[index]
+            hold_speeds(command.names, velocity[None], np.ones(1), self._fastest[index])
+        if self.lag_s == 0.0 and not output.limiter.state[OFFSET, index].any():
+            return command
+        return replace(command, position=position, velocity=velocity, mark=CORRECTED)
+
+    # ---- without a message ----------------------------------------------------------------------
+
+    def end(self, why: RefusedError, now_s: float) -> None:
+        """End it: the robot is slowed down from where and as fast as it was sent last."""
+        if self.phase is not Phase.RUNNING:
+            return
+        output, index, self._why = self._output, self._index, why
+        held = now_s - output.out_s > self._gap_s()  # the controller holds since: it stands
+        speed = np.zeros(len(index))
+        if not held and self._step_s > 0.0:
+            speed = (output.out - self._before)[index] / self._step_s
+        lasts = np.max(np.abs(speed) / self._slowdown[index]) if len(index) else 0.0
+        if not lasts > 0.0 or not np.isfinite(lasts):
+            self.phase = Phase.IDLE
+            return
+        self.phase, self.lag_s, self._lasts_s = Phase.ENDING, 0.0, float(lasts)
+        self._end_s, self._end_out, self._end_speed = output.out_s, output.out[index].copy(), speed
+
+    def tail(self, now_s: float) -> JointCommand | None:
+        """What must go out now without a message; None when nothing must."""
+        if self._command is None:
+            return None
+        if self.phase is Phase.ENDING:
+            return self._slowed(self._command, now_s)
+        late = now_s - self._came_s > 1.5 * self._longest_s() / 2.0
+        if self.phase is Phase.RUNNING and self.lag_s > 0.0 and late:
+            command = replace(self._command, position=self._goal[self._index], velocity=None)
+            return self._message(command, self._advance(now_s))
+        return None
+
+    def _slowed(self, command: JointCommand, now_s: float) -> JointCommand:
+        output, index = self._output, self._index
+        t = min(now_s - self._end_s, self._lasts_s)
+        place = self._end_out + self._end_speed * (t - 0.5 * t * t / self._lasts_s)
+        place = np.clip(place, self._arm.lower[index], self._arm.upper[index])
+        output.taught[index] += place - output.out[index]
+        output.out[index], output.out_s = place, now_s
+        output.limiter.state[OFFSET_RATE, index] = 0.0
+        velocity = None
+        if command.velocity is not None:
+            velocity = self._end_speed * (1.0 - t / self._lasts_s)
+        if t >= self._lasts_s:
+            self.phase = Phase.IDLE
+        return replace(command, position=place, velocity=velocity, mark=CORRECTED)
