@@ -61,6 +61,7 @@ class TrajectoryCorrector:
         try:
             way = np.abs(np.diff(q, axis=0))[:, index].max(axis=1, initial=0.0)
             speed = np.append(2.0 * STILL, way / np.diff(times))  # a lead-in is a motion
+            speed[1:-1] = np.maximum(speed[1:-1], speed[2:])  # so is what begins to move
             active = np.zeros(self._arm.n)
             active[index] = 1.0
             offsets, rates = limiter.follow(desired, np.maximum(times, 0.0), speed, active)

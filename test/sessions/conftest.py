@@ -5,8 +5,6 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
 
-from correction_robot import Robot, drifted, offer
-
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 
@@ -14,19 +12,3 @@ from robocal_ros.storage.calibrations import CalibrationHistory
 def history(tmp_path):
     with CalibrationHistory.open("K1", state_dir=tmp_path) as opened:
         yield opened
-
-
-@pytest.fixture
-def robot() -> Robot:
-    """Not enabled, and nothing known yet."""
-    return Robot()
-
-
-@pytest.fixture
-def warm() -> Robot:
-    """Enabled, with a drifted model, settled."""
-    robot = Robot()
-    robot.session.offer_model(offer(drifted()))
-    robot.session.enable(True)
-    robot.settle()
-    return robot

@@ -1,0 +1,24 @@
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
+
+from correction_robot import Robot, drifted, offer
+
+
+@pytest.fixture
+def robot() -> Robot:
+    """Not enabled, and nothing known yet."""
+    return Robot()
+
+
+@pytest.fixture
+def warm() -> Robot:
+    """Enabled, with a drifted model, settled."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.session.enable(True)
+    robot.settle()
+    return robot

@@ -1,0 +1,385 @@
+"""Whatever happens in whatever order: the offset and the commands move within their limits in time."""
+
+import numpy as np
+from correction_robot import (
+    DT,
+    FASTEST,
+    HOME,
+    LARGEST_A,
+    LIMITS,
+    NAMES,
+    NOMINAL,
+    REST,
+    REST_A,
+    ROUNDING,
+    Robot,
+    bent_tool,
+    drifted,
+    large,
+    offer,
+    refused,
+    still,
+    swing,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason, RefusedError
+
+WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
+
+
+class Watch:
+    """Compares what came in with what went out, step by step, with the limits over time."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
+        self.offsets: dict[int, tuple[float, float, float, bool]] = {}  # when, offset, rate, moved
+        self.steps = 0
+
+    def out(self, names: tuple[str, ...], out: np.ndarray) -> None:
+        """Positions that went out now: no joint is faster than it may be."""
+        now = self.robot.now
+        for name, x in zip(names, out, strict=True):
+            j = NAMES.index(name)
+            if j in self.last:
+                at, before = self.last[j]
+                fastest = LIMITS["velocity_limits"][j]
+                assert abs(x - before) <= fastest * (now - at) + ROUNDING, (name, x - before)
+            self.last[j] = now, x
+
+    def offset(self, names: tuple[str, ...], taught: np.ndarray, out: np.ndarray) -> None:
+        """The same, of a target that was followed without a lag."""
+        now = self.robot.now
+        for name, q, x in zip(names, taught, out, strict=True):
+            j = NAMES.index(name)
+            offset = x - q
+            if j in self.offsets:
+                at, before, rate, taught_before = self.offsets[j]
+                dt = now - at
+                new = (offset - before) / dt
+                assert abs(new) <= FASTEST + ROUNDING / dt
+                if dt <= 1.5 * DT and np.isfinite(rate):
+                    assert abs(new - rate) <= LARGEST_A * dt + 2.0 * ROUNDING / dt, name
+                    self.steps += 1
+                self.offsets[j] = now, offset, new if dt <= 1.5 * DT else np.nan, q
+            else:
+                self.offsets[j] = now, offset, 0.0, q
+
+    def forget(self) -> None:
+        """Nothing was commanded for a while: offsets are those of what begins anew."""
+        self.offsets.clear()
+
+
+EVENT = st.tuples(
+    st.sampled_from(
+        [
+            "on", "off", "model", "nominal", "tool", "nan", "beyond", "some", "stall",
+            "pause", "backwards", "held", "nothing", "path",
+        ]
+    ),
+    st.integers(0, 5),
+    st.integers(1, 60),
+)  # fmt: skip
+
+
+def happen(robot: Robot, watch: Watch, what: str, seed: int, revision: int, q: np.ndarray) -> None:
+    session = robot.session
+    if what in ("on", "off"):
+        session.enable(what == "on")
+    elif what == "model":
+        session.offer_model(offer(drifted(0.4 * seed, seed), revision))
+    elif what == "nominal":
+        session.offer_model(offer(NOMINAL, revision))
+    elif what == "tool":
+        session.offer_tool(bent_tool(1.5e-3 * seed, 0.5 * seed))
+    elif what == "nan":
+        refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan))
+    elif what == "beyond":
+        bad = q.copy()
+        bad[0] = NOMINAL.upper[0] + 0.1
+        with np.testing.assert_raises(RefusedError):
+            robot.stream(bad)
+    elif what == "stall":
+        robot.now += 0.01 * (1 + 2 * seed)
+    elif what == "pause":
+        robot.rest(0.3 + 0.3 * seed)
+    elif what == "backwards":
+        robot.session._stamps["target", ()] = 10**18
+        with np.testing.assert_raises(RefusedError):
+            robot.stream(q, stamp_ns=10**18 - 10**6)
+        robot.session._stamps.clear()
+    elif what == "held":
+        session.hold(Reason.LEASED, "a measurement", robot.now)
+        refused(Reason.LEASED, robot.stream, q)
+        session.release(Reason.LEASED)
+
+
+def slow_down(robot: Robot, watch: Watch) -> None:
+    """What an ended stream still puts out: in time with the period, until it stands."""
+    for _ in range(500):
+        robot.now += DT
+        robot.read(robot.at)
+        command = robot.session.tail(robot.now)
+        if command is None:
+            return
+        watch.out(command.names, command.position)
+        robot.go(command)
+    raise AssertionError("the stream does not end")
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(EVENT, min_size=1, max_size=12), st.floats(0.0, 1.0), st.booleans())
+def test_streams_through_anything(
+    events: list[tuple[str, int, int]], speed: float, whole: bool
+) -> None:
+    """A swinging stream; it is taken up again where the robot stands when it was ended."""
+    robot = Robot(**WIDE)
+    watch, t = Watch(robot), 0.0
+    centre = HOME.copy()
+    for revision, (what, seed, count) in enumerate(events, start=1):
+        q = centre + 0.2 * np.sin(speed * t)
+        happen(robot, watch, what, seed, revision, q)
+        if what == "path":
+            slow_down(robot, watch)
+            robot.rest()
+            begin = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
+            out = robot.session.trajectory(still(begin, 0.5, 3.0 + seed), robot.now)
+            robot.at = out.position[-1]
+            robot.now += out.time_from_start_s[-1]
+            watch.forget()
+            watch.last.clear()
+            robot.rest()
+        for i in range(count):
+            t += DT
+            q = centre + 0.2 * np.sin(speed * t)
+            names, target = NAMES, q
+            if what == "some" and not whole:
+                names, target = NAMES[:3], q[:3]
+            try:
+                robot.stream(target, names=names)
+            except RefusedError:
+                slow_down(robot, watch)
+                robot.rest()
+                robot.session.acknowledge()
+                # a program that begins anew, where the robot stands by its un-corrected readings
+                here = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
+                centre, t = here.copy(), 0.0
+                watch.forget()
+                continue
+            index = [NAMES.index(n) for n in names]
+            watch.out(names, robot.at[index])
+            if robot.session.status().lag_s == 0.0:
+                watch.offset(names, target, robot.at[index])
+            else:
+                watch.forget()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(EVENT, min_size=1, max_size=8), st.integers(2, 60), st.floats(0.8, 4.0))
+def test_trajectories_through_anything(
+    events: list[tuple[str, int, int]], m: int, duration: float
+) -> None:
+    """Each begins where the robot is by its un-corrected readings, at once or led in."""
+    robot = Robot(**WIDE)
+    for revision, (what, seed, count) in enumerate(events, start=1):
+        if what in ("on", "off", "model", "nominal", "tool"):
+            happen(robot, Watch(robot), what, seed, revision, HOME)
+        begin = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
+        first_s = 0.0 if count % 2 else 0.3
+        s = np.linspace(0.0, 1.0, m)[:, None]
+        way = 0.1 * seed * (3.0 * s**2 - 2.0 * s**3)
+        speed = 0.1 * seed * 6.0 * (s - s**2) / duration
+        times = first_s + np.linspace(0.0, duration, m)
+        command = TrajectoryCommand(NAMES, begin + way, times, speed * np.ones(6))
+        try:
+            out = robot.session.trajectory(command, robot.now)
+        except RefusedError as error:
+            assert error.reason in (Reason.TOO_SHORT, Reason.JOINT_LIMIT, Reason.VELOCITY_LIMIT)
+            continue
+        offset, dt = out.position - command.position, np.diff(times)[:, None]
+        if first_s == 0.0:
+            assert np.abs(out.position[0] - robot.at).max() <= ROUNDING
+        else:
+            steps = np.abs(out.position[0] - robot.at)
+            assert np.all(steps <= LIMITS["velocity_limits"] * first_s)
+        rate = np.diff(offset, axis=0) / dt
+        assert np.all(np.abs(rate) <= FASTEST + ROUNDING)
+        if seed == 0:
+            assert np.all(np.abs(rate) <= REST + ROUNDING)
+        if m > 2 and dt[0, 0] <= 0.02:
+            assert np.all(np.abs(np.diff(rate, axis=0)) <= LARGEST_A * dt[1:] + ROUNDING)
+        assert out.velocity is None or np.abs(out.velocity[-1]).max() <= ROUNDING
+        robot.at = out.position[-1]
+        robot.now += times[-1]
+        robot.rest()
+        taught = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
+        assert np.allclose(taught, command.position[-1], rtol=0.0, atol=1e-9)
+
+
+def test_at_rest_the_offset_comes_in_as_fast_as_it_may_and_no_faster() -> None:
+    robot = large()
+    out = np.array([robot.stream() for _ in range(600)])
+    rate = np.diff(out, axis=0) / DT
+    assert np.abs(rate).max() <= REST + ROUNDING
+    assert np.abs(rate).max() > 0.9 * REST
+    assert np.abs(np.diff(rate, axis=0)).max() <= REST_A * DT + ROUNDING
+    assert robot.session.status().settled
+    assert np.array_equal(out[-1], out[-2])
+
+
+def test_a_stall_is_not_made_up_for_in_a_burst() -> None:
+    """Only the newest of what waited is heard; the step after it is no longer than the speeds."""
+    robot, speed = Robot(), np.radians(60.0)
+    q = HOME.copy()
+    robot.stream(q)
+    for _ in range(50):
+        q[0] += speed * DT
+        robot.stream(q)
+    for stall in (0.05, 0.06):
+        q[0] += speed * stall
+        before = robot.at[0]
+        robot.stream(q, dt=stall)
+        step = robot.at[0] - before
+        assert 0.0 < step <= 2.0 * LIMITS["velocity_limits"][0] * DT + ROUNDING
+        for _ in range(60):
+            q[0] += speed * DT
+            before = robot.at[0]
+            robot.stream(q)
+            assert robot.at[0] - before <= LIMITS["velocity_limits"][0] * DT + ROUNDING
+        assert robot.at[0] == q[0]
+
+
+def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
+    robot, speed = Robot(), np.radians(60.0)
+    q = HOME.copy()
+    robot.stream(q)
+    for _ in range(50):
+        q[0] += speed * DT
+        robot.stream(q)
+    q[0] += speed * 0.5
+    before = robot.at.copy()
+    robot.rest(0.49)
+    refused(Reason.START_MISMATCH, robot.stream, q, dt=0.01)
+    assert np.array_equal(robot.at, before)
+    assert robot.session.tail(robot.now + DT) is None  # it stands already
+
+
+def test_a_refusal_in_motion_slows_the_robot_down() -> None:
+    robot, speed = Robot(), np.radians(60.0)
+    watch, q = Watch(robot), HOME.copy()
+    robot.stream(q)
+    for _ in range(50):
+        q[0] += speed * DT
+        robot.stream(q)
+        watch.out(NAMES, robot.at)
+    refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan))
+    begin, rates, sent_s = robot.at[0], [speed], robot.now - DT  # the refused one left its turn out
+    for _ in range(200):
+        robot.now += DT
+        refused_too = q + speed * DT
+        if (command := robot.session.tail(robot.now)) is None:
+            break
+        rates.append((command.position[0] - robot.at[0]) / (robot.now - sent_s))
+        sent_s = robot.now
+        robot.go(command)
+    slowest = LIMITS["acceleration_limits"][0]
+    assert np.diff(rates).min() >= -slowest * DT * 2.5
+    assert rates[-1] <= 2.0 * slowest * DT
+    assert abs((robot.at[0] - begin) - speed**2 / (2.0 * slowest)) < 2.0 * speed * DT
+    refused(Reason.START_MISMATCH, robot.stream, refused_too, dt=0.5)
+
+
+def test_a_stream_of_some_joints_then_of_all_moves_no_other_joint_at_once() -> None:
+    """The others take their offset up where they stand."""
+    for bent in ((2e-3, 0.5), (9e-3, 3.5)):
+        robot = Robot()
+        robot.session.offer_tool(bent_tool(*bent))
+        robot.session.enable(True)
+        for _ in range(100):
+            robot.stream(HOME[:3], names=NAMES[:3])
+        assert np.array_equal(robot.at[3:], HOME[3:])
+        before = robot.at.copy()
+        robot.stream(HOME)
+        assert np.abs(robot.at - before).max() <= REST * DT + ROUNDING
+
+
+def test_refused_messages_leave_nothing_to_jump_to() -> None:
+    """Twenty-three refused ones, then one that could be taken: it is no longer where the robot is."""
+    robot, speed = Robot(), np.radians(60.0)
+    q, held = HOME.copy(), []
+    robot.stream(q)
+    for _ in range(30):
+        q[0] += speed * DT
+        robot.stream(q)
+    for _ in range(23):
+        q[0] += speed * DT
+        bad = q.copy()
+        bad[3] = NOMINAL.upper[3] + 1.0
+        with np.testing.assert_raises(RefusedError):
+            robot.stream(bad)
+        held.append(robot.at.copy())
+    with np.testing.assert_raises(RefusedError):
+        robot.stream(q)
+    assert np.array_equal(robot.at, held[-1])
+
+
+def test_jitter_moves_nothing_faster(rng_seed: int = 3) -> None:
+    rng = np.random.default_rng(rng_seed)
+    robot, speed = Robot(), 0.9 * LIMITS["velocity_limits"]
+    watch, t, q = Watch(robot), 0.0, HOME.copy()
+    q = HOME - speed * 0.4
+    robot.at = q.copy()
+    robot.rest()
+    for i in range(400):
+        ramp = min(i * DT / 0.3, 1.0)
+        q = q + speed * DT * ramp
+        t += DT
+        if np.any(q > NOMINAL.upper - 0.05):
+            break
+        robot.stream(q, dt=float(DT * rng.uniform(0.3, 1.7)))
+        watch.out(NAMES, robot.at)
+        assert robot.session.status().lag_s <= 5.0 * DT  # early messages in a row
+
+
+def test_a_last_message_that_came_late_is_still_reached() -> None:
+    robot, speed = Robot(), np.radians(60.0)
+    q = HOME.copy()
+    robot.stream(q)
+    for _ in range(50):
+        q[0] += speed * DT
+        robot.stream(q)
+    q[0] += speed * 0.06
+    robot.stream(q, dt=0.06)
+    assert robot.session.status().lag_s > 0.0
+    for _ in range(50):
+        robot.now += DT
+        if (command := robot.session.tail(robot.now)) is not None:
+            robot.go(command)
+    assert np.allclose(robot.at, q, rtol=0.0, atol=1e-12)
+
+
+def test_a_trajectory_that_is_too_short_for_its_offset_says_how_long_it_takes() -> None:
+    robot = large()
+    short = still(seconds=0.05)
+    assert "longer" in refused(Reason.TOO_SHORT, robot.session.trajectory, short, robot.now)
+    robot.session.trajectory(still(seconds=1.5), robot.now)
+    assert not robot.session.status(robot.now + 0.01).settled
+    assert robot.session.status(robot.now + 2.0).settled
+
+
+def test_rates_of_a_settled_swing_are_those_of_its_positions() -> None:
+    robot = large()
+    robot.settle()
+    fine = swing(2001)
+    out = robot.session.trajectory(fine, robot.now)
+    assert out.velocity is not None
+    assert out.acceleration is not None
+    t = fine.time_from_start_s
+    by_steps = np.gradient(out.position, t, axis=0)[5:-1]  # after the step of its acceleration
+    assert np.abs(out.velocity[5:-1] - by_steps).max() < 1e-5
+    bends = np.gradient(out.velocity, t, axis=0)[8:-1]
+    assert np.abs(out.acceleration[8:-1] - bends).max() < 1e-4
