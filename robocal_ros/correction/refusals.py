@@ -24,8 +24,6 @@ class Reason(StrEnum):
     NO_POINTS = "a trajectory without points"
     TOO_SHORT = "too short for the offset to change"
     TWO_SOURCES = "two publishers at once"
-    OTHER_COMMANDER = "somebody else commands the robot"
-    LEASED = "the robot is leased for a measurement"
     JOINT_LIMIT = "a joint limit is exceeded"
     VELOCITY_LIMIT = "a velocity limit is exceeded"
     TCP_BOUND = "the arm's correction at the tool exceeds its bound"

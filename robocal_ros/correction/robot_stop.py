@@ -2,7 +2,7 @@
 
 A controller has no order for "stop": one that is sent nothing, or a trajectory without points, goes
 on to where it was sent, and the cancel of a goal is a dead stop from any speed. What stops it
-smoothly is a cubic from where it is to rest, some tenths of a second ahead (docs/joint_correction.md).
+smoothly is a cubic from where it is to rest, some tenths of a second ahead.
 """
 
 from collections import deque
@@ -15,7 +15,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.stopping import stop
+from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
 
 Array = NDArray[np.float64]
 
@@ -113,8 +113,7 @@ class RobotStop:
         known = np.isfinite(acceleration) & (acceleration > 0.0)
         self._limits = MotionLimits(stop_deceleration=np.where(known, acceleration, assumed))
         self._arm, self._track, self._send = arm, track, send
-        self._plan: JointPlan | None = None
-        self._began_s = self._sent_s = self._speed = 0.0
+        self._began_s = self._sent_s = self._speed = self._lasts_s = 0.0
         self.why = self.fault = ""
         self.sent = 0
 
@@ -130,14 +129,22 @@ class RobotStop:
         self.fault = f"{why}: no stop can be planned, the joint states are missing or too old"
         return False
 
+    def watch(self, why: str, lasts_s: float, now_s: float) -> None:
+        """Watch a stop that was sent by others, and send one of its own where it is not obeyed."""
+        here = self._track.here(now_s)
+        self._speed = 0.0 if here is None else float(np.max(np.abs(here[1])))
+        self._began_s = self._sent_s = now_s
+        self._lasts_s, self.sent = max(lasts_s, SHORTEST_STOP_S), 1
+        self.why, self.fault = why, ""
+
     def look(self, now_s: float, scaling: float = 1.0) -> bool:
         """Whether a stop is under way; sent again where the robot does not obey.
 
         ``scaling``: how fast the controller's clock runs, 0 to 1.
         """
-        if not self.why or self._plan is None:
+        if not self.why:
             return False
-        plan, since_s = self._plan, now_s - self._sent_s
+        since_s = now_s - self._sent_s
         if since_s > TRACK_S and self._track.stands(now_s):
             self.why = ""
             return False
@@ -146,7 +153,7 @@ class RobotStop:
             self.why = ""
             return False
         here = self._track.here(now_s)
-        planned = min((since_s - LAG_S) * scaling / plan.duration_s, 1.0)
+        planned = min((since_s - LAG_S) * scaling / self._lasts_s, 1.0)
         if here is not None and planned > SEEN:
             speed = float(np.max(np.abs(here[1])))
             if speed > (1.0 - 0.5 * planned) * self._speed and not self._track.stands(now_s):
@@ -158,8 +165,9 @@ class RobotStop:
         if here is None:
             return False
         q, qd = here
-        self._plan = stop(self._arm, self._limits, q + qd * REACTION_S, qd)
+        plan = stop(self._arm, self._limits, q + qd * REACTION_S, qd)
         self._speed, self._sent_s = float(np.max(np.abs(qd))), now_s
+        self._lasts_s = plan.duration_s
         self.sent += 1
-        self._send(self._plan)
+        self._send(plan)
         return True
