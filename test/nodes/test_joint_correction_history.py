@@ -14,7 +14,7 @@ from robocal_ros import __version__
 from robocal_ros.core import frames
 from robocal_ros.core.correction_record import CALIBRATED, CorrectionRecord
 from robocal_ros.core.correction_record import NOMINAL as AS_NOMINAL
-from robocal_ros.correction import log as correction_log
+from robocal_ros.correction import report as correction_log
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_description, save_robot
 
