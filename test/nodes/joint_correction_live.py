@@ -92,6 +92,14 @@ class Line:
         self.at: Any = HOME
         self.rested = False
         self.node = graph.add(JointCorrectionNode, {"serial": "s1"} | PATIENT | parameters)
+        self._connect(graph)
+        outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
+        graph.spin_until(
+            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
+        )
+
+    def _connect(self, graph: Any) -> None:
+        """Listen to all outputs, and wait for the inputs."""
         self.targets = graph.collect(JointState, f"{NODE}/joint_targets")
         self.paths = graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
         self.arrays = graph.collect(Float64MultiArray, f"{NODE}/joint_commands")
@@ -105,10 +113,6 @@ class Line:
         self.to_states = graph.publisher(JointState, "joint_states")
         self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
         self.to_tool = graph.publisher(ToolFrame, "tool", qos.LATCHED)
-        outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
-        graph.spin_until(
-            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
-        )
 
     def wait(self, inbox: list[Any], count: int = 1) -> Any:
         self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs")
