@@ -134,8 +134,8 @@ class Moving(Line):
 
         self.graph.spin_until(rests, "the robot stands", within_s + 8.0)
         times = np.array([t for t, _ in self.out])
-        q = np.array([q for _, q in self.out])[times > began_s - 0.1][:, 0]
-        times = times[times > began_s - 0.1]
+        q = np.array([q for _, q in self.out])[times > began_s - 0.5][:, 0]
+        times = times[times > began_s - 0.5]
         moves = np.flatnonzero(np.diff(q) > 1e-7)
         assert times[moves[-1] + 1] - began_s < within_s
         assert np.all(np.diff(q) > -1e-9)
