@@ -73,7 +73,8 @@ KINDS = {
     STATES: JointState,
 }
 ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
-AHEAD_S = 0.02  # the first point of a stop
+AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
+STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither hastens nor turns back
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 TAIL_LASTS_S = 0.5  # after the last message nothing more may be to go out
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
@@ -396,7 +397,8 @@ class JointCorrectionNode(HouseNode):
         self._arm_tail()
         sent = True
         if planned is not None:
-            after_s = float(planned.time_from_start_s[-1]) - REACTION_S
+            way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
+            after_s = way_s / STOP_SHARE
             sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
             self._stopping.watch(why, after_s, now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
