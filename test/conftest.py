@@ -2,7 +2,8 @@
 
 import importlib.util
 import os
-from collections.abc import Generator
+import subprocess
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -49,3 +50,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def data_dir() -> Path:
     """Folder of the real measurements; the test must be marked ``data``."""
     return find_data()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 2 MB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)]
+    found = subprocess.run(mount, capture_output=True, text=True, check=False)
+    if found.returncode:
+        pytest.skip(f"this user may mount nothing: {found.stderr.strip()}")
+    try:
+        yield disk
+    finally:
+        # lazily: what a test leaves open ends after this
+        subprocess.run(["umount", "-l", str(disk)], check=True)

@@ -18,6 +18,7 @@ from robocal_ros.core.thermal.process_documents import process_document
 from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.motion.gap import Gap
@@ -34,6 +35,7 @@ from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import ToolDriver
 from robocal_ros.sim.cell_samples import Sample
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.robots import load_description
 
 Array = NDArray[np.float64]
 
@@ -248,7 +250,11 @@ class Suite:
         taught = replace(
             self.thermal.reference.cell.arm, T_flange_tool=self.tool.config.T_flange_taught
         )
-        self.correction = CorrectionSession(self._nominal, taught, setting.SERIAL)
+        robot = load_description("kr150_r3100")
+        limits = CorrectionConfig(
+            velocity_limits=robot.max_velocity, acceleration_limits=robot.max_acceleration
+        )
+        self.correction = CorrectionSession(self._nominal, taught, setting.SERIAL, limits)
         self.poll()
         self.correction.enable(True)
 

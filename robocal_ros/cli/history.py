@@ -10,29 +10,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import count, text
-from robocal_ros.cli.history_view import show_corrections, show_decision, show_entry, show_list
+from robocal_ros.cli.history_options import add_history, add_rollback_target
+from robocal_ros.cli.history_view import (
+    show_acknowledged,
+    show_corrections,
+    show_decision,
+    show_entry,
+    show_list,
+)
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.proposals import (
-    BEFORE_ANY,
-    HEALTHY_TOOL,
-    THERMAL,
-    TOOL,
-    Decision,
-    Entry,
-    hand_eye_kind,
-)
-from robocal_ros.storage.files import quoted
+from robocal_ros.core.proposals import BEFORE_ANY, Decision, Entry
 
 if TYPE_CHECKING:
     from robocal_ros.storage.calibrations import CalibrationHistory
 
 NAME = "history"
 HELP = "list the calibrations of a robot; accept, reject or roll back"
-
-_PREVIOUS = "previous"
-_NOMINAL = "nominal"
-_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     def add(name: str, words: str) -> argparse.ArgumentParser:
         action = actions.add_parser(name, help=words, description=words)
-        _add_history(action)
+        add_history(action)
         return action
 
     for name, words in (
@@ -50,6 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ):
         listing = add(name, words)
         listing.add_argument("--limit", type=count, default=50, metavar="N", help="default 50")
+    knowing = add("acknowledge", "say that you know of a damaged history that was set aside")
+    knowing.add_argument("--by", type=text, help="who knows, default the user's name")
     showing = add("show", "all that is kept of one calibration")
     showing.add_argument("id", type=int, help="number in the list")
     for name, words in (
@@ -70,57 +66,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                 help="refuse when another revision is in force",
             )
         if name == "rollback":
-            _add_rollback_target(action)
-
-
-def _add_history(action: argparse.ArgumentParser) -> None:
-    action.add_argument(
-        "--robot-serial",
-        type=text,
-        metavar="S",
-        help="robot serial; may be left out where only one robot has a history",
-    )
-    action.add_argument(
-        "--state",
-        type=Path,
-        metavar="DIR",
-        help="folder of the histories, default $ROBOCAL_STATE or ~/.local/state/robocal",
-    )
-
-
-def _add_rollback_target(action: argparse.ArgumentParser) -> None:
-    action.add_argument(
-        "--to",
-        type=_target,
-        default=None,
-        metavar="ID",
-        help="an accepted calibration, 'nominal', or 'previous' (default): the one in force "
-        "before the present one",
-    )
-    action.add_argument(
-        "--kind",
-        type=_kind,
-        metavar="KIND",
-        default=THERMAL,
-        help=f"{', '.join(_KINDS)} or {hand_eye_kind('SENSOR')}; default {THERMAL}",
-    )
+            add_rollback_target(action)
 
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from robocal_ros.storage.calibrations import CalibrationHistory
+    from robocal_ros.storage.history_damage import damaged_files
     from robocal_ros.storage.history_paths import known_serials, state_folder
 
     folder = state_folder() if args.state is None else args.state.absolute()
     serial = args.robot_serial
     if serial is None:
         serial = _only(known_serials(folder), folder)
-    with CalibrationHistory.open(serial, state_dir=folder, create=False) as history:
+    with CalibrationHistory.open(serial, state_dir=folder, create=False, owner=False) as history:
         document, render = _ACTIONS[args.action](history, args)
+    damaged = damaged_files(history.path)
     place = {
         "serial": serial,
         "file": str(history.path),
-        "damaged": None if history.damaged is None else str(history.damaged),
+        "damaged": str(damaged[-1]) if damaged else None,
     }
     complete = place | document
     return Outcome(complete, lambda console: render(console, complete))
@@ -178,6 +143,13 @@ def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Ans
     return document, show_corrections
 
 
+def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
+    from robocal_ros.storage.history_damage import acknowledge
+
+    files = acknowledge(history.path, _by(args), time.time_ns())
+    return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_acknowledged
+
+
 def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
     from robocal_ros.sessions.decisions import measured_with
 
@@ -219,21 +191,13 @@ def _rollback(history: "CalibrationHistory", args: argparse.Namespace) -> Answer
 
 _ACTIONS: dict[str, Callable[["CalibrationHistory", argparse.Namespace], Answer]] = {
     "list": _list,
+    "acknowledge": _acknowledge,
     "show": _show,
     "corrections": _corrections,
     "accept": _accept,
     "reject": _reject,
     "rollback": _rollback,
 }
-
-
-def _kind(value: str) -> str:
-    """A kind of calibration; each sensor has its own."""
-    start = hand_eye_kind("")
-    if value not in _KINDS and (not value.startswith(start) or value == start):
-        known = ", ".join((*_KINDS, hand_eye_kind("SENSOR")))
-        raise argparse.ArgumentTypeError(f"'{value}' is none of {known}")
-    return value
 
 
 def _decided(
@@ -281,16 +245,3 @@ def _by(args: argparse.Namespace) -> str:
         return getpass.getuser()
     except (KeyError, OSError):  # a user without a name, as in containers
         return f"uid {os.getuid()}"
-
-
-def _target(value: str) -> int | None:
-    if value == _PREVIOUS:
-        return None
-    if value == _NOMINAL:
-        return 0
-    try:
-        return count(value)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(
-            f"{quoted(value)} is neither an id of the list nor {_NOMINAL!r} nor {_PREVIOUS!r}"
-        ) from error

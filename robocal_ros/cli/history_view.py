@@ -91,6 +91,16 @@ def show_corrections(console: "Console", document: Document) -> None:
         console.print("Nothing yet: joint_correction_node adds a record when it becomes active")
 
 
+def show_acknowledged(console: "Console", document: Document) -> None:
+    """Print which damaged histories somebody knows of now."""
+    from rich.text import Text
+
+    for path in document["acknowledged"]:
+        console.print(Text(f"Acknowledged by {document['by']}: {path}"), soft_wrap=True)
+    if not document["acknowledged"]:
+        console.print("There is nothing to acknowledge")
+
+
 def show_decision(console: "Console", document: Document) -> None:
     """Print what was done."""
     from rich.text import Text
@@ -102,7 +112,8 @@ def show_decision(console: "Console", document: Document) -> None:
 def _show_damage(console: "Console", document: Document) -> None:
     if document["damaged"]:
         console.print(
-            f"The history was damaged and is kept as {document['damaged']}",
+            f"The history was damaged and is kept as {document['damaged']}; 'robocal history "
+            "acknowledge' ends the warnings",
             style="bold red",
             soft_wrap=True,
         )

@@ -75,6 +75,8 @@ class CorrectionConfig:
     policy : what is done with a command whose correction would exceed a bound or a limit.
     model_age_s : a model with an older stamp is not corrected with; 0: any age.
     free_axis : the tool may turn about its z.
+    robot_file_hash : of the robot file, where no serial tells robots of one model apart; a model
+        or tool must then have been made with the same file. Empty: the serial tells them apart.
     shadow : commands and readings pass as they came; the correction is only shown.
     """
 
@@ -97,6 +99,7 @@ class CorrectionConfig:
     policy: Policy = Policy.REFUSE
     model_age_s: float = 0.0
     free_axis: bool = False
+    robot_file_hash: str = ""
     shadow: bool = False
 
     def start_near(self, arm: SerialArm) -> Array:

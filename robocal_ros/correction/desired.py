@@ -1,8 +1,6 @@
 """The offset that is wanted at a posture, by model, tool and policy; the limiter comes after it."""
 
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +18,19 @@ ROUNDING = 1e-12  # of packed models that are the same
 
 
 class _Shim:
-    def __init__(self, s): self._s = s
+    def __init__(self, s):
+        self._s = s
+
     def correct(self, q):
         r = self._s.correct(np.ascontiguousarray(q), np.ones(len(q)))
         object.__setattr__(r, "weak", ~r.whole)
         return r
-    def uncorrect(self, q): return self._s.uncorrect(q, np.ones(len(q)))
-    def rates(self, q, v, a, result): return self._s.rates(q, v, a, np.ones(len(q)), np.zeros(len(q)), result)
+
+    def uncorrect(self, q):
+        return self._s.uncorrect(q, np.ones(len(q)))
+
+    def rates(self, q, v, a, result):
+        return self._s.rates(q, v, a, np.ones(len(q)), np.zeros(len(q)), result)
 
 
 class DesiredOffset:
@@ -35,6 +39,7 @@ class DesiredOffset:
     Attributes
     ----------
     stage : the correction in use; None while nothing is to be corrected.
+    known : the same as if it were on: a robot may show it that was corrected before.
     reduced : how many points were corrected in part, as a direction of theirs is weak.
     clamped, passed : how many messages were corrected in part, or not at all, for what bound.
     tcp_shift_m, largest, remaining_m : of the last message: error at the tool that the drift would
@@ -46,6 +51,7 @@ class DesiredOffset:
         self._reference = pack_model(reference)
         self._actual = self._reference
         self.stage: StagedCorrection | None = None
+        self.known: StagedCorrection | None = None
         self.reduced = 0
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
@@ -53,17 +59,21 @@ class DesiredOffset:
 
     def want(self, actual: SerialArm, on: bool) -> None:
         """Correct for an arm with its tool from the next command on, or for nothing."""
-        packed = pack_model(actual) if on else self._reference
-        if np.allclose(packed, self._actual, rtol=0.0, atol=ROUNDING):
-            return
-        self._actual = packed
-        same = np.allclose(packed, self._reference, rtol=0.0, atol=ROUNDING)
-        self.stage = None
-        if not same:
-            self.stage = _Shim(correction_between(self._reference, packed, packed, self._arm, self._config))
+        packed = pack_model(actual)
+        if not np.allclose(packed, self._actual, rtol=0.0, atol=ROUNDING):
+            self._actual = packed
+            same = np.allclose(packed, self._reference, rtol=0.0, atol=ROUNDING)
+            self.known = (
+                None
+                if same
+                else _Shim(
+                    correction_between(self._reference, packed, packed, self._arm, self._config)
+                )
+            )
+        self.stage = self.known if on else None
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
-        """Wanted offsets (m, n) at taught joints (m, n); raises `RefusedError` as the policy says."""
+        """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
         if self.stage is None:
             self.tcp_shift_m = self.largest = self.remaining_m = 0.0
             return np.zeros_like(q), None
@@ -84,11 +94,13 @@ class DesiredOffset:
         self.remaining_m = float(result.remaining_m.max())
         return offset, result
 
-    @contextmanager
-    def uncounted(self) -> Iterator[None]:
-        """What is asked for meanwhile is not counted: a start is looked at before it is made."""
-        kept = self.reduced, self.clamped.copy(), self.passed.copy()
-        try:
-            yield
-        finally:
-            self.reduced, self.clamped, self.passed = kept
+    def begins(self, q: Array) -> Array:
+        """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.
+
+        Nothing is counted: the command itself is looked at after its begin.
+        """
+        rows = np.zeros((3, len(q)))
+        for row, stage in zip(rows, (self.stage, self.known), strict=False):
+            if stage is not None:
+                row[:] = stage.correct(q[None]).q[0] - q
+        return rows

@@ -69,6 +69,7 @@ class OfferedModel:
     mdh: Array
     T_base_root: Array = field(default_factory=lambda: np.eye(4))
     stamp_ns: int = 0
+    robot_file_hash: str = ""
 
 
 @dataclass(frozen=True)
@@ -90,6 +91,7 @@ class OfferedTool:
     revision: int
     accepted: bool
     stamp_ns: int = 0
+    robot_file_hash: str = ""
 
 
 def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:
@@ -229,6 +231,7 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
         mdh=mdh,
         T_base_root=_pose(root.translation, root.rotation, Reason.NOT_FINITE),
         stamp_ns=stamp_ns(message.header.stamp),
+        robot_file_hash=message.robot_file_hash,
     )
 
 
@@ -253,4 +256,5 @@ def offered_tool(message: Any, accepted_state: int) -> OfferedTool:
         revision=int(message.revision),
         accepted=taught or int(message.state) == accepted_state,
         stamp_ns=stamp_ns(message.header.stamp),
+        robot_file_hash=message.robot_file_hash,
     )

@@ -9,7 +9,7 @@ correction follows the posture.
 With the offset o, its rate v, the desired offset d and the withheld part e = o - d, each step of
 dt follows the desired rate w = d' and takes e back along its own direction,
 
-    v = w - e / T,    T = max_j |e_j| / u_j,    u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (1)
+    v = w - e / T,   T = max_j |e_j| / u_j,   u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (1)
 
 where u_j is the fastest rate that half of the acceleration a still brings to rest within |e_j| in
 steps of dt, and no more than the limit at rest. Then each joint's v is held to its limits, and a
@@ -55,7 +55,9 @@ class OffsetLimits:
         if not (0.0 < self.rest <= self.motion) or not (
             0.0 < self.rest_acceleration <= self.motion_acceleration
         ):
-            raise ValueError(f"limits of the offset must be positive, and greatest in motion: {self}")
+            raise ValueError(
+                f"limits of the offset must be positive, and greatest in motion: {self}"
+            )
 
     def row(self) -> tuple[float, float, float, float]:
         """In the order of the limits' rows."""
@@ -67,7 +69,9 @@ SLIDING = OffsetLimits(5e-3, 50e-3, 25e-3, 0.5)
 
 
 @lean
-def _range(rate: float, dt: float, moves: bool, limits: Array, j: int) -> tuple[float, float, float]:
+def _range(
+    rate: float, dt: float, moves: bool, limits: Array, j: int
+) -> tuple[float, float, float]:
     """Least and largest rate of joint ``j`` after a step, and the acceleration that it may have.
 
     One that is faster than the limit at rest as the motion ends slows down as in motion.

@@ -83,7 +83,7 @@ class CorrectionGate:
                 raise RefusedError(
                     Reason.OLD_REVISION,
                     f"revision {model.revision} with other numbers after {self.revision}, and not "
-                    "newer by its stamp; ~/enable takes it over",
+                    "newer by its stamp; ~/take_over takes it over",
                 )
         arm = self._arm_of(model)
         if len(places):
@@ -123,6 +123,14 @@ class CorrectionGate:
         for what, (found, own) in expected.items():
             if found != own:
                 raise RefusedError(Reason.WRONG_ROBOT, f"{what} {found}, this is {own}")
+        own = self._config.robot_file_hash
+        if own and offered.robot_file_hash != own:
+            raise RefusedError(
+                Reason.WRONG_ROBOT,
+                f"no serial is set and the robot files differ (hash "
+                f"{offered.robot_file_hash or 'not given'}, this is {own}): set the serial of each "
+                "robot",
+            )
 
     def _arm_of(self, model: OfferedModel) -> SerialArm:
         """The offered arm; the nominal one says that no drift is known: then the reference."""

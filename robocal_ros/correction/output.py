@@ -1,5 +1,6 @@
 """What was put out last: where it leads the controller, and what it adds to the taught joints."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -10,13 +11,12 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, OffsetLimiter
 from robocal_ros.correction.refusals import Reason, RefusedError
-from robocal_ros.correction.robot_state import RESPONSE_S, RobotState
+from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-INSTANTS = 9  # of the response time, at which a robot may be that follows a path
 ROUNDING = 1e-9
 
 
@@ -29,7 +29,9 @@ class SentPath:
     index : (k,) its joints.
     times : (m,) of its points, s; ``begin_s`` is their zero on the session's clock.
     out, velocity : (m, k) as put out; ``velocity`` None for straight lines between the points.
-    offsets, rates, withheld : (m, n) offset, its rate, and what of it the limiter adds.
+    known_times : (r,) of the rows below: those of the points, and before them when it was put out,
+        where it leads in.
+    offsets, rates, withheld : (r, n) offset, its rate, and what of it the limiter adds.
     stage : the correction that it was made with; None for none.
     led_from, put_s : (k,) where the controller leads in from, since when.
     replaced : what it took the place of, until the controller is known to have accepted it.
@@ -40,6 +42,7 @@ class SentPath:
     times: Array
     out: Array
     velocity: Array | None
+    known_times: Array
     offsets: Array
     rates: Array
     withheld: Array
@@ -106,15 +109,9 @@ class SentPath:
         return np.asarray(self.out[k] + s * (v0 + s * curve))
 
     def at(self, rows: Array, now_s: float) -> Array:
-        """Rows (m, n) of it now (n,)."""
+        """Rows (r, n) of it now (n,)."""
         t = self.time(now_s)
-        return np.array([np.interp(t, self.times, column) for column in rows.T])
-
-    def follows(self, measured: Array, near: Array, now_s: float) -> bool:
-        """Whether a robot at ``measured`` (k,) is on it, within its response time."""
-        places = np.array([self.place(t) for t in now_s - np.linspace(0.0, RESPONSE_S, INSTANTS)])
-        beside = np.maximum(places.min(axis=0) - measured, measured - places.max(axis=0))
-        return bool(np.all(beside <= near))
+        return np.array([np.interp(t, self.known_times, column) for column in rows.T])
 
 
 class Output:
@@ -139,6 +136,7 @@ class Output:
         self.out_s = -np.inf
         self.path: SentPath | None = None
         self.mismatch = ""
+        self._track: deque[tuple[float, Array]] = deque()  # where the controller was sent lately
 
     # ---- the offset -----------------------------------------------------------------------------
 
@@ -175,34 +173,38 @@ class Output:
             return state.unwrapped(index, known, q), True
         state.require_fresh(index, now_s)
         measured, near = state.measured[index], self._near[index]
-        stands, path = state.stands(index, now_s), self.path
-        if path is None:
-            out, recent = self.out[index], now_s - self.out_s <= RESPONSE_S
-        else:
-            columns = [np.flatnonzero(path.index == i) for i in index]
-            whole = all(len(column) for column in columns)
-            out, recent = np.full(len(index), np.nan), False
-            if whole:
-                chosen = np.concatenate(columns)
-                out = path.place(now_s)[chosen]
-                seen = np.full(self._state.count, np.inf)
-                seen[path.index] = self._near[path.index]
-                on_it = path.follows(state.measured[path.index], seen[path.index], now_s)
-                recent = path.live(now_s) and on_it and not stands
-        beside = np.abs(state.unwrapped(index, measured, out) - out)
-        on_its_way = recent and bool(np.all(beside <= self._fastest[index] * RESPONSE_S + near))
-        if np.all(beside <= near) or (on_its_way and not stands):
-            return state.unwrapped(index, out, q), True
+        stands, sent = state.stands(index, now_s), self._sent(now_s)[index]
+        if np.isfinite(sent).all():
+            lately = [p[index] for t, p in self._track if t >= now_s - RESPONSE_S]
+            places = np.array([sent, *(p for p in lately if np.isfinite(p).all())])
+            here = state.unwrapped(index, measured, sent)
+            beside = np.maximum(places.min(axis=0) - here, here - places.max(axis=0))
+            if np.all(beside <= near):  # it is there, or lags on its way
+                return state.unwrapped(index, sent, q), True
         if stands:
             return state.unwrapped(index, measured, q), False
-        name = state.names[index[int(np.argmax(np.nan_to_num(beside, nan=np.inf)))]]
-        raise self.refuse(f"the robot moves ({name}), and where its controller is is not known")
+        raise self.refuse("the robot moves, and where its controller is is not known")
 
-    def begin_at(self, index: Index, q: Array, desired: Array, now_s: float) -> Array:
+    def note_place(self, now_s: float) -> None:
+        """Keep where the controller is sent now, for robots that lag."""
+        track = self._track
+        if not track or now_s - track[-1][0] >= TRACK_S or now_s < track[-1][0]:
+            track.append((now_s, self._sent(now_s)))
+            while len(track) > 1 and track[1][0] <= now_s - RESPONSE_S:
+                track.popleft()
+
+    def _sent(self, now_s: float) -> Array:
+        """Where the controller was sent by now (n,); NaN where nothing was."""
+        sent = self.out.copy()
+        if self.path is not None:
+            sent[self.path.index] = self.path.place(now_s)
+        return sent
+
+    def begin_at(self, index: Index, q: Array, begins: Array, now_s: float) -> Array:
         """Offsets (k,) with which joints may begin at once at taught ones ``q`` (n,).
 
-        The controller must be where they begin with an offset between none, the last one and the
-        ``desired`` (n,) one.
+        The controller must be where they begin with an offset between the last one and those that
+        a robot may show, ``begins`` (r, n).
 
         Raises
         ------
@@ -210,36 +212,52 @@ class Output:
             As `place`, and when it is elsewhere.
         """
         place, exact = self.place(index, q[index], now_s)
-        offset, near = place - q[index], self._near[index]
-        kept = self.limiter.state[OFFSET, index]
-        known = np.array([kept, np.zeros(len(index)), desired[index]])
-        beside = np.maximum(known.min(axis=0) - offset, offset - known.max(axis=0))
-        if np.any(beside > near):
-            j = int(np.argmax(beside / near))
+        offset, beside = self._taken_up(index, place - q[index], begins, exact=exact)
+        if np.any(beside > 1.0):
+            j = int(np.argmax(beside))
             raise self.refuse(
                 f"{self._state.names[index[j]]} is at {place[j]:.6f}, and the command begins at "
-                f"{q[index[j]]:.6f}, corrected at {q[index[j]] + desired[index[j]]:.6f}"
+                f"{q[index[j]]:.6f}, corrected at {(q + begins[0])[index[j]]:.6f}"
             )
-        if not exact:  # readings have noise and drives sag: one of these is what was commanded
-            miss = np.max(np.abs(known - offset) / near, axis=1)
-            if np.min(miss) <= 1.0:
-                offset = known[int(np.argmin(miss))].copy()
-        return np.asarray(offset)
+        return offset
 
-    def lead_in(self, now_s: float) -> tuple[Array, Array] | None:
-        """Taught joints (n,) and offset (n,) where a command may lead in from.
+    def _taken_up(
+        self, index: Index, offset: Array, begins: Array, *, exact: bool
+    ) -> tuple[Array, Array]:
+        """Offsets (k,) to begin with, and how far (k,) beside those known, in units of ``near``.
 
-        None where the robot is not where it was sent: then none is taken up.
+        Readings have noise and drives sag: one that is not exact is the nearest one known.
+        """
+        near = self._near[index]
+        known = np.vstack([self.limiter.state[OFFSET], begins])[:, index]
+        beside = np.maximum(known.min(axis=0) - offset, offset - known.max(axis=0)) / near
+        miss = np.max(np.abs(known - offset) / near, axis=1)
+        if not exact and np.min(miss) <= 1.0:
+            offset = known[int(np.argmin(miss))].copy()
+        return np.asarray(offset), np.asarray(beside)
+
+    def lead_in(
+        self, index: Index, q: Array, begins: Array, now_s: float
+    ) -> tuple[Array | None, Array] | None:
+        """Taught joints (n,) and offset (n,) from where a command leads in to ``q`` (n,).
+
+        The taught joints are None where the controller is at its first point already. None where
+        the robot is neither there nor where it was sent: no offset is taken up then.
         """
         everything = np.arange(self._state.count)
+        before = self.mismatch
         try:
-            place, _ = self.place(everything, self._state.measured, now_s)
+            place, exact = self.place(everything, q, now_s)
         except RefusedError:
+            self.mismatch = before
             return None
-        finally:
-            self.mismatch = ""
-        if self.path is None and not np.isfinite(self.out).any():
-            return place, np.zeros(len(place))
+        offset, beside = self._taken_up(index, (place - q)[index], begins, exact=exact)
+        if np.all(beside <= 1.0):
+            whole = place - q
+            whole[index] = offset
+            return None, whole
+        if not exact:
+            return None
         taught = self.uncorrected(place, now_s)
         return taught, place - taught
 
@@ -252,6 +270,7 @@ class Output:
         """The next command may begin where the robot stands."""
         if self.mismatch:
             self.mismatch, self.path = "", None
+            self._track.clear()
             self.taught[:], self.out[:] = np.nan, np.nan
 
     # ---- what goes out --------------------------------------------------------------------------

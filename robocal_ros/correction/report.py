@@ -24,7 +24,11 @@ from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.correction.status import CorrectionStatus
 from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
-from robocal_ros.nodes.history_settings import open_history
+from robocal_ros.nodes.history_settings import (
+    acknowledge_history,
+    history_notice,
+    open_history,
+)
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 TELL_S = 1.0  # the status goes out at least so often
@@ -37,27 +41,40 @@ FIGURES = (
 RETRY_S = 5.0
 CLOSE_S = 5.0  # the end of the node waits so long for what is not yet written
 MOST_WAITING = 1000  # then the oldest are lost
+END, ACKNOWLEDGE = "end", "acknowledge"
+ACKNOWLEDGED_BY = "joint_correction_node"
 
 
 class CorrectionLog:
-    """Keeps each change of what is corrected with, from the first record on.
+    """Keeps each change of what is corrected with, from the first record on; and watches the disk.
+
+    A thread of its own reads and writes: a disk that is slow, full or locked holds no command up.
+    What cannot be written is told and tried again.
 
     Parameters
     ----------
     open_history : raises `RobocalError`. It is opened anew for what has changed.
+    notice : of a damaged history that nobody has acknowledged; empty without one.
+    acknowledge : writes down that somebody has; raises `RobocalError`.
 
     Attributes
     ----------
     fault : why something waits to be written; empty when nothing does.
+    damage : the last notice.
     """
 
-    def __init__(self, open_history: Callable[[], CalibrationHistory]) -> None:
-        self._open = open_history
+    def __init__(
+        self,
+        open_history: Callable[[], CalibrationHistory],
+        notice: Callable[[], str],
+        acknowledge: Callable[[], object],
+    ) -> None:
+        self._open, self._notice, self._acknowledge = open_history, notice, acknowledge
         self._last: CorrectionRecord | None = None
-        self._noted: queue.SimpleQueue[CorrectionRecord | None] = queue.SimpleQueue()
+        self._noted: queue.SimpleQueue[CorrectionRecord | str] = queue.SimpleQueue()
         self._waiting: deque[CorrectionRecord] = deque(maxlen=MOST_WAITING)
-        self.fault = ""
-        self._thread = threading.Thread(target=self._write, name="correction_log", daemon=True)
+        self.fault = self.damage = ""
+        self._thread = threading.Thread(target=self._run, name="correction_log", daemon=True)
         self._thread.start()
 
     def note(self, record: CorrectionRecord) -> None:
@@ -67,39 +84,39 @@ class CorrectionLog:
             self._noted.put(record)
 
     def acknowledge(self) -> None:
-        """Somebody has taken note of a damaged history."""
+        """Write down that somebody knows of the damage."""
+        self._noted.put(ACKNOWLEDGE)
 
     def close(self) -> None:
         """Write what waits, if that is possible soon."""
-        self._noted.put(None)
+        self._noted.put(END)
         self._thread.join(CLOSE_S)
 
-    def _write(self) -> None:
-        ends = False
-        while not ends:
+    def _run(self) -> None:
+        noted: CorrectionRecord | str = ""
+        while noted != END:
             try:
-                record = self._noted.get(timeout=RETRY_S if self._waiting else None)
+                noted = self._noted.get(timeout=RETRY_S)
             except queue.Empty:
-                pass
-            else:
-                ends = record is None
-                if record is not None:
-                    self._waiting.append(record)
-            self._try()
+                noted = ""
+            if isinstance(noted, CorrectionRecord):
+                self._waiting.append(noted)
+            self._try(acknowledges=noted == ACKNOWLEDGE)
 
-    def _try(self) -> None:
-        if not self._waiting:
-            return
+    def _try(self, *, acknowledges: bool) -> None:
         try:
-            with self._open() as history:
-                while self._waiting:
-                    history.note_correction(self._waiting[0])
-                    self._waiting.popleft()
+            if acknowledges:
+                self._acknowledge()
+            self.damage = self._notice()
+            if self._waiting:
+                with self._open() as history:
+                    while self._waiting:
+                        history.note_correction(self._waiting[0])
+                        self._waiting.popleft()
             self.fault = ""
-        except RobocalError as error:
-            self.fault = (
-                f"{len(self._waiting)} changes wait to be written into the history: {error}"
-            )
+        except (RobocalError, OSError) as error:
+            count = len(self._waiting)
+            self.fault = f"{count} changes wait to be written into the history: {error}"
 
 
 class CorrectionReport:
@@ -142,7 +159,7 @@ class CorrectionReport:
             reference_hash=reference.model_hash,
             taught_tool=(*T[:3, 3].tolist(), *frames.quat_xyzw(T).tolist()),
         )
-        self._log = CorrectionLog(lambda: open_history(settings, nominal)[1])
+        self._log = CorrectionLog(lambda: open_history(settings, nominal, owner=False)[1])
 
     def close(self) -> None:
         """Finish the history."""
@@ -201,7 +218,7 @@ class CorrectionReport:
             faults = [*faults, f"{Reason.START_MISMATCH.value}: {status.mismatch}"]
         for fault in faults:
             health.worsen(ERROR, fault)
-        for warning in [*warnings, *_warnings(status), self._log.fault]:
+        for warning in [*warnings, *_warnings(status), self._log.damage, self._log.fault]:
             if warning:
                 health.worsen(WARN, warning)
         health.values = _figures(status)

@@ -70,14 +70,16 @@ class CorrectionSession:
         config = replace(
             config,
             velocity_limits=np.broadcast_to(config.velocity_limits, (n,)).astype(np.float64),
-            acceleration_limits=np.broadcast_to(config.acceleration_limits, (n,)).astype(np.float64),
+            acceleration_limits=np.broadcast_to(config.acceleration_limits, (n,)).astype(
+                np.float64
+            ),
         )
         self._reference, self._config = reference, config
         self._gate = CorrectionGate(nominal, reference, serial, config)
         self._state = RobotState(reference, config.joint_state_age_s, config.start_near(reference))
         self._desired = DesiredOffset(reference, config)
         self._output = Output(reference, config, self._state)
-        self._stream = TargetStream(reference, config, self._desired, self._output)
+        self._stream = TargetStream(reference, config, self._state, self._desired, self._output)
         self._paths = TrajectoryCorrector(
             reference, config, self._state, self._desired, self._output
         )
@@ -292,6 +294,7 @@ class CorrectionSession:
                 times=command.time_from_start_s,
                 out=command.position,
                 velocity=command.velocity,
+                known_times=command.time_from_start_s,
                 offsets=np.tile(offset, (count, 1)),
                 rates=np.zeros((count, len(offset))),
                 withheld=np.tile(withheld, (count, 1)),
@@ -325,6 +328,7 @@ class CorrectionSession:
         self._require_order("reading", state.stamp_ns, state.mark, state.names)
         index, column = self._state.find(state)
         self._state.read(index, state.position[column], now_s, age_s)
+        self._output.note_place(now_s)
         q, position, velocity = self._uncorrected(state, index, column, now_s)
         self._taught[:] = q
         return replace(state, position=position, velocity=velocity, mark=TAUGHT)
@@ -430,9 +434,7 @@ class CorrectionSession:
         self._last_refusal = str(refusal)
         return refusal
 
-    def _require_order(
-        self, kind: str, stamp: int, mark: str, names: tuple[str, ...]
-    ) -> None:
+    def _require_order(self, kind: str, stamp: int, mark: str, names: tuple[str, ...]) -> None:
         """Refuse what carries a mark of a correction, or was overtaken by a newer one.
 
         Readings have one order in time for each driver, by its joints.

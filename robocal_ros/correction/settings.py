@@ -13,9 +13,15 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.limiter import OffsetLimits
+from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.storage.robots import FULL_SPEED_IN_S, load_description, load_robot
+from robocal_ros.storage.robots import (
+    FULL_SPEED_IN_S,
+    load_description,
+    load_robot,
+    robot_file_hash,
+)
 
 Array = NDArray[np.float64]
 
@@ -263,6 +269,7 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         )
 
     speeds, accelerations = joint_limits(settings)
+    nameless = settings["serial"] in ("", NO_SERIAL)
     return CorrectionConfig(
         thermal=bounds("thermal"),
         tool=bounds("tool"),
@@ -279,5 +286,6 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         free_axis=settings["free_axis"],
         velocity_limits=speeds,
         acceleration_limits=accelerations,
+        robot_file_hash=robot_file_hash(settings["robot"]) if nameless else "",
         shadow=settings["shadow"],
     )

@@ -16,6 +16,7 @@ from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.correction.limiter import DESIRED, LONGEST_STEP_S, OFFSET, OFFSET_RATE
 from robocal_ros.correction.output import ROUNDING, Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
 
 Array = NDArray[np.float64]
@@ -45,9 +46,14 @@ class TargetStream:
     """
 
     def __init__(
-        self, arm: SerialArm, config: CorrectionConfig, desired: DesiredOffset, output: Output
+        self,
+        arm: SerialArm,
+        config: CorrectionConfig,
+        state: RobotState,
+        desired: DesiredOffset,
+        output: Output,
     ) -> None:
-        self._arm, self._config = arm, config
+        self._arm, self._config, self._state = arm, config, state
         self._desired, self._output = desired, output
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
         self.phase, self.lag_s = Phase.IDLE, 0.0
@@ -103,7 +109,7 @@ class TargetStream:
             raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
         interval = now_s - self._came_s
         if self.phase is Phase.RUNNING and interval > self._gap_s():
-            self._look_after_pause(q, interval)
+            self._look_after_pause(q, interval, now_s)
         if self.phase is Phase.IDLE:
             self._active[:] = 0.0
             self._intervals.clear()
@@ -113,7 +119,7 @@ class TargetStream:
         new = index[self._active[index] == 0.0]
         if len(new):
             self._begin(new, q, now_s)
-        self._output.stage, self._output.path = self._desired.stage, None
+        self._output.path = None
         self._active[:] = 0.0
         self._active[index] = 1.0
         self._goal[:], self._index = q, index
@@ -133,9 +139,10 @@ class TargetStream:
             self._speed[index] = np.abs(q - self._goal)[index] / interval
             self._intervals.append(interval)
 
-    def _look_after_pause(self, q: Array, pause_s: float) -> None:
+    def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
         """Go on after a pause only where the robot can be there soon; else a new begin."""
         chosen = self._active > 0.0
+        self._state.require_fresh(np.flatnonzero(chosen), now_s)
         spare = np.maximum(self._fastest - self._speed, 0.0)[chosen] * CATCH_UP_S
         ahead = np.abs(q - self._output.taught)[chosen]
         if pause_s > RESUME_S or np.any(ahead > spare + self._config.start_near(self._arm)[chosen]):
@@ -144,11 +151,10 @@ class TargetStream:
     def _begin(self, new: Index, q: Array, now_s: float) -> None:
         """Joints begin where the controller is."""
         output = self._output
-        with self._desired.uncounted():
-            desired, _ = self._desired.at(q[None])
+        begins = self._desired.begins(q)
         output.take_up(now_s)
-        offset = output.begin_at(new, q, desired[0], now_s)
-        output.limiter.begin(new, offset, desired[0, new])
+        offset = output.begin_at(new, q, begins, now_s)
+        output.limiter.begin(new, offset, begins[0, new])
         output.taught[new], output.out[new] = q[new], q[new] + offset
         self._before[new] = output.out[new]
         if self.phase is Phase.IDLE:
@@ -168,7 +174,7 @@ class TargetStream:
             limiter.step(desired[0], min(longest, LONGEST_STEP_S), speed, self._active)
             limiter.state[DESIRED] = desired[0]
             out = q + limiter.state[OFFSET]
-            allowed = self._fastest[index] * longest + ROUNDING
+            allowed = (self._fastest[index] * longest if longest > 0.0 else 0.0) + ROUNDING
             step = np.abs(out - output.out)[index]
             if np.all(step <= allowed):
                 break
@@ -177,12 +183,13 @@ class TargetStream:
             q = self._goal.copy()
             q[index] = before[index] + fraction * (self._goal - before)[index]
         else:
-            q, out, result = before.copy(), output.out.copy(), None
+            q, out = before.copy(), output.out.copy()
             limiter.state[OFFSET_RATE] = 0.0
         require_limits(out[None], self._arm)
         self._before[:], self._step_s = output.out, elapsed
         output.taught[index], output.out[index] = q[index], out[index]
         output.out_s = now_s
+        output.stage = self._desired.stage if result is not None else None
         ahead = np.abs(self._goal - output.taught)[index] / self._fastest[index]
         self.lag_s = float(np.max(ahead)) if len(ahead) else 0.0
         return result
@@ -200,9 +207,9 @@ class TargetStream:
             elif stage is not None and result is not None and not withheld.any():
                 speeds = np.zeros((1, self._arm.n))
                 speeds[0, index] = velocity
-                velocity = stage.rates(
-                    self._goal[None], speeds, np.zeros_like(speeds), result
-                )[0][0, index]
+                velocity = stage.rates(self._goal[None], speeds, np.zeros_like(speeds), result)[0][
+                    0, index
+                ]
             else:
                 velocity = velocity + rate[index]
             hold_speeds(command.names, velocity[None], np.ones(1), self._fastest[index])

@@ -59,7 +59,7 @@ class ToolGate:
             raise RefusedError(
                 Reason.OLD_REVISION,
                 f"tool revision {tool.revision} is another tool than the last one and not newer "
-                "by its stamp; ~/enable takes it over",
+                "by its stamp; ~/take_over takes it over",
             )
         if self.in_use is not None and _same(tool, self.in_use):
             self.in_use, self.waiting = tool, None

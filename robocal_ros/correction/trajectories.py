@@ -57,8 +57,9 @@ class TrajectoryCorrector:
         times = command.time_from_start_s + starts_in_s
         desired, result = self._desired.at(q)
         output.take_up(now_s)
-        led_from = self._begin(index, q, desired, times, now_s)
         try:
+            led_from = self._begin(index, q, desired, times, now_s)
+            begin = limiter.state.copy()
             way = np.abs(np.diff(q, axis=0))[:, index].max(axis=1, initial=0.0)
             speed = np.append(2.0 * STILL, way / np.diff(times))  # a lead-in is a motion
             speed[1:-1] = np.maximum(speed[1:-1], speed[2:])  # so is what begins to move
@@ -74,15 +75,23 @@ class TrajectoryCorrector:
             self._require_speeds(command, index, out, velocity, times, led_from)
         finally:
             limiter.state[:] = kept
+        known_times, withheld = command.time_from_start_s, offsets - desired
+        sent, sent_rates, sent_withheld = offsets, rates, withheld
+        if led_from is not None:  # until its first point: from the offset that there is now
+            known_times = np.append(-starts_in_s, known_times)
+            sent = np.vstack([begin[OFFSET], offsets])
+            sent_rates = np.vstack([begin[OFFSET_RATE], rates])
+            sent_withheld = np.vstack([begin[OFFSET] - begin[DESIRED], withheld])
         path = SentPath(
             index=index,
             begin_s=now_s + starts_in_s,
             times=command.time_from_start_s,
             out=out[:, index],
             velocity=velocity,
-            offsets=offsets,
-            rates=rates,
-            withheld=offsets - desired,
+            known_times=known_times,
+            offsets=sent,
+            rates=sent_rates,
+            withheld=sent_withheld,
             stage=self._desired.stage if result is not None else None,
             led_from=out[0, index] if led_from is None else led_from,
             put_s=now_s,
@@ -109,20 +118,22 @@ class TrajectoryCorrector:
                 np.array([np.interp(0.0, times, column) for column in rows.T])
                 for rows in (q, desired)
             )
-            offset = output.begin_at(index, here, wanted, now_s)
+            offset = output.begin_at(index, here, self._desired.begins(here), now_s)
             limiter.state[OFFSET, index] = offset
             limiter.state[DESIRED] = wanted
             return None
         self._state.require_fresh(index, now_s)
-        found = output.lead_in(now_s)
+        found = output.lead_in(index, q[0], self._desired.begins(q[0]), now_s)
         if found is None:  # the controller leads in from wherever it is
             limiter.state[OFFSET], limiter.state[DESIRED] = desired[0], desired[0]
             limiter.state[OFFSET_RATE] = 0.0
             return self._state.measured[index].copy()
         taught, offset = found
-        with self._desired.uncounted():
-            wanted, _ = self._desired.at(taught[None])
-        limiter.state[OFFSET], limiter.state[DESIRED] = offset, wanted[0]
+        limiter.state[OFFSET] = offset
+        if taught is None:
+            limiter.state[DESIRED] = desired[0]
+            return np.asarray((q[0] + offset)[index])
+        limiter.state[DESIRED] = self._desired.begins(taught)[0]
         return np.asarray((taught + offset)[index])
 
     def _require_end(self, withheld: Array, active: Array) -> None:

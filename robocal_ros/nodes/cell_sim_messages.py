@@ -4,19 +4,22 @@ from array import array
 from collections.abc import Mapping
 
 import numpy as np
+from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import PointStamped
 from numpy.typing import NDArray
 from robocal_msgs.msg import BeamEvent, ToolStep
 from sensor_msgs.msg import JointState, PointCloud2, PointField, Temperature
+from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.samples import stamp_ns
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.crossed_model import StepKind
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.correction.inputs import TrajectoryCommand
 from robocal_ros.nodes.conversions import header
+from robocal_ros.sim.trajectory import Trajectory
+from robocal_ros.sim.trajectory_goal import Tolerances
 
 Array = NDArray[np.float64]
 
@@ -61,28 +64,65 @@ def planned_step(message: ToolStep) -> PlannedStep:
     )
 
 
-def in_joint_order(
-    command: TrajectoryCommand, arm: SerialArm
-) -> tuple[Array, Array | None, Array | None]:
-    """Positions, velocities, accelerations (k, n) of a trajectory in the arm's order of joints.
+def trajectory_of(message: JointTrajectory, from_ns: int) -> Trajectory:
+    """A trajectory whose start, where it has one, is counted from ``from_ns`` on.
 
     Raises
     ------
     InputError
-        When it does not name each joint once.
+        When a controller rejects the numbers of its values.
     """
-    if sorted(command.names) != sorted(arm.joint_names):
-        raise InputError(
-            f"the trajectory is for {', '.join(command.names)}; this robot has "
-            f"{', '.join(arm.joint_names)}"
-        )
-    order = [command.names.index(name) for name in arm.joint_names]
-    qd, qdd = command.velocity, command.acceleration
-    return (
-        command.position[:, order],
-        None if qd is None else qd[:, order],
-        None if qdd is None else qdd[:, order],
+    points, count = message.points, len(message.joint_names)
+    rows = []
+    for what, needed in (("positions", True), ("velocities", False), ("accelerations", False)):
+        values = [getattr(point, what) for point in points]
+        has = np.array([len(row) > 0 for row in values], dtype=bool)
+        for i, row in enumerate(values):
+            if len(row) != count and (needed or has[i]):
+                raise InputError(f"rejected: point {i} has {len(row)} {what} for {count} joints")
+        filled = [row if given else [0.0] * count for row, given in zip(values, has, strict=True)]
+        rows.append((np.array(filled, dtype=np.float64).reshape(len(points), count), has))
+    if any(len(point.effort) for point in points):
+        raise InputError("rejected: efforts, for which there is no command interface")
+    (q, _), (qd, has_qd), (qdd, has_qdd) = rows
+    times = [point.time_from_start for point in points]
+    at_ns = stamp_ns(message.header.stamp)
+    return Trajectory(
+        names=tuple(message.joint_names),
+        time_s=np.array([t.sec + 1e-9 * t.nanosec for t in times], dtype=np.float64),
+        q=q,
+        qd=qd,
+        qdd=qdd,
+        has_qd=has_qd,
+        has_qdd=has_qdd,
+        start_s=(at_ns - from_ns) * 1e-9 if at_ns else None,
     )
+
+
+def tolerances_of(
+    goal: FollowJointTrajectory.Goal, names: tuple[str, ...], own: Tolerances
+) -> Tolerances:
+    """A goal's tolerances for joints ``names``: 0 leaves the controller's ``own``, -1 removes one.
+
+    As get_segment_tolerances of tolerances.hpp: what is wrong anywhere leaves all of its own.
+    """
+
+    def resolved(default: float, given: float) -> float:
+        return default if given == 0.0 else max(given, 0.0)
+
+    time = goal.goal_time_tolerance
+    over_s = time.sec + 1e-9 * time.nanosec
+    path, end = own.path.copy(), own.goal.copy()
+    for given, into in ((goal.path_tolerance, path), (goal.goal_tolerance, end)):
+        for joint in given:
+            values = joint.position, joint.velocity, joint.acceleration
+            if joint.name not in names or any(x < 0.0 and x != -1.0 for x in values):
+                return own
+            at = names.index(joint.name)
+            into[at] = resolved(into[at], joint.position)
+    if over_s < 0.0 and over_s != -1.0:
+        return own
+    return Tolerances(path, end, resolved(own.goal_time_s, over_s))
 
 
 def beam_event(edge: BeamEdge, stamp_ns: int, station: str) -> BeamEvent:
@@ -95,13 +135,22 @@ def beam_event(edge: BeamEdge, stamp_ns: int, station: str) -> BeamEvent:
     )
 
 
-def joint_state(names: list[str], stamp_ns: int, q: Array, qd: Array) -> JointState:
-    """A joint reading."""
+def joint_state(
+    names: tuple[str, ...], stamp_ns: int, q: Array, qd: Array | None, odd: bool = False
+) -> JointState:
+    """A reading as joint_state_broadcaster tells it: by alphabet, without effort.
+
+    ``qd`` None: hardware that has positions alone. ``odd``: a velocity is missing.
+    """
+    order = sorted(range(len(names)), key=lambda i: names[i])
+    nothing = np.full(len(names), np.nan)
+    velocity = nothing if qd is None else qd[order]
     return JointState(
         header=header(stamp_ns, ""),
-        name=names,
-        position=array("d", q.tobytes()),
-        velocity=array("d", qd.tobytes()),
+        name=[names[i] for i in order],
+        position=array("d", q[order].tobytes()),
+        velocity=array("d", velocity[odd:].tobytes()),
+        effort=array("d", nothing.tobytes()),
     )
 
 

@@ -7,12 +7,12 @@ import numpy as np
 from robocal_msgs.msg import ToolStep
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.correction.inputs import trajectory_command
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.cell_sim_messages import in_joint_order, planned_step
+from robocal_ros.nodes.cell_sim_controller import SimulatedController
+from robocal_ros.nodes.cell_sim_messages import planned_step, trajectory_of
 from robocal_ros.nodes.cell_sim_outputs import CellOutputs
 from robocal_ros.nodes.cell_sim_settings import (
     SETTINGS,
@@ -22,11 +22,11 @@ from robocal_ros.nodes.cell_sim_settings import (
     laser_pose,
 )
 from robocal_ros.nodes.diagnostics import WARN, Health
-from robocal_ros.nodes.endpoints import LOG_EVERY_S
 from robocal_ros.nodes.run import run
-from robocal_ros.sim.cell import TICK_S, SimulatedCell
+from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_plan import known_laser
 from robocal_ros.sim.kr150_cell import worked_for
+from robocal_ros.sim.standing import TICK_S
 from robocal_ros.storage.files import write_text
 
 BEHIND_S = 1.0  # a longer pause of the process, or a jump of its clock, is none of the cell's
@@ -41,6 +41,10 @@ class CellSimNode(HouseNode):
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self._cell: SimulatedCell | None = None
+        self._origin_ns: int | None = None
+        self._controller = SimulatedController(
+            self, "~/follow_joint_trajectory", self._tick, lambda: self._origin_ns or 0
+        )
 
     def configure(self) -> None:
         """Build the cell, let its robot place the beams, then open the topics."""
@@ -56,7 +60,7 @@ class CellSimNode(HouseNode):
             rows = [f"{name},{_mm(place)}\n" for name, place in sorted(points.items())]
             write_text(Path(settings["laser_csv"]), "point,x_mm,y_mm,z_mm\n" + "".join(rows))
         self._out = CellOutputs(self.add_output, settings, self._cell)
-        self.add_input(JointTrajectory, "joint_trajectory", self._follow, qos.RELIABLE)
+        self._controller.open(self._cell)
         self.add_input(JointTrajectory, "~/truth/commanded", self._judge, qos.RELIABLE)
         if settings["run_program"]:
             self.add_input(ToolStep, "next_step", self._await_step, qos.LATCHED)
@@ -65,7 +69,7 @@ class CellSimNode(HouseNode):
 
     def activate(self) -> None:
         """The cell goes on from where it stood."""
-        self._origin_ns: int | None = None
+        self._origin_ns = None
         self._step: PlannedStep | None = None
         self._driven: tuple[int, int] | None = None
         self._fault: tuple[str, float] = ("none", 0.0)
@@ -74,12 +78,17 @@ class CellSimNode(HouseNode):
 
     def deactivate(self) -> None:
         """The robot stands still."""
-        if self._cell is not None:
-            self._cell.hold()
+        self._controller.deactivate()
 
     def cleanup(self) -> None:
         """The cell is gone."""
+        self._controller.close()
         self._cell = None
+
+    def close(self) -> None:
+        """At the end of the process."""
+        super().close()
+        self._controller.destroy()
 
     def settings_changed(self) -> None:
         """Another fault, another bend, another heat."""
@@ -96,22 +105,6 @@ class CellSimNode(HouseNode):
 
     # ---- what comes in --------------------------------------------------------------------------
 
-    def _follow(self, message: Any) -> None:
-        cell = self._cell
-        self._tick()
-        if cell is None or self._origin_ns is None:
-            return
-        if not message.points:
-            cell.hold()
-            return
-        command = trajectory_command(message)
-        start_s = cell.now_s
-        if command.stamp_ns:
-            start_s = (command.stamp_ns - self._origin_ns) * 1e-9
-        q, qd, qdd = in_joint_order(command, cell.plan.arm)
-        if not cell.follow(start_s + command.time_from_start_s, q, qd, qdd):
-            self.get_logger().error(cell.motion.fault, throttle_duration_sec=LOG_EVERY_S)
-
     def _judge(self, message: Any) -> None:
         """A trajectory of the programme: the truth tells what would come of it.
 
@@ -120,7 +113,10 @@ class CellSimNode(HouseNode):
         cell = self._cell
         if cell is None:
             return
-        q, _, _ = in_joint_order(trajectory_command(message), cell.plan.arm)
+        names, given = cell.plan.arm.joint_names, trajectory_of(message, 0)
+        if sorted(given.names) != sorted(names):
+            raise InputError(f"a trajectory for {', '.join(given.names)}, not {', '.join(names)}")
+        q = given.q[:, [given.names.index(name) for name in names]]
         which, points = cell.plan.at_work(q)
         if len(which):
             self._out.commanded = which, q[points]
@@ -143,9 +139,13 @@ class CellSimNode(HouseNode):
             self._origin_ns = now_ns - cell_ns
         if self._step is not None and not cell.moving:
             self._drive(cell, self._step)
+        faults = cell.motion.faults
         came = cell.advance((now_ns - self._origin_ns) * 1e-9)
+        if cell.motion.faults > faults:
+            self.get_logger().error(cell.motion.fault)
         self._out.tell_truth(now_ns)
         self._out.tell(came, self._stamp_ns)
+        self._controller.tell_state(self._stamp_ns(cell.now_s))
 
     def _drive(self, cell: SimulatedCell, step: PlannedStep) -> None:
         self._step, self._refused = None, ""

@@ -22,7 +22,7 @@ from robocal_ros.nodes.cell_sim_messages import (
     profile,
     temperature,
 )
-from robocal_ros.nodes.conversions import header, transform_message
+from robocal_ros.nodes.conversions import NS, header, transform_message
 from robocal_ros.sessions.hand_eye_shots import PROFILE
 from robocal_ros.sim.beams import RoundTool
 from robocal_ros.sim.cell import SimulatedCell
@@ -73,13 +73,21 @@ class CellOutputs:
         """Tell the truth anew."""
         self._shown: RoundTool | None = None
         self._next_state_s = 0.0
+        self._reset_ns = 0  # when the robot's clock began anew, less a second
 
     def tell(self, came: Happened, stamp_ns: Callable[[float], int]) -> None:
         """Publish what came; ``stamp_ns`` of a time of the cell."""
-        settings = self._settings
-        names = list(self._cell.plan.arm.joint_names)
+        settings, faults = self._settings, self._cell.faults
+        names, odd = self._cell.plan.arm.joint_names, "odd_lengths" in faults
         for t, q, qd in zip(came.time_s.tolist(), came.q, came.qd, strict=True):
-            self._send("joint_states", joint_state(names, stamp_ns(t), q, qd))
+            at = stamp_ns(t)
+            if "clock_reset" in faults:
+                self._reset_ns = self._reset_ns or at - NS
+                at -= self._reset_ns
+            else:
+                self._reset_ns = 0
+            speed = qd if settings["velocities"] else None
+            self._send("joint_states", joint_state(names, at, q, speed, odd))
         station = station_name(settings["station"], self._cell.faults)
         for edge in came.edges:
             self._send("beam_events", beam_event(edge, stamp_ns(edge.time_s), station))

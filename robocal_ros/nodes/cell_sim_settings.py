@@ -1,7 +1,7 @@
 """Parameters of the simulated cell."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,11 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
-from robocal_ros.sim.cell_faults import FAULTS
+from robocal_ros.sim.cell_faults import CONTROLLER_FAULTS, FAULTS
 from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
+from robocal_ros.sim.joint_motion import LAG_S
 from robocal_ros.sim.kr150_cell import T_BASE_LASER, kr150_cell, poses
+from robocal_ros.sim.trajectory_goal import ControllerOptions
 from robocal_ros.storage.robots import load_description, load_robot
 
 Array = NDArray[np.float64]
@@ -63,6 +65,42 @@ SETTINGS = (
         high=1e5,
     ),
     Setting("rate_hz", 125.0, "Rate of joint_states", unit="Hz", low=1.0, high=1000.0),
+    Setting(
+        "velocities",
+        False,
+        "The robot reports velocities; false: they are NaN in joint_states and absent in "
+        "~/controller_state, as of hardware that has positions alone",
+    ),
+    Setting(
+        "limits",
+        False,
+        "Drives refuse a command that is more than 5 % faster than their greatest speed; nobody "
+        "behind a real controller does by default",
+    ),
+    Setting(
+        "lag_ms",
+        1e3 * LAG_S,
+        "By so much the drives are behind their command",
+        unit="ms",
+        low=0.0,
+        high=200.0,
+    ),
+    *(
+        Setting(name, getattr(ControllerOptions(), name), f"Of the controller: {what}")
+        for name, what in (
+            ("allow_partial_joints_goal", "take trajectories for some of the joints"),
+            ("allow_nonzero_velocity_at_trajectory_end", "take those that end in motion"),
+            ("interpolate_from_desired_state", "begin at the last command, not where the robot is"),
+        )
+    ),
+    *(
+        Setting(name, 0.0, f"Of the controller, of every joint: {what}", low=0.0, high=100.0)
+        for name, what in (
+            ("trajectory", "greatest error on the way, rad (sliding: m); 0: no check"),
+            ("goal", "greatest error at the end, rad (sliding: m); 0: no check"),
+            ("goal_time", "how long a goal may be out of that, s; 0: for ever"),
+        )
+    ),
     _mm("arm_error_mm", 0.0, "Scatter of the true arm's lengths; angles err as much at 1 m", 5.0),
     _mm("repeatability_mm", 0.03, "Scatter of a motion in each axis", 2.0),
     _mm("edge_noise_mm", 0.01, "Further scatter at each edge", 2.0),
@@ -142,7 +180,7 @@ SETTINGS = (
     Setting("run_program", False, "Drive each step that is announced on next_step"),
     Setting("flange_frame", "tool0", "Parent frame of ~/truth"),
     Setting("tool_frame", "true_tool", "Child frame of ~/truth"),
-    Setting("fault", "none", "What goes wrong", choices=FAULTS, live=True),
+    Setting("fault", "none", "What goes wrong", choices=(*FAULTS, *CONTROLLER_FAULTS), live=True),
     Setting(
         "fault_size",
         0.0,
@@ -213,6 +251,12 @@ def cell_plan(settings: Mapping[str, Any]) -> CellPlan:
         rate_hz=settings["rate_hz"],
         tool=bent_tool(settings, plan),
         ripple=settings["ripple"],
+        limits=settings["limits"],
+        lag_s=settings["lag_ms"] * MS,
+        controller=ControllerOptions(
+            velocity_states=settings["velocities"],
+            **{of.name: settings[of.name] for of in fields(ControllerOptions)[1:]},
+        ),
         seed=seed,
     )
 

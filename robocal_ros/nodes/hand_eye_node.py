@@ -28,9 +28,10 @@ from robocal_ros.nodes.hand_eye_files import HandEyeFiles
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.hand_eye_services import HandEyeServices
 from robocal_ros.nodes.hand_eye_settings import SETTINGS, session_config
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.stamp_watch import StampWatch
 from robocal_ros.sessions.decisions import named
 from robocal_ros.sessions.events import ACCEPT, CALIBRATE, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
@@ -71,6 +72,7 @@ class HandEyeNode(HouseNode):
         self._kind = hand_eye_kind(self._config.sensor_frame)
         self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
         self._guard = SourceGuard(self, JOINTS)
+        self._stamps = StampWatch(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, (message_type, profile) in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), profile)
@@ -127,6 +129,7 @@ class HandEyeNode(HouseNode):
             session = self._session
             if session is None:
                 return
+            self._stamps.note(kind, message)
             if kind == JOINTS and (fault := self._guard.fault_at(session.received[JOINTS])):
                 session.refuse(JOINTS, InputError(fault))
                 return
@@ -253,7 +256,7 @@ class HandEyeNode(HouseNode):
             if data is None
             else f"{data.kind}, {len(data.samples)} samples of {len(data.captures)} captures"
         )
-        values |= session.ignored.listed()
+        values |= session.ignored.listed() | self._stamps.judge(health)
         model = session.in_force.model
         taken = "" if model is None else self._conflict(model)
         for fault in (self._guard.fault, session.current.fault, taken):
@@ -261,7 +264,8 @@ class HandEyeNode(HouseNode):
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        warn_without_serial(health, self._serial_in_use)
+        if self._history is not None:
+            warn_of_history(health, self._history)
         health.values = values
         return health
 

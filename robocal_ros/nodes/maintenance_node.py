@@ -18,7 +18,7 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, Health
 from robocal_ros.nodes.endpoints import NotActiveError
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
 from robocal_ros.nodes.maintenance_inputs import require_robot, told_correction, told_drift
 from robocal_ros.nodes.maintenance_outputs import MaintenanceOutputs
@@ -244,7 +244,8 @@ class MaintenanceNode(HouseNode):
         for words in (self._guard.fault, self._sources.doubt(), status.trouble):
             if words:
                 health.worsen(ERROR, words)
-        warn_without_serial(health, self._serial_in_use)
+        if self._history is not None:
+            warn_of_history(health, self._history)
         return health
 
 

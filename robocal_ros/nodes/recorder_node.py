@@ -14,15 +14,16 @@ from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.nodes.recorded_topics import Recorded, RecordedTopics
 from robocal_ros.nodes.run import run
-from robocal_ros.storage.bag_recording import (
+from robocal_ros.storage.bag_recording import BagRecording
+from robocal_ros.storage.history_paths import state_folder
+from robocal_ros.storage.recording_folders import (
     MB,
-    BagRecording,
-    delete_oldest,
+    Maker,
     keep,
-    next_folder,
+    make_room,
+    new_folder,
     size_bytes,
 )
-from robocal_ros.storage.history_paths import state_folder
 
 LOOK_S = 0.5
 ROOM_S = 5.0
@@ -75,7 +76,8 @@ SETTINGS = (
     Setting("folder", "", "Where recordings are kept; empty: recordings/ in the state folder"),
     Setting("file_mb", 50.0, "A file is this large", unit="MB", low=0.1, high=10000.0),
     Setting("hours", 8.0, "A recording is no longer than this", unit="h", low=1e-3, high=168.0),
-    Setting("keep_mb", 20000.0, "All recordings together", unit="MB", low=1.0, high=1e7),
+    Setting("keep_mb", 20000.0, "All its recordings together", unit="MB", low=1.0, high=1e7),
+    Setting("free_mb", 500.0, "So much of the disk stays free", unit="MB", low=0.0, high=1e7),
     Setting("flush_s", 1.0, "A crash loses no more than this", unit="s", low=0.1, high=60.0),
 )
 
@@ -86,7 +88,7 @@ def utc() -> str:
 
 
 class RecorderNode(HouseNode):
-    """Writes one recording after another; the oldest are deleted."""
+    """Writes one recording after another; the oldest of its own are deleted."""
 
     NAME = "recorder_node"
     SETTINGS = SETTINGS
@@ -96,11 +98,14 @@ class RecorderNode(HouseNode):
         self._recording: BagRecording | None = None
         self._topics: RecordedTopics | None = None
         self._fault = ""
+        self._no_room = ""  # why nothing may be recorded now
+        self._left: dict[str, str] = {}  # what looks like a recording and is left alone, and why
 
     def configure(self) -> None:
         """Find the folder; nothing is recorded before activation."""
         given = self.settings["folder"]
         self._folder = Path(given) if given else state_folder() / "recordings"
+        self._maker = Maker(self.get_fully_qualified_name(), self.settings["serial"])
         self.add_service(Trigger, "~/keep", self._keep)
         self.add_service(Trigger, "~/split", self._split)
         self.add_timer(LOOK_S, self._look, steady=True)
@@ -111,6 +116,8 @@ class RecorderNode(HouseNode):
         """Begin a recording."""
         self._fault, self._lost, self._lost_since, self._deleted = "", 0, "", 0
         self._again_s: float | None = None  # when a recording that broke off is begun again
+        self._no_room, self._left = "", {}
+        self._make_room()
         self._topics = RecordedTopics(self, self.settings["topics"], self._take)
         self._topics.look()
 
@@ -137,9 +144,11 @@ class RecorderNode(HouseNode):
     def _begin(self) -> BagRecording:
         if self._again_s is not None:
             raise StorageError(self._fault)
+        if self._no_room:
+            raise StorageError(self._no_room)
         latched = set() if self._topics is None else self._topics.latched
         self._recording = BagRecording(
-            next_folder(self._folder),
+            new_folder(self._folder, self._maker),
             latched=latched,
             file_bytes=round(self.settings["file_mb"] * MB),
         )
@@ -170,14 +179,34 @@ class RecorderNode(HouseNode):
 
     def _make_room(self) -> None:
         recording, most = self._recording, round(self.settings["keep_mb"] * MB)
+        least_free = round(self.settings["free_mb"] * MB)
         try:
             if recording is not None and size_bytes(recording.folder) >= most // SHARES:
                 self._next()
-            self._deleted += len(delete_oldest(self._folder, most))
-        except FileNotFoundError:  # another recorder of this folder was faster
-            return
+            room = make_room(self._folder, self._maker, most, least_free)
         except OSError as error:
-            self.get_logger().error(f"no room is made: {error}")
+            self._tell_left(self._left | {str(self._folder): str(error)})
+            return
+        self._deleted += len(room.deleted)
+        self._tell_left(room.left)
+        was, self._no_room = self._no_room, ""
+        if room.short_bytes:
+            free_mb = self.settings["free_mb"] - room.short_bytes / MB
+            self._no_room = (
+                f"{free_mb:.0f} MB are free on the disk of {self._folder}, free_mb is "
+                f"{self.settings['free_mb']:g}, and no recording is left to delete: nothing is "
+                "recorded until there is room"
+            )
+            self._complete()
+            if not was:
+                self.get_logger().error(self._no_room)
+
+    def _tell_left(self, left: dict[str, str]) -> None:
+        """What is left alone, once in the log."""
+        for name, why in left.items():
+            if self._left.get(name) != why:
+                self.get_logger().warning(f"{name} in {self._folder} is left alone: it {why}")
+        self._left = left
 
     def _next(self) -> None:
         """Begin another recording, which opens with all that is in force."""
@@ -225,8 +254,9 @@ class RecorderNode(HouseNode):
         health, topics, recording = Health(), self._topics, self._recording
         if self._lost:
             health.worsen(WARN, f"{self._lost} messages since {self._lost_since} are not recorded")
-        if self._fault:
-            health.worsen(ERROR, self._fault)
+        for fault in dict.fromkeys((self._fault, self._no_room)):
+            if fault:
+                health.worsen(ERROR, fault)
         if topics is None:
             return health
         if topics.unknown:
@@ -242,6 +272,7 @@ class RecorderNode(HouseNode):
             "messages": 0 if recording is None else recording.messages,
             "not there": ", ".join(topics.missing),
             "recordings deleted": self._deleted,
+            "left alone": "; ".join(f"{name} {why}" for name, why in self._left.items()),
             "messages not recorded": self._lost,
         }
         return health

@@ -19,9 +19,10 @@ from robocal_ros.nodes.base import POLL_S, HouseNode
 from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.stamp_watch import StampWatch
 from robocal_ros.nodes.tcf_motion import TcfMotion
 from robocal_ros.nodes.tcf_outputs import TcfOutputs
 from robocal_ros.nodes.tcf_services import Runner, TcfServices
@@ -41,7 +42,7 @@ from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import configuration
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.laser_files import read_laser_for
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_robot, robot_file_hash
 
 COMMAND_S = 1.0
 WATCH_S = 0.02
@@ -73,8 +74,15 @@ class TcfNode(HouseNode):
         self._config = session_config(settings, placed.laser, placed.station, taught)
         self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
         frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]
-        self._outputs = TcfOutputs(self.add_output, self._nominal, self._serial_in_use, frames)
+        self._outputs = TcfOutputs(
+            self.add_output,
+            self._nominal,
+            self._serial_in_use,
+            robot_file_hash(settings["robot"]),
+            frames,
+        )
         self._guard = SourceGuard(self, JOINTS)
+        self._stamps = StampWatch(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, (message_type, profile) in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), profile)
@@ -136,6 +144,7 @@ class TcfNode(HouseNode):
             session = self._session
             if session is None:
                 return
+            self._stamps.note(kind, message)
             if kind == JOINTS:
                 if fault := self._guard.fault_at(session.received[JOINTS]):
                     session.ignored.add(JOINTS, fault)
@@ -266,13 +275,13 @@ class TcfNode(HouseNode):
         if self._motion is not None:
             values["motion"] = self._motion.words()
         values["last run"] = "none" if self._last is None else self._last.message
-        values |= session.ignored.listed()
+        values |= session.ignored.listed() | self._stamps.judge(health)
         for fault in (self._guard.fault, session.current.fault):
             if fault:
                 health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
-        warn_without_serial(health, self._serial_in_use)
+        warn_of_history(health, history)
         health.values = values
         return health
 

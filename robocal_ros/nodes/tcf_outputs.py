@@ -39,11 +39,12 @@ class TcfOutputs:
         add: AddOutput,
         nominal: SerialArm,
         serial: str,
+        robot_file_hash: str,
         frames: tuple[str, str, str],
     ) -> None:
         self._base, flange, tool = frames
         self._nominal, self._serial = nominal, serial
-        self._messages = ToolMessages(nominal, serial, flange, tool)
+        self._messages = ToolMessages(nominal, serial, robot_file_hash, flange, tool)
         self._step = add(ToolStep, "~/next_step", qos.LATCHED)
         self._candidate = add(ToolFrame, "~/candidate", qos.LATCHED)
         self._tool = add(ToolFrame, "~/tool", qos.LATCHED)

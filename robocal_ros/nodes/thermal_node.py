@@ -19,10 +19,11 @@ from robocal_ros.nodes.command_desk import CommandDesk
 from robocal_ros.nodes.data_clock import DataClock
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
-from robocal_ros.nodes.history_settings import open_history, warn_without_serial
+from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.set_up_services import SetUpServices
 from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.nodes.stamp_watch import StampWatch
 from robocal_ros.nodes.thermal_outputs import ThermalOutputs
 from robocal_ros.nodes.thermal_services import ThermalServices
 from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
@@ -34,7 +35,7 @@ from robocal_ros.sessions.setting_up import SENSOR
 from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_robot, robot_file_hash
 
 Array = NDArray[np.float64]
 
@@ -70,10 +71,15 @@ class ThermalNode(HouseNode):
         self._config = session_config(settings, self._nominal)
         self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
         self._outputs = ThermalOutputs(
-            self.add_output, self._nominal, self._serial_in_use, settings["base_frame"]
+            self.add_output,
+            self._nominal,
+            self._serial_in_use,
+            robot_file_hash(settings["robot"]),
+            settings["base_frame"],
         )
         self._data_clock = DataClock()
         self._guard = SourceGuard(self, JOINTS)
+        self._stamps = StampWatch(self, JOINTS)
         self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
         for kind, message_type in INPUTS.items():
             self.add_input(message_type, kind, self._taker(kind), qos.STREAM)
@@ -113,6 +119,7 @@ class ThermalNode(HouseNode):
             session = self._session
             if session is None:
                 return
+            self._stamps.note(kind, message)
             desk = session.desk
             if kind == JOINTS and (fault := self._guard.fault_at(desk.received[JOINTS])):
                 desk.ignored.add(JOINTS, fault)
@@ -213,17 +220,15 @@ class ThermalNode(HouseNode):
         named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
         values["cycle"] = f"{named}{visited} of {poses} poses measured"
         values["joint gaps"] = session.desk.stream.gap_count
-        values |= session.desk.ignored.listed()
+        values |= session.desk.ignored.listed() | self._stamps.judge(health)
         if self._guard.fault:
             health.worsen(ERROR, self._guard.fault)
         if session.fault:
             health.worsen(ERROR, session.fault)
-        if history.damaged is not None:
-            health.worsen(WARN, f"a damaged history was set aside as {history.damaged}")
         lost = [topic for topic, count in self.inputs.items() if count.lost]
         if lost:
             health.worsen(WARN, f"messages lost on {', '.join(lost)}")
-        warn_without_serial(health, self._serial_in_use)
+        warn_of_history(health, history)
         health.values = values
         return health
 

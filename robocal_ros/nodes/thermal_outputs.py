@@ -25,11 +25,19 @@ class ThermalOutputs:
     Parameters
     ----------
     add : creates a publisher.
-    serial, base_frame : as messages carry them.
+    serial, robot_file_hash, base_frame : as messages carry them.
     """
 
-    def __init__(self, add: AddOutput, nominal: SerialArm, serial: str, base_frame: str) -> None:
+    def __init__(
+        self,
+        add: AddOutput,
+        nominal: SerialArm,
+        serial: str,
+        robot_file_hash: str,
+        base_frame: str,
+    ) -> None:
         self._nominal, self._serial, self._base_frame = nominal, serial, base_frame
+        self._robot_file_hash = robot_file_hash
         self._candidate = add(KinematicModel, "~/candidate", qos.LATCHED)
         self._model = add(KinematicModel, "~/model", qos.LATCHED)
         self._quality = add(CalibrationQuality, "~/quality", qos.LATCHED)
@@ -83,6 +91,7 @@ class ThermalOutputs:
             model,
             serial=self._serial,
             model_hash=self._nominal.model_hash,
+            robot_file_hash=self._robot_file_hash,
             revision=revision,
             state=state,
             stamp=conversions.header(stamp_ns, self._base_frame),

@@ -64,8 +64,11 @@ class ToolMessages:
     flange, tool : names of the frames.
     """
 
-    def __init__(self, nominal: SerialArm, serial: str, flange: str, tool: str) -> None:
+    def __init__(
+        self, nominal: SerialArm, serial: str, robot_file_hash: str, flange: str, tool: str
+    ) -> None:
         self._nominal, self._serial = nominal, serial
+        self._robot_file_hash = robot_file_hash
         self._flange, self._tool = flange, tool
 
     def frame(
@@ -79,6 +82,7 @@ class ToolMessages:
             robot=self._nominal.name,
             serial=self._serial,
             model_hash=self._nominal.model_hash,
+            robot_file_hash=self._robot_file_hash,
             revision=revision,
             thermal_revision=thermal_revision,
             tool=transform_message(known.T_flange_tool),

@@ -6,7 +6,7 @@ used, so that a mistake there cannot hide.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -267,3 +267,16 @@ def bent(T_flange_tool: Array, shift: ArrayLike, tilt_rad: ArrayLike) -> Array:
     """A tool pose (4, 4) shifted (3,), m, and tilted by a rotation vector (3,), flange axes."""
     R = frames.exp_rotation(tilt_rad) @ T_flange_tool[:3, :3]
     return frames.transform(R, T_flange_tool[:3, 3] + np.asarray(shift))
+
+
+def on_one_clock(station: BeamStation, phase: float) -> BeamStation:
+    """The station whose input is sampled on one clock, ``phase`` of a period late.
+
+    The scatter of its motions is left to the robot.
+    """
+    source = station.input
+    return replace(
+        station,
+        input=replace(source, first_sample_s=source.sample_period_s * phase),
+        noise=TrueNoise(0.0, station.noise.edge_m),
+    )

@@ -6,7 +6,6 @@ each time it moves after a rest. Every random number belongs to its place in tim
 not matter when the cell is asked, and what is switched on or off leaves all else alone.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -18,31 +17,32 @@ from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.sim.beam_moves import Circle, Plunge
 from robocal_ros.sim.beam_program import program
 from robocal_ros.sim.beam_watch import BeamWatch
-from robocal_ros.sim.beams import BeamStation, RoundTool, TrueNoise
+from robocal_ros.sim.beams import RoundTool, on_one_clock
 from robocal_ros.sim.cell_faults import (
     LASTING,
     NEXT_MOTION,
-    Fault,
+    AnyFault,
     Faults,
     FaultyInput,
     size_of,
 )
 from robocal_ros.sim.cell_outputs import Happened, Outbox
 from robocal_ros.sim.cell_plan import CellPlan
+from robocal_ros.sim.command_gate import CommandGate
 from robocal_ros.sim.draws import Draws, Stream
 from robocal_ros.sim.heating import Heating
-from robocal_ros.sim.joint_motion import JointMotion
+from robocal_ros.sim.joint_motion import ROOM, JointMotion
 from robocal_ros.sim.joint_readings import JointReadings
 from robocal_ros.sim.profile_station import ProfileStation
 from robocal_ros.sim.scatter import Scatter
 from robocal_ros.sim.sphere_station import SphereStation
-from robocal_ros.sim.standing import Standing
+from robocal_ros.sim.standing import TICK_S, Standing, standstills
 from robocal_ros.sim.thermal import Warmth
+from robocal_ros.sim.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-TICK_S = 8e-3  # the cell works in whole ticks, so that it does not matter when it is asked
 BEAT = 125  # ticks in which warmth is taken as constant: a second
 STILL = 1e-9  # a joint that goes less in a tick stands, rad (prismatic: m)
 
@@ -52,7 +52,7 @@ class SimulatedCell:
 
     Attributes
     ----------
-    motion : of the joints.
+    motion : of the joints; ``gate``: what passes commands on to it, and its speed scaling.
     next_tool : mounted when the next motion begins: how a tool gets bent.
     faults : what is wrong now.
     heating : None where the robot stays cold.
@@ -61,17 +61,25 @@ class SimulatedCell:
     def __init__(self, plan: CellPlan) -> None:
         self.plan = plan
         self._mounted = self.next_tool = plan.tool
-        self.motion = JointMotion(plan.q_start, plan.fastest)
+        self.motion = JointMotion(
+            plan.q_start,
+            plan.fastest,
+            names=plan.arm.joint_names,
+            options=plan.controller,
+            limits=plan.limits,
+            lag_s=plan.lag_s,
+        )
         self.faults = Faults()
-        self._waiting: tuple[Fault, float] | None = None
+        self._waiting: tuple[AnyFault, float] | None = None
         self._draws = Draws(plan.seed)
+        self.gate = CommandGate(self.motion, self.faults, self._draws, self._begin)
         self.heating = Heating(plan.heat, self._draws) if plan.heat else None
         self._readings = JointReadings(
             plan.rate_hz, plan.reading_noise_rad, self.faults, self._draws, plan.arm.n
         )
         self._input = FaultyInput(self.faults)
         self._watch = BeamWatch(plan.arm, self._draws)
-        self._station = _on_one_clock(plan.station, self._draws)
+        self._station = on_one_clock(plan.station, self._draws.of(Stream.STATION).random())
         self._standing = Standing()
         self._scatter = Scatter(3 + plan.arm.n)
         self._hand, self._drawn = np.zeros(3), np.zeros(3 + plan.arm.n)
@@ -103,12 +111,13 @@ class SimulatedCell:
 
     # ---- what is told to it ---------------------------------------------------------------------
 
-    def set_fault(self, fault: Fault, size: float = 0.0) -> None:
+    def set_fault(self, fault: AnyFault, size: float = 0.0) -> None:
         """Let something go wrong, in place of what went wrong before; "none" ends all at once.
 
         What `NEXT_MOTION` names begins with the next motion, all else now; what `LASTING` names
         stays until "none". ``size`` in the unit that `SIZES` gives; 0: the usual one.
         """
+        self.gate.fault_began(self.now_s)
         if fault == "none":
             self._waiting = None
             self.faults.sizes.clear()
@@ -124,21 +133,19 @@ class SimulatedCell:
         q: ArrayLike,
         qd: ArrayLike | None = None,
         qdd: ArrayLike | None = None,
-    ) -> bool:
-        """Follow a trajectory at once, see `JointMotion.follow`; times as of `now_s`.
+    ) -> None:
+        """Follow a trajectory at once, see `JointMotion.follow`; times of the cell.
 
         Raises
         ------
         InputError
-            When it cannot be followed.
+            When the controller rejects it; what runs goes on.
         """
-        if not self.motion.follow(self.now_s, time_s, q, qd, qdd):
-            return False
-        self._begin()
-        return True
+        names = self.plan.arm.joint_names
+        self.gate.take(Trajectory.of(names, time_s, q, qd, qdd, start_s=0.0), self.now_s)
 
     def hold(self) -> None:
-        """Stand still at once."""
+        """Stand still at once: the controller is inactive."""
         self.motion.hold(self.now_s)
 
     def drive(self, step: PlannedStep) -> Circle | Plunge:
@@ -152,8 +159,13 @@ class SimulatedCell:
         q_now = self.motion.at([self.now_s])[0][0]
         phase = 2.0 * np.pi * self._draws.of(Stream.RIPPLE, self._motions).random()
         time, q, qd, move = program(self.plan.arm, step, q_now, self.plan.ripple, phase)
-        if not self.follow(self.now_s + time, q, qd):
-            raise LimitError(f"the robot cannot drive step {step.name}: {self.motion.fault}")
+        share = float(np.max(np.abs(qd) / self.plan.fastest))
+        if self.plan.limits and share > 1.0 + ROOM:
+            raise LimitError(
+                f"the robot cannot drive step {step.name}: a joint would go at {share:.3g} times "
+                "its drive's greatest speed"
+            )
+        self.follow(self.now_s + time, q, qd)
         return replace(move, start_s=self.now_s + move.start_s)
 
     # ---- time -----------------------------------------------------------------------------------
@@ -164,16 +176,21 @@ class SimulatedCell:
         Without ``readings`` no joints are read: a long stretch of work takes less time.
         """
         last = int(np.floor(to_s / TICK_S * (1.0 + 1e-12)))
+        read = [self._read(readings)]
         while self._ticks < last:
             self._pass(min(last, (self._ticks // BEAT + 1) * BEAT))
-        number = self._readings.due(self.now_s)
-        joints = self._readings.read(number if readings else number[:0], self.motion)
+            read.append(self._read(readings))
+        joints = [np.concatenate(parts) for parts in zip(*read, strict=True)]
         return self._out.told(self.now_s, *joints)
+
+    def _read(self, readings: bool) -> tuple[Array, Array, Array]:
+        number = self._readings.due(self.now_s)
+        return self._readings.read(number if readings else number[:0], self.motion)
 
     def flange(self, time_s: Array) -> Array:
         """True T_base_flange (m, 4, 4) at times (m,), the robot as warm as it is now."""
         off = self._scatter.at(time_s)
-        T = self.plan.robot.flange(self._joints(time_s) + off[:, 3:], self.warmth)
+        T = self.plan.robot.flange(self.motion.joints(time_s) + off[:, 3:], self.warmth)
         T[:, :3, 3] += off[:, :3]
         return T
 
@@ -194,14 +211,13 @@ class SimulatedCell:
         p = plan.arm.T_flange_tool[:3, 3]
         return plan.robot.point(plan.working, Warmth.cold(plan.arm.n), p)
 
-    def _joints(self, time_s: Array) -> Array:
-        return self.motion.joints(time_s)
-
     def _pass(self, stop: int) -> None:
         """From tick to tick, at most to the next beat."""
+        until_s = self.gate.pass_time(self.now_s, stop * TICK_S)
+        stop = min(stop, max(self._ticks + 1, int(np.ceil(until_s / TICK_S * (1.0 - 1e-12)))))
         ticks = np.arange(self._ticks, stop + 1)
         time, now = np.asarray(ticks * TICK_S), self._ticks
-        q = self._joints(time)
+        q = self.motion.joints(time)
         way = np.abs(np.diff(q, axis=0))
         departed, stood = self._standing.look(now, np.max(way, axis=1) > STILL)
         for tick in departed.tolist():
@@ -222,7 +238,9 @@ class SimulatedCell:
 
     def _see_edges(self, ticks: Index, time_s: Array, q: Array) -> None:
         station = self.faults.station(self._station)
-        found = self._watch.edges(station, self.tool, ticks, time_s, q, self._joints, self.flange)
+        found = self._watch.edges(
+            station, self.tool, ticks, time_s, q, self.motion.joints, self.flange
+        )
         lost = self.faults.size("lost_messages")
         for edge in self._input.passed(found):
             place = round(edge.time_s * 1e9)
@@ -231,7 +249,8 @@ class SimulatedCell:
 
     def _see_sphere(self, sphere: SphereStation, ticks: Index, q: Array, stood: Index) -> None:
         """Measure the ball where the robot has ``stood`` still for so many ticks."""
-        for tick, T in self._standstills(sphere, ticks, q, stood):
+        for tick in standstills(sphere, self.plan.arm, ticks, q, stood):
+            T = self.flange(np.array([tick * TICK_S]))[0]
             if sphere.sees(T):
                 rise = float(self.warmth.link[-1])
                 shot = sphere.shoot(T, rise, tick, tick * TICK_S, self.faults, self._draws)
@@ -240,20 +259,11 @@ class SimulatedCell:
 
     def _see_profile(self, profile: ProfileStation, ticks: Index, q: Array, stood: Index) -> None:
         """Look at the target with the robot's own sensor."""
-        for tick, T in self._standstills(profile, ticks, q, stood):
+        for tick in standstills(profile, self.plan.arm, ticks, q, stood):
+            T = self.flange(np.array([tick * TICK_S]))[0]
             shot = profile.shoot(T, tick, tick * TICK_S, self._draws)
             if shot is not None:
                 self._out.profiles.append(shot)
-
-    def _standstills(
-        self, station: SphereStation | ProfileStation, ticks: Index, q: Array, stood: Index
-    ) -> Iterator[tuple[int, Array]]:
-        """Ticks at which a station near the robot measures, and true flange poses (4, 4) there."""
-        settle, period = round(station.settle_s / TICK_S), round(station.period_s / TICK_S)
-        for i in np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0)):
-            if station.near(self.plan.arm.fk(q[i])):
-                tick = int(ticks[i])
-                yield tick, self.flange(np.array([tick * TICK_S]))[0]
 
     # ---- what changes ---------------------------------------------------------------------------
 
@@ -282,18 +292,8 @@ class SimulatedCell:
     def _offset(self) -> Array:
         return np.append(self._drawn[:3] + self._hand, self._drawn[3:])
 
-    def _replace_fault(self, fault: Fault, size: float) -> None:
+    def _replace_fault(self, fault: AnyFault, size: float) -> None:
         sizes = self.faults.sizes
         for other in [name for name in sizes if name not in LASTING]:
             del sizes[other]
         sizes[fault] = size
-
-
-def _on_one_clock(station: BeamStation, draws: Draws) -> BeamStation:
-    """The station whose input is sampled on one clock; the scatter of motions is the robot's."""
-    source, phase = station.input, draws.of(Stream.STATION).random()
-    return replace(
-        station,
-        input=replace(source, first_sample_s=source.sample_period_s * phase),
-        noise=TrueNoise(0.0, station.noise.edge_m),
-    )

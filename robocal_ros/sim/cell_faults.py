@@ -38,9 +38,22 @@ Fault = Literal[
     "swapped_temperatures",
     "moved_by_hand",
 ]
+ControllerFault = Literal[
+    "commands_lost",
+    "commands_lossy",
+    "commands_late",
+    "commands_rejected",
+    "protective_stop",
+    "speed_scaling",
+    "odd_lengths",
+    "clock_reset",
+]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
+CONTROLLER_FAULTS: tuple[ControllerFault, ...] = get_args(ControllerFault)
+"""Of the way to the controller, of its speed and of what it reports; none of what is measured."""
+AnyFault = Fault | ControllerFault
 
-SIZES: Mapping[Fault, tuple[float, float, str]] = {
+SIZES: Mapping[AnyFault, tuple[float, float, str]] = {
     "collision": (2.0, 1e-3, "mm"),
     "wrong_tool": (10.0, 1e-3, "mm"),
     "sensor_knocked": (1.0, 1e-3, "mm"),
@@ -52,10 +65,15 @@ SIZES: Mapping[Fault, tuple[float, float, str]] = {
     "sensor_clock_jump": (1.0, 1.0, "s"),
     "frozen_encoder": (3.0, 1.0, ""),
     "moved_by_hand": (1.0, 1e-3, "mm"),
+    "commands_lost": (1.0, 1.0, ""),
+    "commands_lossy": (0.01, 1.0, ""),
+    "commands_late": (200.0, 1e-3, "ms"),
+    "protective_stop": (10.0, 1.0, "s"),
+    "speed_scaling": (50.0, 1e-2, "%"),
 }
 """Faults that have a size: the usual one, the factor of its unit, and this unit."""
 
-NEXT_MOTION: frozenset[Fault] = frozenset(
+NEXT_MOTION: frozenset[AnyFault] = frozenset(
     {
         "beam_x_dead",
         "beam_y_dead",
@@ -71,7 +89,7 @@ NEXT_MOTION: frozenset[Fault] = frozenset(
 )
 """Faults that begin with the robot's next motion; the others begin at once."""
 
-LASTING: frozenset[Fault] = frozenset(
+LASTING: frozenset[AnyFault] = frozenset(
     {"collision", "wrong_tool", "sensor_knocked", "sphere_knocked"}
 )
 """What was moved or mounted stays so while other faults come and go."""
@@ -90,7 +108,7 @@ CHATTER_S = 3e-4
 AGAIN_S = 5e-3  # a double edge comes so much later
 
 
-def size_of(fault: Fault, size: float = 0.0) -> float:
+def size_of(fault: AnyFault, size: float = 0.0) -> float:
     """A fault's size in SI from one in its own unit; 0: the usual one."""
     usual, unit, _ = SIZES.get(fault, (0.0, 1.0, ""))
     return (size or usual) * unit
@@ -100,12 +118,12 @@ def size_of(fault: Fault, size: float = 0.0) -> float:
 class Faults:
     """What is wrong now: size, in SI, of each fault in force."""
 
-    sizes: dict[Fault, float] = field(default_factory=dict)
+    sizes: dict[AnyFault, float] = field(default_factory=dict)
 
-    def __contains__(self, fault: Fault) -> bool:
+    def __contains__(self, fault: AnyFault) -> bool:
         return fault in self.sizes
 
-    def size(self, fault: Fault) -> float:
+    def size(self, fault: AnyFault) -> float:
         """Size of a fault, 0 where it is not in force."""
         return self.sizes.get(fault, 0.0)
 

@@ -10,10 +10,12 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sim.beam_calibration import laser_points
 from robocal_ros.sim.beams import BeamStation, RoundTool
 from robocal_ros.sim.heating import HeatPlan
+from robocal_ros.sim.joint_motion import LAG_S
 from robocal_ros.sim.profile_station import ProfileStation
 from robocal_ros.sim.robot import Body, Effects, TrueRobot
 from robocal_ros.sim.sphere_station import SphereStation
 from robocal_ros.sim.thermal import Warmth
+from robocal_ros.sim.trajectory_goal import ControllerOptions
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -32,6 +34,8 @@ class CellPlan:
     tool : as it is mounted at the begin.
     q_start : (n,) where the robot stands then.
     fastest : (n,) or one for all: greatest speeds of its drives, rad/s (prismatic: m/s).
+    limits, lag_s : whether its drives refuse what is faster; their lag: see `JointMotion`.
+    controller : parameters of its trajectory controller.
     rate_hz, reading_noise_rad : of the joint readings; without noise they are exact.
     ripple : relative, of the speed of circles that the robot's program drives.
     heat : what warms it up; None: it stays cold.
@@ -45,6 +49,9 @@ class CellPlan:
     tool: RoundTool
     q_start: Array
     fastest: ArrayLike = np.inf
+    limits: bool = False
+    lag_s: float = LAG_S
+    controller: ControllerOptions = field(default_factory=ControllerOptions)
     rate_hz: float = 125.0
     reading_noise_rad: float = 0.0
     ripple: float = 0.02

@@ -19,6 +19,7 @@ class Stream(IntEnum):
     LOST_EDGES = 8
     TEMPERATURES = 9
     PROFILES = 10
+    LOST_COMMANDS = 11
 
 
 class Draws:

@@ -77,6 +77,7 @@ def kr150_cell(
         tool=RoundTool.cylinder(TAUGHT, PIN_RADIUS_M),
         q_start=poses("home")[0],
         fastest=kr150.FASTEST_RAD_S,
+        limits=True,
         reading_noise_rad=JITTER_RAD if robot.effects.noise else 0.0,
         heat=HeatPlan(kr150.WARM_UP, PROGRAMME_RAD_S / DUTY),
         sphere=SphereStation(kr150.sphere_sensor(effects), FLOOR, points=points),

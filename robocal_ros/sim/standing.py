@@ -3,8 +3,14 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.sim.profile_station import ProfileStation
+from robocal_ros.sim.sphere_station import SphereStation
+
+Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+TICK_S = 8e-3  # the cell works in whole ticks, so that it does not matter when it is asked
 FEWEST = 4  # ticks: a shorter stop, as where a plunge turns, is no rest
 
 
@@ -24,3 +30,15 @@ class Standing:
         before = np.append(self._moved, last[:-1])
         self._moved = int(last[-1])
         return ticks[moved & (ticks - 1 - before >= FEWEST)] - 1, ticks - last
+
+
+def standstills(
+    station: SphereStation | ProfileStation, arm: SerialArm, ticks: Index, q: Array, stood: Index
+) -> list[int]:
+    """Ticks at which a station near the robot measures: it has ``stood`` (k,) for so many ticks.
+
+    ``q`` (k, n) joints at ``ticks`` (k,).
+    """
+    settle, period = round(station.settle_s / TICK_S), round(station.period_s / TICK_S)
+    due = np.flatnonzero((stood >= settle) & ((stood - settle) % period == 0))
+    return [int(ticks[i]) for i in due if station.near(arm.fk(q[i]))]

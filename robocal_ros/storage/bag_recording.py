@@ -1,15 +1,11 @@
-"""A recording that grows: a folder of MCAP files as ``ros2 bag`` makes it, and how many are kept.
+"""A recording that grows: a folder of MCAP files as ``ros2 bag`` makes it.
 
 Each file has an index once it is full; of one that a crash left behind, `BagReader` reads
 everything up to the last flush.
 """
 
-import fcntl
-import shutil
-import time
 from collections.abc import Collection
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,11 +14,7 @@ import yaml
 from robocal_ros.core.errors import InputError, StorageError
 from robocal_ros.storage.bag_writer import BagWriter, offered_qos
 from robocal_ros.storage.files import write_text
-
-PREFIX = "robocal_"
-KEEP = "KEEP"  # a file of this name in a recording's folder: it is never deleted
-OPEN = "OPEN"  # of this name, locked by the process that writes it; gone with its end
-MB = 1_000_000
+from robocal_ros.storage.recording_folders import OPEN, hold_open
 
 
 class BagRecording:
@@ -33,7 +25,7 @@ class BagRecording:
 
     Parameters
     ----------
-    folder : made where it is not there; see `next_folder`.
+    folder : made where it is not there; see `recording_folders.new_folder`.
     latched : topics that are published latched; may grow.
     file_bytes : size of a file.
 
@@ -51,8 +43,7 @@ class BagRecording:
         self._writer: BagWriter | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._open = (folder / OPEN).open("w", encoding="utf-8")
-            fcntl.flock(self._open, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._open = hold_open(folder)
         except OSError as error:
             raise StorageError(f"{folder}: cannot be made: {error.strerror or error}") from error
 
@@ -183,85 +174,3 @@ def _times(start_ns: int, end_ns: int) -> dict[str, dict[str, int]]:
         "duration": {"nanoseconds": end_ns - start_ns},
         "starting_time": {"nanoseconds_since_epoch": start_ns},
     }
-
-
-def next_folder(parent: Path, wall_ns: int | None = None) -> Path:
-    """Make the folder for a recording that begins now: named by UTC, nobody else's.
-
-    Raises
-    ------
-    StorageError
-        When it cannot be made.
-    """
-    wall_ns = time.time_ns() if wall_ns is None else wall_ns
-    stamp = datetime.fromtimestamp(wall_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H-%M-%SZ")
-    folder, number = parent / f"{PREFIX}{stamp}", 1
-    while True:
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            number += 1
-            folder = parent / f"{PREFIX}{stamp}_{number}"
-        except OSError as error:
-            raise StorageError(f"{folder}: cannot be made: {error.strerror or error}") from error
-        else:
-            return folder
-
-
-def recordings(parent: Path) -> list[Path]:
-    """Folders of recordings, the oldest first."""
-    found = [path for path in parent.glob(f"{PREFIX}*") if path.is_dir()]
-    return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
-
-
-def size_bytes(folder: Path) -> int:
-    """What a recording takes."""
-    return sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-
-
-def delete_oldest(parent: Path, most_bytes: int) -> list[Path]:
-    """Delete whole recordings, the oldest first, until the rest fits; those that were deleted.
-
-    Recordings that a process writes, and those that are marked by `keep`, stay.
-
-    Raises
-    ------
-    OSError
-        When one cannot be deleted; FileNotFoundError where another process deletes here now.
-    """
-    sizes = {folder: size_bytes(folder) for folder in recordings(parent)}
-    left, deleted = sum(sizes.values()), []
-    for folder, size in sizes.items():
-        if left <= most_bytes:
-            break
-        if (folder / KEEP).exists() or _is_open(folder):
-            continue
-        shutil.rmtree(folder)
-        deleted.append(folder)
-        left -= size
-    return deleted
-
-
-def _is_open(folder: Path) -> bool:
-    """Whether a process writes it; one that a crash left behind is not."""
-    try:
-        with (folder / OPEN).open("r+", encoding="utf-8") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except BlockingIOError:
-        return True
-    return False
-
-
-def keep(folder: Path, why: str) -> None:
-    """Mark a recording: it is never deleted.
-
-    Raises
-    ------
-    InputError
-        When it cannot be marked.
-    """
-    if not folder.is_dir():
-        raise InputError("no such recording", file=str(folder))
-    write_text(folder / KEEP, f"{why}\n")

@@ -1,10 +1,12 @@
 """The SQLite file behind a calibration history: place, schema, locks, damage.
 
 A damaged file is never repaired and never deleted: it is set aside under another name. That is
-done only while no other process has the file open, so that two of them cannot go on with two
-different histories; a lock file beside it (shared while open, exclusive to set aside) sees to it.
+done only by an owner (see `history_damage`), and only while no other process has the file open, so
+that two of them cannot go on with two different histories; a lock file beside it (shared while
+open, exclusive to set aside) sees to it.
 """
 
+import errno
 import fcntl
 import os
 import sqlite3
@@ -15,6 +17,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from robocal_ros.core.errors import StorageError, WrongRobotError
+from robocal_ros.storage.history_damage import set_aside
 from robocal_ros.storage.history_schema import (
     APPLICATION_ID,
     MIGRATIONS,
@@ -22,7 +25,6 @@ from robocal_ros.storage.history_schema import (
     DamagedError,
 )
 
-COMPANIONS = ("", "-wal", "-shm")
 _FULL_CHECK_BYTES = 2_000_000
 _NOT_READABLE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -42,6 +44,8 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 def _advice(error: sqlite3.Error | OSError) -> str:
     base = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    if isinstance(error, OSError) and error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
+        return f"{error}: the disk knows no locks (NFS?), keep histories on a local one"
     advice = {
         sqlite3.SQLITE_BUSY: "another process holds it; nothing was changed, try again",
         sqlite3.SQLITE_FULL: "the disk is full; nothing was changed, free some space",
@@ -80,8 +84,8 @@ class HistoryFile:
     created : whether this opening made a new, empty history.
     """
 
-    def __init__(self, path: Path, serial: str, timeout_s: float) -> None:
-        self.path = path
+    def __init__(self, path: Path, serial: str, timeout_s: float, *, owner: bool) -> None:
+        self.path, self._owner = path, owner
         self.damaged: Path | None = None
         self.created = False
         self._serial = serial
@@ -153,8 +157,13 @@ class HistoryFile:
         """Make the file, alone; what is there and damaged is set aside."""
         try:  # another process may have made it or set it aside meanwhile
             self._connect(verify)
-        except DamagedError:
-            self._set_aside()
+        except DamagedError as error:
+            if not self._owner:
+                raise DamagedError(
+                    f"is damaged ({error}) and was not touched: thermal_node, tcf_node, "
+                    "hand_eye_node and maintenance_node set it aside when they start"
+                ) from error
+            self.damaged = set_aside(self.path)
             self._connect(verify)
         self.connection.close()
 
@@ -258,38 +267,24 @@ class HistoryFile:
                 f"{self.path}: is the history of robot {serials[0]!r}, not {self._serial!r}"
             )
 
-    def _set_aside(self) -> None:
-        """Rename the file and its companions, the file first.
 
-        A kill in between leaves a log without its file, which the next opening sets aside too;
-        the other way round it would leave an older state that looks healthy.
-        """
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        aside = Path(f"{self.path}.damaged-{stamp}")
-        number = 1
-        while any(Path(f"{aside}{end}").exists() for end in COMPANIONS):
-            number += 1
-            aside = Path(f"{self.path}.damaged-{stamp}-{number}")
-        for end in COMPANIONS:
-            part = Path(f"{self.path}{end}")
-            if part.exists():
-                part.rename(f"{aside}{end}")
-        self.damaged = aside
-
-
-def open_file(path: Path, serial: str, *, timeout_s: float, verify: Verify) -> HistoryFile:
+def open_file(
+    path: Path, serial: str, *, timeout_s: float, verify: Verify, owner: bool = True
+) -> HistoryFile:
     """Open a history file; ``verify`` raises `DamagedError` when its contents make no sense.
+
+    ``owner``: a damaged one is set aside.
 
     Raises
     ------
     StorageError
-        It cannot be opened, is of a newer version, or is damaged and in use elsewhere.
+        It cannot be opened, is of a newer version, or is damaged and in use elsewhere or not ours.
     WrongRobotError
         It belongs to another serial.
     """
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = HistoryFile(path, serial, timeout_s)
+        file = HistoryFile(path, serial, timeout_s, owner=owner)
         try:
             file.open(verify)
         except BaseException:

@@ -85,6 +85,7 @@ class HistoryReader:
         create: bool = True,
         busy_timeout_s: float = BUSY_TIMEOUT_S,
         sole_user: str = "",
+        owner: bool = True,
     ) -> Self:
         """Open the history of a robot.
 
@@ -96,6 +97,7 @@ class HistoryReader:
         create : False refuses a robot that has no history.
         busy_timeout_s : longest wait for other processes.
         sole_user : the part that only one process may play for this robot; empty: none.
+        owner : sets a damaged file aside and begins anew; others are refused.
 
         Raises
         ------
@@ -104,7 +106,8 @@ class HistoryReader:
         WrongRobotError
             The file belongs to another serial.
         StorageError
-            The file cannot be opened, or was made by a newer version.
+            The file cannot be opened, was made by a newer version, or is damaged and ``owner`` is
+            False.
         ConflictError
             Another process plays the part of ``sole_user``.
         """
@@ -124,7 +127,7 @@ class HistoryReader:
 
         sole = SoleUser(path, sole_user, serial, busy_timeout_s) if sole_user else None
         try:
-            file = open_file(path, serial, timeout_s=busy_timeout_s, verify=verify)
+            file = open_file(path, serial, timeout_s=busy_timeout_s, verify=verify, owner=owner)
         except Exception:
             if sole is not None:
                 sole.close()
@@ -133,9 +136,7 @@ class HistoryReader:
             _log.warning(
                 "%s was damaged: it is kept as %s, the history of robot %s starts anew with the "
                 "nominal model; restore a backup to go on with the former one",
-                path,
-                file.damaged.name,
-                serial,
+                *(path, file.damaged.name, serial),
             )
         return cls(serial, file, ledger, model_hash, sole)
 

@@ -1,5 +1,6 @@
 """Robot files (YAML), described in docs/robot_file.md, and where the shipped ones are."""
 
+import hashlib
 import os
 import warnings
 from dataclasses import dataclass
@@ -103,6 +104,20 @@ def load_description(name: str | Path) -> RobotDescription:
         acceleration_assumed=np.isnan(given),
         notes=_open_limits(arm),
     )
+
+
+def robot_file_hash(name: str | Path) -> str:
+    """SHA-256 of a robot file's bytes, its first 16 hexadecimal digits.
+
+    Unlike `SerialArm.model_hash` it tells robots of one type apart that have their own files.
+
+    Raises
+    ------
+    InputError
+        When there is no such robot.
+    """
+    text = read_text(find_robot(name), "robot file")
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def robot_folders() -> list[Path]:

@@ -35,6 +35,17 @@ class SoleUser:
             self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except OSError as error:
             raise StorageError(f"{path} cannot be made: {error}") from error
+        try:
+            self._wait_for(name, serial, history, timeout_s)
+        except OSError as error:
+            self.close()
+            raise StorageError(
+                f"{path} cannot be locked: {error}: keep histories on a local disk, not on NFS"
+            ) from error
+        os.ftruncate(self._file, 0)
+        os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
+
+    def _wait_for(self, name: str, serial: str, history: Path, timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s
         while not self._held():
             if time.monotonic() > deadline:
@@ -45,8 +56,6 @@ class SoleUser:
                     f"robot '{serial}' in {history}: end it, or give each robot its own serial"
                 )
             time.sleep(_POLL_S)
-        os.ftruncate(self._file, 0)
-        os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
 
     def _held(self) -> bool:
         try:

@@ -275,19 +275,33 @@ class TestDeciding:
 
 
 class TestTrouble:
-    def test_damaged_file_is_reported_and_kept(self, state):
+    def test_damaged_file_is_reported_and_not_touched(self, state):
         path = state / "KR%2F7.sqlite"
         path.write_bytes(b"\xff" * 5000)
-        done = robocal("history", "list", "--state", state, "--json")
-        assert done.returncode == 0
-        document = json.loads(done.stdout)
-        conforms(document, "history.list.json")
-        assert Path(document["damaged"]).read_bytes() == b"\xff" * 5000
-        assert document["calibrations"] == []
-        assert "was damaged" in done.stderr
+        document = robocal_json("error.json", "history", "list", "--state", state, status=2)
+        assert document["error"]["code"] == "STORAGE_FAILED"
+        assert "thermal_node" in document["error"]["message"]
+        assert path.read_bytes() == b"\xff" * 5000
+        assert not list(state.glob("*damaged*"))
+
+    def test_what_an_owner_set_aside_is_told_until_it_is_acknowledged(self, state):
+        path = state / "KR%2F7.sqlite"
         path.write_bytes(b"\xff" * 5000)
+        CalibrationHistory.open(SERIAL, state_dir=state).close()
+        for _ in range(2):
+            document = robocal_json("history.list.json", "history", "list", "--state", state)
+            assert Path(document["damaged"]).read_bytes() == b"\xff" * 5000
+            assert document["calibrations"] == []
         done = robocal("history", "list", "--state", state)
         assert "The history was damaged and is kept as" in done.stdout
+        given = "history", "acknowledge", "--by", "Ada", "--state", state
+        document = robocal_json("history.acknowledge.json", *given)
+        (aside,) = document["acknowledged"]
+        assert Path(aside).read_bytes() == b"\xff" * 5000
+        assert document["damaged"] is None
+        assert robocal_json("history.acknowledge.json", *given)["acknowledged"] == []
+        document = robocal_json("history.list.json", "history", "list", "--state", state)
+        assert document["damaged"] is None
 
     def test_state_is_no_folder(self, tmp_path):
         place = tmp_path / "file"

@@ -119,6 +119,12 @@ CASES = {
         ["history", "corrections", "--state", "nowhere"],
         (2, "BAD_INPUT"),
     ),
+    "history acknowledge": (
+        "history.acknowledge.json",
+        ["history", "acknowledge", "--state", "state"],
+        ["history", "acknowledge", "--state", "nowhere"],
+        (2, "BAD_INPUT"),
+    ),
     "history accept": (
         "history.decision.json",
         ["history", "rollback", "--to", "nominal", "--state", "state"],

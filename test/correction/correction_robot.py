@@ -11,15 +11,14 @@ from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool, TrajectoryCommand
+from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.limiter import TURNING
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.storage.robots import load_description
 
 DESCRIPTION = load_description("kr150_r3100")
-NOMINAL = replace(
-    DESCRIPTION.arm, T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2])
-)
+NOMINAL = replace(DESCRIPTION.arm, T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2]))
 NAMES = NOMINAL.joint_names
 HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
 DT = 0.004
@@ -31,7 +30,7 @@ LIMITS = {
 REST, FASTEST = np.radians(2.0), np.radians(10.0)
 REST_A, LARGEST_A = np.radians(20.0), np.radians(200.0)
 ROUNDING = 1e-9
-assert (REST, REST_A, FASTEST, LARGEST_A) == pytest.approx(TURNING.row())
+assert pytest.approx(TURNING.row()) == (REST, REST_A, FASTEST, LARGEST_A)
 
 
 def drifted(size: float = 1.0, seed: int = 0) -> SerialArm:
@@ -80,12 +79,13 @@ def bent_tool(shift_m: float = 2e-3, turn_deg: float = 0.5, **changes: Any) -> O
 class Robot:
     """A session, the time in which it is used, and a robot that goes where it is sent."""
 
-    def __init__(self, **config: Any) -> None:
+    def __init__(self, *, rested: bool = True, **config: Any) -> None:
         settings = CorrectionConfig(**(LIMITS | config))
         self.session = CorrectionSession(NOMINAL, NOMINAL, "s1", settings)
         self.now = 100.0
         self.at = HOME
-        self.rest()
+        if rested:
+            self.rest()
 
     def stream(self, q: np.ndarray = HOME, dt: float = DT, **fields: Any) -> np.ndarray:
         """Send a target, and let the robot follow it."""
@@ -115,6 +115,10 @@ class Robot:
             self.read(self.at)
         self.session.look(self.now, 0)
 
+    def change_tool(self, tool: OfferedTool) -> None:
+        self.session.offer_tool(tool)
+        self.rest()
+
     def read(self, q: np.ndarray, **fields: Any) -> JointCommand:
         return self.session.reading(JointCommand(NAMES, np.array(q), **fields), self.now)
 
@@ -137,6 +141,18 @@ def refused(reason: Reason, act: Any, *arguments: Any, **fields: Any) -> str:
 def still(q: np.ndarray = HOME, first_s: float = 0.0, seconds: float = 20.0) -> TrajectoryCommand:
     times = np.linspace(first_s, first_s + seconds, 41)
     return TrajectoryCommand(NAMES, np.tile(q, (41, 1)), times)
+
+
+def good_here_only() -> tuple[SerialArm, np.ndarray]:
+    """A drift that is within the bounds at home, and a posture where it is not."""
+    far = HOME + np.array([1.0, 0.6, -0.8, 1.0, 0.6, 1.0])
+    bounds = CorrectionConfig().thermal
+    for seed in range(400):
+        arm = drifted(6.0, seed)
+        here, there = (JointCorrection.between(NOMINAL, arm).correct(q) for q in (HOME, far))
+        if bounds.hold(here).all() and there.tcp_shift_m > 1.05e-3:
+            return arm, far
+    pytest.fail("no such drift")
 
 
 def swing(m: int = 201, duration: float = 2.0, first_s: float = 0.0) -> TrajectoryCommand:

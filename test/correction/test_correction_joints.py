@@ -8,6 +8,7 @@ from correction_robot import (
     DT,
     HOME,
     NAMES,
+    NOMINAL,
     Robot,
     refused,
 )
@@ -34,6 +35,7 @@ def test_joints_are_matched_by_name(warm: Robot) -> None:
 def test_a_part_of_the_joints_is_completed_from_the_readings(warm: Robot) -> None:
     part = JointCommand(NAMES[2:4], HOME[2:4])
     new = Robot()
+    new.session = type(new.session)(NOMINAL, NOMINAL, "s1")
     refused(Reason.MISSING_JOINT, new.session.target, part, new.now)
     straight = warm.stream()
     warm.read(straight)

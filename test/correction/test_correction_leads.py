@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from correction_robot import HOME, NAMES, RATE, Robot, bent_tool, drifted, offer, refused, still
+from correction_robot import HOME, NAMES, REST, Robot, bent_tool, drifted, offer, refused, still
 
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import TrajectoryCommand
@@ -121,4 +121,4 @@ def test_a_lead_in_needs_readings_that_are_fresh(on: bool) -> None:
     refused(Reason.STALE_JOINTS, robot.session.trajectory, still(first_s=5.0), robot.now)
     robot.read(robot.at)
     out = robot.session.trajectory(still(first_s=5.0), robot.now)
-    assert np.abs(out.position[0] - robot.at).max() <= RATE * 5.0
+    assert np.abs(out.position[0] - robot.at).max() <= REST * 5.0

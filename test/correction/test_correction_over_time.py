@@ -1,4 +1,4 @@
-"""Whatever happens in whatever order: the offset and the commands move within their limits in time."""
+"""Whatever happens in whatever order: offset and commands move within their limits in time."""
 
 import numpy as np
 from correction_robot import (
@@ -37,7 +37,7 @@ class Watch:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
-        self.offsets: dict[int, tuple[float, float, float, bool]] = {}  # when, offset, rate, moved
+        self.offsets: dict[int, tuple[float, float, float]] = {}  # when, offset, rate
         self.steps = 0
 
     def out(self, names: tuple[str, ...], out: np.ndarray) -> None:
@@ -58,16 +58,16 @@ class Watch:
             j = NAMES.index(name)
             offset = x - q
             if j in self.offsets:
-                at, before, rate, taught_before = self.offsets[j]
+                at, before, rate = self.offsets[j]
                 dt = now - at
                 new = (offset - before) / dt
                 assert abs(new) <= FASTEST + ROUNDING / dt
                 if dt <= 1.5 * DT and np.isfinite(rate):
                     assert abs(new - rate) <= LARGEST_A * dt + 2.0 * ROUNDING / dt, name
                     self.steps += 1
-                self.offsets[j] = now, offset, new if dt <= 1.5 * DT else np.nan, q
+                self.offsets[j] = now, offset, new if dt <= 1.5 * DT else np.nan
             else:
-                self.offsets[j] = now, offset, 0.0, q
+                self.offsets[j] = now, offset, 0.0
 
     def forget(self) -> None:
         """Nothing was commanded for a while: offsets are those of what begins anew."""
@@ -131,7 +131,7 @@ def slow_down(robot: Robot, watch: Watch) -> None:
     raise AssertionError("the stream does not end")
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(EVENT, min_size=1, max_size=12), st.floats(0.0, 1.0), st.booleans())
 def test_streams_through_anything(
     events: list[tuple[str, int, int]], speed: float, whole: bool
@@ -153,7 +153,7 @@ def test_streams_through_anything(
             watch.forget()
             watch.last.clear()
             robot.rest()
-        for i in range(count):
+        for _ in range(count):
             t += DT
             q = centre + 0.2 * np.sin(speed * t)
             names, target = NAMES, q
@@ -178,7 +178,7 @@ def test_streams_through_anything(
                 watch.forget()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(EVENT, min_size=1, max_size=8), st.integers(2, 60), st.floats(0.8, 4.0))
 def test_trajectories_through_anything(
     events: list[tuple[str, int, int]], m: int, duration: float
@@ -198,8 +198,9 @@ def test_trajectories_through_anything(
         try:
             out = robot.session.trajectory(command, robot.now)
         except RefusedError as error:
-            assert error.reason in (Reason.TOO_SHORT, Reason.JOINT_LIMIT, Reason.VELOCITY_LIMIT)
-            continue
+            if error.reason in (Reason.TOO_SHORT, Reason.JOINT_LIMIT, Reason.VELOCITY_LIMIT):
+                continue
+            raise
         offset, dt = out.position - command.position, np.diff(times)[:, None]
         if first_s == 0.0:
             assert np.abs(out.position[0] - robot.at).max() <= ROUNDING
@@ -308,7 +309,7 @@ def test_a_stream_of_some_joints_then_of_all_moves_no_other_joint_at_once() -> N
 
 
 def test_refused_messages_leave_nothing_to_jump_to() -> None:
-    """Twenty-three refused ones, then one that could be taken: it is no longer where the robot is."""
+    """Twenty-three refused, then one that could be taken: the robot is no longer there."""
     robot, speed = Robot(), np.radians(60.0)
     q, held = HOME.copy(), []
     robot.stream(q)
@@ -327,8 +328,8 @@ def test_refused_messages_leave_nothing_to_jump_to() -> None:
     assert np.array_equal(robot.at, held[-1])
 
 
-def test_jitter_moves_nothing_faster(rng_seed: int = 3) -> None:
-    rng = np.random.default_rng(rng_seed)
+def test_jitter_moves_nothing_faster() -> None:
+    rng = np.random.default_rng(3)
     robot, speed = Robot(), 0.9 * LIMITS["velocity_limits"]
     watch, t, q = Watch(robot), 0.0, HOME.copy()
     q = HOME - speed * 0.4

@@ -20,7 +20,7 @@ from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.tool_messages import ToolMessages
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.storage.robots import load_robot, robot_file_hash
 
 NOMINAL = load_robot("kr150_r3100")
 NAMES = list(NOMINAL.joint_names)
@@ -39,6 +39,7 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
     fields = {
         "serial": "s1",
         "model_hash": NOMINAL.model_hash,
+        "robot_file_hash": robot_file_hash("kr150_r3100"),
         "revision": revision,
         "state": KinematicModel.ACCEPTED,
         "stamp": Header(frame_id="base"),
@@ -48,7 +49,7 @@ def model_message(arm: SerialArm, revision: int = 1, **changes: Any) -> Kinemati
 
 def tool_message(T: np.ndarray, revision: int = 1, **changes: Any) -> ToolFrame:
     """As tcf_node makes it."""
-    build = ToolMessages(NOMINAL, "s1", "tool0", "tool")
+    build = ToolMessages(NOMINAL, "s1", robot_file_hash("kr150_r3100"), "tool0", "tool")
     message = build.frame(KnownTool(T), revision, 0, ToolFrame.ACCEPTED, 0)
     for name, value in changes.items():
         setattr(message, name, value)

@@ -112,3 +112,23 @@ def test_the_end_of_the_node_loses_no_record(graph: Any) -> None:
     line.node.close()
     graph.executor.remove_node(line.node)
     assert [r.enabled for r in kept(graph)] == [False, True, False]
+
+
+def test_a_damaged_history_is_not_touched_and_what_could_not_be_written_comes_later(
+    graph: Any, monkeypatch: Any
+) -> None:
+    """It only adds to the history: setting it aside is for the nodes whose history it is."""
+    monkeypatch.setattr(correction_log, "RETRY_S", 0.1)
+    graph.state.mkdir(exist_ok=True)
+    path = graph.state / "s1.sqlite"
+    path.write_bytes(b"\xff" * 5000)
+    line = Line(graph)
+    graph.spin_until(
+        lambda: "is damaged" in line.node.health().message, "the diagnostics say so", 20.0
+    )
+    assert path.read_bytes() == b"\xff" * 5000
+    assert not list(graph.state.glob("*.damaged-*"))
+    CalibrationHistory.open("s1", state_dir=graph.state).close()  # as thermal_node starts
+    assert len(list(graph.state.glob("*.damaged-*"))) == 1
+    after(graph, 1)
+    assert "is damaged" not in line.node.health().message

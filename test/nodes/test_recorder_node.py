@@ -19,8 +19,8 @@ from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNod
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.storage.bag_recording import KEEP, MB, recordings, size_bytes
 from robocal_ros.storage.bags import BagReader
+from robocal_ros.storage.recording_folders import KEEP, MB, Maker, recordings, size_bytes
 
 NODE = "recorder_node"
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -55,7 +55,7 @@ def test_a_killed_recorder_keeps_what_it_flushed_and_the_next_begins_anew(graph)
         said(graph, publisher, String, f"{i}")
     graph.spin_for(0.5)  # five times as long as between two flushes
     recorder.kill()
-    (first,) = recordings(graph.state / "rec")
+    first = recordings(graph.state / "rec")[0].folder
     assert words(first, "/words") == [f"{i}" for i in range(50)]
     recorder = started(graph)
 
@@ -65,7 +65,7 @@ def test_a_killed_recorder_keeps_what_it_flushed_and_the_next_begins_anew(graph)
 
     graph.spin_until(recorded_again, "a second recording")
     assert recorder.stop() == 0
-    second = recordings(graph.state / "rec")[-1]
+    second = recordings(graph.state / "rec")[-1].folder
     with BagReader(second) as bag:
         assert not bag.info.notes
     assert set(words(second, "/words")) == {"again"}
@@ -85,7 +85,7 @@ def test_each_recording_opens_with_what_is_in_force(graph):
     said(graph, publisher, String, "after")
     graph.spin_until(lambda: len(recordings(graph.state / "rec")) == 2, "a second recording")
     graph.spin_for(0.5)
-    first, second = recordings(graph.state / "rec")
+    first, second = (one.folder for one in recordings(graph.state / "rec"))
     assert (first / KEEP).read_text().startswith("kept at ")
     assert not (second / KEEP).exists()
     for folder, expected in ((first, "before"), (second, "after")):
@@ -122,7 +122,8 @@ def test_what_it_cannot_write_is_told_and_the_next_recording_opens_with_what_is_
     graph.spin_until(recorded_again, "a recording", AGAIN_S + 10.0)
     graph.spin_for(2 * LOOK_S)
     assert recorder.stop() == 0
-    (folder,) = recordings(obstacle)
+    (recording,) = recordings(obstacle)
+    folder = recording.folder
     assert words(folder, "/model") == ["revision 3"]
     assert set(words(folder, "/words")) <= {"again"}
     with BagReader(folder) as bag:
@@ -176,6 +177,10 @@ KEEP_MB = 2.0
 
 def test_all_recordings_together_stay_in_their_room(graph, monkeypatch):
     """Two robots' recorders of one folder, each with more than it may keep: 4 MB a second."""
+
+    def of(name: str) -> list[Any]:
+        return [one.folder for one in recordings(folder, Maker(f"/{name}/{NODE}"))]
+
     monkeypatch.setattr(recorder_node, "ROOM_S", 0.1)
     folder = graph.state / "rec"
     given = {"topics": ["words"], "folder": str(folder), "keep_mb": KEEP_MB, "file_mb": 0.1}
@@ -187,7 +192,9 @@ def test_all_recordings_together_stay_in_their_room(graph, monkeypatch):
         for publisher in robots:
             said(graph, publisher, String, f"{sent} {os.urandom(50_000).hex()}")
         sent += 1
-        largest = max(largest, sum(size_bytes(found) for found in recordings(folder)) / MB)
+        largest = max(
+            largest, *(sum(size_bytes(found) for found in of(name)) / MB for name in names)
+        )
     told = [f"/{name}/words recorded" for name in names]
     graph.spin_until(
         lambda: all(
@@ -199,13 +206,79 @@ def test_all_recordings_together_stay_in_their_room(graph, monkeypatch):
     # what comes between two looks is beside it
     assert KEEP_MB / 2 < largest < KEEP_MB * 1.5
     last = {name: [] for name in names}
-    for found in recordings(folder):
-        with BagReader(found) as bag:
-            for message in bag.messages():
-                last[message.topic.split("/")[1]].append(int(message.message.data.split()[0]))
+    for name in names:
+        for found in of(name):
+            with BagReader(found) as bag:
+                for message in bag.messages():
+                    assert message.topic == f"/{name}/words"
+                    last[name].append(int(message.message.data.split()[0]))
     for numbers in last.values():  # nothing of the newest is missing
         assert numbers == list(range(numbers[0], sent))
         assert len(numbers) > 1
+
+
+def test_what_it_did_not_make_stays_and_is_told_once(graph, tmp_path, monkeypatch, capfd):
+    """A checkout and a link beside the recordings, both older than these."""
+    monkeypatch.setattr(recorder_node, "ROOM_S", 0.1)
+    folder = graph.state / "rec"
+    checkout = folder / "robocal_ros"
+    checkout.mkdir(parents=True)
+    (checkout / "setup.py").write_text("work of years")
+    (folder / "robocal_elsewhere").symlink_to(tmp_path)
+    given = {"topics": ["words"], "folder": str(folder), "keep_mb": KEEP_MB, "file_mb": 0.1}
+    node = graph.add(RecorderNode, given)
+    publisher = graph.publisher(String, "/words")
+
+    def deleted() -> bool:
+        said(graph, publisher, String, os.urandom(50_000).hex())
+        return bool(node.health().values["recordings deleted"])
+
+    graph.spin_until(deleted, "room is made", 60.0)
+    assert (checkout / "setup.py").read_text() == "work of years"
+    left = node.health().values["left alone"]
+    assert "robocal_ros has no robocal_recording.json" in left
+    assert "robocal_elsewhere is a symbolic link" in left
+    log = capfd.readouterr().err
+    assert log.count("robocal_ros in") == log.count("robocal_elsewhere in") == 1
+
+
+def test_a_disk_that_fills_up_is_relieved_and_what_others_take_is_told(
+    graph, small_disk, monkeypatch
+):
+    """First its own recordings make the room, then there are none: it says so, and comes back."""
+    for name in ("ROOM_S", "AGAIN_S"):
+        monkeypatch.setattr(recorder_node, name, 0.1)
+    given = {"topics": ["words"], "folder": str(small_disk), "file_mb": 0.1, "flush_s": 0.1}
+    node = graph.add(RecorderNode, given | {"keep_mb": 2.0, "free_mb": 0.8})
+    publisher = graph.publisher(String, "/words")
+
+    def publish() -> None:
+        said(graph, publisher, String, os.urandom(20_000).hex())
+
+    def free_bytes() -> int:
+        disk = os.statvfs(small_disk)
+        return disk.f_bavail * disk.f_frsize
+
+    def deleted() -> bool:
+        publish()
+        return node.health().values["recordings deleted"] >= 2
+
+    graph.spin_until(deleted, "room is made", 60.0)
+    assert node.health().level != ERROR
+    theirs = small_disk / "theirs"
+
+    def filled() -> bool:
+        publish()
+        with theirs.open("ab") as file:
+            file.write(bytes(max(free_bytes() - 400_000, 0)))
+        return node.health().level == ERROR
+
+    graph.spin_until(filled, "it is told", 60.0)
+    assert "free_mb is 0.8" in node.health().message
+    assert recordings(small_disk)  # the newest is still there
+    theirs.unlink()
+    graph.spin_until(lambda: publish() or node.health().level == WARN, "it records again", 60.0)
+    assert "are not recorded" in node.health().message  # those of meanwhile
 
 
 def test_the_type_is_the_one_that_is_offered(graph):
@@ -214,7 +287,8 @@ def test_the_type_is_the_one_that_is_offered(graph):
     said(graph, publisher, Bool, True)
     graph.spin_until(lambda: recordings(graph.state / "rec"), "a recording")
     graph.spin_for(0.5)
-    (folder,) = recordings(graph.state / "rec")
+    (recording,) = recordings(graph.state / "rec")
+    folder = recording.folder
     assert words(folder, "/words") == [True]
 
 

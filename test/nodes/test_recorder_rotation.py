@@ -17,7 +17,7 @@ from robocal_ros.cli.main import main
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes.recorder_node import LOOK_S
 from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.storage.bag_recording import recordings
+from robocal_ros.storage.recording_folders import recordings
 from robocal_ros.storage.robots import load_robot
 
 RECORDER = "recorder_node"
@@ -42,7 +42,7 @@ def judged(
     """The second recording replayed, and its row of a report; both equal what was live."""
     graph.spin_for(1.0)
     assert recorder.stop() == 0, recorder.output
-    _, folder = recordings(graph.state / "rec")
+    folder = recordings(graph.state / "rec")[1].folder
     capsys.readouterr()
     assert main(["replay", str(folder), "--json"]) == 0
     replayed = json.loads(capsys.readouterr().out)

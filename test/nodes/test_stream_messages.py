@@ -133,3 +133,11 @@ def test_a_velocity_of_another_joint_that_is_no_number_does_not_go_out() -> None
     out = as_message(message.changed(replace(command, mark=CORRECTED)), JointState)
     assert list(out.velocity) == []
     assert list(out.position) == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("velocity", [[NAN, NAN], [0.1, NAN], [0.1], [0.1, 0.2, 0.3]])
+def test_velocities_of_a_reading_that_are_unknown_are_absent(velocity: list[float]) -> None:
+    message = came(a_state(velocity=velocity, effort=[NAN, NAN]), is_reading=True)
+    assert message.is_finite()
+    assert message.command().velocity is None
+    assert message.unchanged() == a_state(velocity=[])

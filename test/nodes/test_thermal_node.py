@@ -31,13 +31,18 @@ from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.diagnostics import Health
+from robocal_ros.nodes.hand_eye_node import HandEyeNode
+from robocal_ros.nodes.history_settings import history_notice
+from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.session_events import EVENTS
+from robocal_ros.nodes.thermal_node import ThermalNode
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.replay import input_topics, read_events, replay
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.bags import BagReader, BagWriter
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.history_damage import acknowledge
 from robocal_ros.storage.robots import load_robot
 
 POSES = 8
@@ -432,6 +437,29 @@ def test_a_damaged_history_is_set_aside_and_said(graph):
     assert "damaged" in cell.status().message
     assert cell.models[-1].revision == 0
     assert list(graph.state.glob("s1.sqlite.damaged-*"))
+
+
+def test_every_node_says_that_a_history_was_set_aside_until_it_is_acknowledged(graph):
+    """Also after a restart, and though another node set it aside."""
+    graph.state.mkdir()
+    path = graph.state / "s1.sqlite"
+    path.write_bytes(b"SQLite format 3\0" + bytes(5000))
+    CalibrationHistory.open("s1", state_dir=graph.state).close()
+    kinds = {
+        ThermalNode: {},
+        HandEyeNode: {},
+        MaintenanceNode: {"home_deg": [0.0, -90.0, 90.0, 0.0, 90.0, 0.0]},
+    }
+    nodes = [graph.add(kind, given | {"serial": "s1"}) for kind, given in kinds.items()]
+    said = "damaged history was set aside"
+    assert history_notice({"serial": "s1", "state_dir": ""}).count(said) == 1
+    for node in nodes:
+        assert said in node.health().message
+    (aside,) = acknowledge(path, "Ada", time.time_ns())
+    assert aside.exists()
+    for node in nodes:
+        assert said not in node.health().message
+    assert history_notice({"serial": "s1", "state_dir": ""}) == ""
 
 
 def test_a_history_that_vanishes_fails_calls_and_not_the_node(graph):

@@ -56,12 +56,15 @@ class Robot:
         return self.gap.closed(now_s)
 
     def send(self, plan: JointPlan) -> None:
-        """The controller gets it with a lag, and goes on from where it is and moves by then."""
+        """The controller gets it with a lag, and goes on from where it is and moves by then.
+
+        The point at 0 is not sent: a controller would jump there.
+        """
         self.sent.append((self.now_s, plan))
         self.coming.append((self.now_s + LAG_S, plan))
 
     def receive(self, at_s: float, plan: JointPlan) -> None:
-        self.motion.follow(at_s, plan.time_s + at_s, plan.q, plan.qd)
+        self.motion.follow(at_s, plan.time_s[1:] + at_s, plan.q[1:], plan.qd[1:])
         motion, end_s = self.motion, at_s + plan.duration_s
         moved = self.cell.station.edges(
             self.tool, lambda t: self.true.fk(motion.joints(t)), (at_s, end_s), self.rng

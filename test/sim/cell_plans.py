@@ -25,13 +25,14 @@ Q_START = np.radians([2.3, -124.4, -70.9, 107.7, -91.1, 91.8])
 def plan_of(
     source: TrueInput = PERFECT, noise: TrueNoise = NO_NOISE, error_m: float = 0.0, **changes
 ) -> CellPlan:
-    """A bent pin; without noise unless one is given."""
+    """A bent pin; without noise and lag unless one is given."""
     settings = {
         "robot": rigid_robot(ARM, error_m, np.random.default_rng(5)),
         "station": make_cell(source=source, noise=noise).station,
         "tool": RoundTool.cylinder(TRUTH, 0.0025),
         "q_start": Q_START,
         "ripple": 0.0,
+        "lag_s": 0.0,
     }
     return CellPlan(**(settings | changes))
 

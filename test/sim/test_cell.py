@@ -14,8 +14,10 @@ from robocal_ros.core.tool.laser_frame import calibrate_laser
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
 from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
 from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise
-from robocal_ros.sim.cell import TICK_S, SimulatedCell
+from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_plan import known_laser
+from robocal_ros.sim.joint_motion import CYCLE_S
+from robocal_ros.sim.standing import TICK_S
 from robocal_ros.sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
 
 NOISE = TrueNoise(3e-5, 1e-5)
@@ -45,8 +47,8 @@ def test_readings_are_the_commanded_joints_at_their_rate():
     time = np.concatenate([p.time_s for p in parts])
     assert time == pytest.approx(np.arange(len(time)) / 250.0, abs=1e-12)
     assert time[-1] > 1.2 - TICK_S - 1.0 / 250.0
-    s = np.clip(time / 0.5, 0.0, 2.0)
-    s = np.where(s > 1.0, 2.0 - s, s)
+    s = np.clip((time - CYCLE_S) / (0.5 - CYCLE_S), 0.0, 1.0)  # it begins in the next cycle
+    s = np.where(time > 0.5, np.clip((1.0 - time) / 0.5, 0.0, 1.0), s)
     wanted = Q_START + 0.1 * (s**2 * (3.0 - 2.0 * s))[:, None]
     assert np.concatenate([p.q for p in parts]) == pytest.approx(wanted, abs=1e-9)
 
@@ -208,8 +210,9 @@ def test_a_replaced_or_ended_motion_goes_on_where_it_is():
     cell.drive(circle(direction=-1))
     assert cell.flange(np.array([cell.now_s])) == pytest.approx(before, abs=1e-12)
     cell.advance(1.5)
-    before = cell.flange(np.array([cell.now_s]))
     cell.hold()
+    cell.advance(1.6)
+    before = cell.flange(np.array([cell.now_s]))
     assert not cell.moving
     later = cell.flange(cell.now_s + np.array([0.0, 1.0]))
     assert later == pytest.approx(np.tile(before, (2, 1, 1)), abs=1e-12)

@@ -8,7 +8,7 @@ import pytest
 from kr150_shift import ABOVE, CYCLE, HOME, WORK, cell_of, first_circle, went
 
 from bench.closed_loop.faults import proven, rights_by_size, shown, smallest_held
-from robocal_ros.sim.cell_faults import FAULTS, NEXT_MOTION, SIZES
+from robocal_ros.sim.cell_faults import CONTROLLER_FAULTS, FAULTS, NEXT_MOTION, SIZES
 from robocal_ros.sim.kr150_cell import TAUGHT
 from robocal_ros.sim.robot import Effects
 
@@ -76,7 +76,7 @@ TOUCHED = {
 
 def test_every_fault_is_looked_at():
     assert set(TOUCHED) == set(FAULTS) - {"none"}
-    assert set(SIZES) <= set(FAULTS)
+    assert set(SIZES) <= {*FAULTS, *CONTROLLER_FAULTS}
     healthy = tour()
     assert len(healthy["edges"]) == 8
     assert len(healthy["ball"]) == 2

@@ -27,6 +27,7 @@ from robocal_ros.core.tool.crossed_model import RobotNoise
 from robocal_ros.sim import kr150
 from robocal_ros.sim.cell import SimulatedCell
 from robocal_ros.sim.cell_samples import CellSamples
+from robocal_ros.sim.joint_motion import LAG_S
 from robocal_ros.sim.kr150_cell import (
     DUTY,
     SPIN_RAD,
@@ -249,10 +250,12 @@ def test_the_programme_keeps_its_speed_and_rests():
     cell.follow(time, q, qd, qdd)
     at = np.arange(0.0, time[-1], 0.004)
     seen, moving = cell.motion.at(at)
-    assert np.max(np.abs(moving)) == pytest.approx(1.2, rel=1e-3)
+    # It begins a cycle late, and goes the first way in what is left.
+    assert np.max(np.abs(moving)) == pytest.approx(1.2, rel=5e-3)
     assert seen[-1] == pytest.approx(WORK[-1], abs=1e-9)
     resting = np.all(moving == 0.0, axis=1) | (np.max(np.abs(moving), axis=1) < 1e-9)
-    assert resting.mean() == pytest.approx(0.5 * len(WORK) / time[-1], rel=0.05)
+    rests_s = (0.5 - 2.0 * LAG_S) * len(WORK)  # the drives take a part of each to come to rest
+    assert resting.mean() == pytest.approx(rests_s / time[-1], rel=0.05)
 
 
 def test_the_line_laser_sees_its_target_at_each_of_its_poses():

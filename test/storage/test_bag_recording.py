@@ -1,9 +1,7 @@
-"""Recordings: complete and broken off, split, kept and deleted."""
+"""Recordings: complete and broken off, and split."""
 
 import os
 import resource
-import subprocess
-import sys
 
 import pytest
 from rosbags.highlevel import AnyReader
@@ -12,11 +10,6 @@ from rosbags.typesys import Stores, get_typestore
 from robocal_ros.core.errors import StorageError
 from robocal_ros.storage.bag_recording import (
     BagRecording,
-    delete_oldest,
-    keep,
-    next_folder,
-    recordings,
-    size_bytes,
 )
 from robocal_ros.storage.bag_types import encode
 from robocal_ros.storage.bags import BagReader
@@ -101,62 +94,3 @@ def test_a_disk_that_takes_no_more_is_told_and_what_it_took_is_read(tmp_path):
     found = numbers(tmp_path / "r")
     assert found == list(range(len(found)))
     assert len(found) >= 40
-
-
-def made(tmp_path, name: str, age_s: int) -> int:
-    with BagRecording(tmp_path / name, latched=(), file_bytes=FILE_BYTES) as recording:
-        fill(recording, 20)
-    os.utime(tmp_path / name, (1e9 - age_s, 1e9 - age_s))
-    return size_bytes(tmp_path / name)
-
-
-def test_the_oldest_go_first_but_for_those_that_are_kept(tmp_path):
-    sizes = [made(tmp_path, f"robocal_{i}", age_s=100 - i) for i in range(5)]
-    keep(tmp_path / "robocal_0", "a dispute")
-    os.utime(tmp_path / "robocal_0", (1e9 - 100, 1e9 - 100))
-    (tmp_path / "mine").mkdir()
-    room = sum(sizes) - sizes[1] - sizes[2] + 100
-    deleted = delete_oldest(tmp_path, room)
-    assert [path.name for path in deleted] == ["robocal_1", "robocal_2"]
-    assert [p.name for p in recordings(tmp_path)] == ["robocal_0", "robocal_3", "robocal_4"]
-    deleted = delete_oldest(tmp_path, 0)
-    assert [path.name for path in deleted] == ["robocal_3", "robocal_4"]
-    assert (tmp_path / "mine").is_dir()
-
-
-def test_what_is_being_written_is_not_deleted(tmp_path):
-    recording = BagRecording(tmp_path / "robocal_1", latched=(), file_bytes=FILE_BYTES)
-    fill(recording, 40)
-    assert delete_oldest(tmp_path, 0) == []
-    fill(recording, 40, start=40)
-    recording.close()
-    assert numbers(recording.folder) == list(range(80))
-    assert delete_oldest(tmp_path, 0) == [recording.folder]
-
-
-WRITER = """
-import sys
-from pathlib import Path
-from robocal_ros.storage.bag_recording import BagRecording
-recording = BagRecording(Path(sys.argv[1]), latched=(), file_bytes=1000)
-print(flush=True)
-sys.stdin.read()
-"""
-
-
-def test_what_another_process_writes_is_not_deleted_until_it_is_gone(tmp_path):
-    folder = tmp_path / "robocal_1"
-    with subprocess.Popen(
-        [sys.executable, "-c", WRITER, folder], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as writer:
-        writer.stdout.readline()
-        assert delete_oldest(tmp_path, -1) == []
-        writer.kill()
-        writer.wait()
-    assert delete_oldest(tmp_path, -1) == [folder]
-
-
-def test_two_recordings_of_one_second_have_two_folders(tmp_path):
-    first = next_folder(tmp_path, 1_800_000_000_123_000_000)
-    assert first.name == "robocal_2027-01-15T08-00-00Z"
-    assert next_folder(tmp_path, 1_800_000_000_900_000_000).name == f"{first.name}_2"

@@ -1,8 +1,11 @@
 """A full disk, a file taken away, damage: nothing is lost, nothing half-written."""
 
 import contextlib
+import errno
+import fcntl
 import os
 import sqlite3
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from robocal_ros.core.errors import (
     StorageError,
 )
 from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.storage.history_damage import acknowledge, damage_notice, damaged_files
 from robocal_ros.storage.history_paths import (
     history_path,
     known_serials,
@@ -95,6 +99,59 @@ class TestDamage:
             assert history.damaged is None
             assert len(history.list()) == 1
         assert known_serials(tmp_path) == [SERIAL]
+
+    def test_who_is_no_owner_touches_nothing(self, tmp_path: Path) -> None:
+        path = filled(tmp_path)
+        os.truncate(path, path.stat().st_size // 2)
+        before = path.read_bytes()
+        for _ in range(2):
+            with pytest.raises(StorageError, match=r"thermal_node.* set it aside"):
+                CalibrationHistory.open(SERIAL, state_dir=tmp_path, owner=False)
+        assert path.read_bytes() == before
+        assert not list(tmp_path.glob("*.damaged-*"))
+
+    def test_it_is_told_until_somebody_acknowledges_each(self, tmp_path: Path) -> None:
+        path = filled(tmp_path)
+        assert damage_notice(path) == ""
+        for _ in range(2):
+            path.write_bytes(b"junk" * 100)
+            CalibrationHistory.open(SERIAL, state_dir=tmp_path).close()
+            assert "acknowledge" in damage_notice(path)
+            (aside,) = damaged_files(path)
+            assert acknowledge(path, "Ada", 7) == (aside,)
+            assert aside.exists()
+            assert damage_notice(path) == ""
+        path.write_bytes(b"junk" * 100)
+        CalibrationHistory.open(SERIAL, state_dir=tmp_path).close()
+        (aside,) = damaged_files(path)
+        aside.rename(tmp_path / "to be looked at")
+        assert damage_notice(path) == ""
+
+    @pytest.mark.parametrize("sole_user", ["", "thermal_node"])
+    def test_a_disk_without_locks_is_named(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sole_user: str
+    ) -> None:
+        """As an NFS server without its lock daemon answers."""
+
+        def flock(*_: object) -> None:
+            raise OSError(errno.ENOLCK, "No locks available")
+
+        monkeypatch.setattr(fcntl, "flock", flock)
+        with pytest.raises(StorageError, match=r"No locks available.*local"):
+            CalibrationHistory.open(SERIAL, state_dir=tmp_path, sole_user=sole_user)
+
+    def test_a_read_only_disk_and_a_full_one_are_named(self, small_disk: Path) -> None:
+        path = filled(small_disk)
+        with pytest.raises(OSError, match="No space"):
+            (small_disk / "theirs").write_bytes(bytes(3_000_000))
+        before = path.read_bytes()
+        with pytest.raises(StorageError, match="check the disk and its free space"):
+            CalibrationHistory.open(SERIAL, state_dir=small_disk)
+        (small_disk / "theirs").unlink()
+        subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+        with pytest.raises(StorageError, match=r"[Rr]ead-only"):
+            CalibrationHistory.open(SERIAL, state_dir=small_disk)
+        assert path.read_bytes() == before
 
     def test_cut_short(self, tmp_path: Path) -> None:
         path = filled(tmp_path)
