@@ -159,7 +159,11 @@ class CorrectionReport:
             reference_hash=reference.model_hash,
             taught_tool=(*T[:3, 3].tolist(), *frames.quat_xyzw(T).tolist()),
         )
-        self._log = CorrectionLog(lambda: open_history(settings, nominal, owner=False)[1])
+        self._log = CorrectionLog(
+            lambda: open_history(settings, nominal, owner=False)[1],
+            lambda: history_notice(settings),
+            lambda: acknowledge_history(settings, ACKNOWLEDGED_BY),
+        )
 
     def close(self) -> None:
         """Finish the history."""

@@ -46,9 +46,7 @@ def tcp(arm: SerialArm, q: Any) -> np.ndarray:
     return np.asarray(arm.fk(np.array(q)) @ arm.T_flange_tool)
 
 
-def goal_of(
-    *places: np.ndarray, lasts_s: float = 0.4, starts_s: float = 0.0, **fields: Any
-) -> Any:
+def goal_of(*places: np.ndarray, lasts_s: float = 0.4, starts_s: float = 0.0, **fields: Any) -> Any:
     """From place to place in equal times, at rest at the ends."""
     times = np.linspace(starts_s, lasts_s, len(places))
     points = [

@@ -1,4 +1,4 @@
-"""Stops that are watched: against a simulated controller that behaves as joint_trajectory_controller."""
+"""Stops that are watched, against a simulated controller that does as joint_trajectory_controller."""
 
 import numpy as np
 import pytest
@@ -47,9 +47,7 @@ class SimulatedController:
         while self._coming and self._coming[0][0] <= self.now_s:
             plan = self._coming.pop(0)[1]
             ends = np.array([0.0, plan.duration_s])
-            self._spline = CubicHermiteSpline(
-                ends, [self.q, plan.q[-1]], [self.qd, 0.0 * self.qd]
-            )
+            self._spline = CubicHermiteSpline(ends, [self.q, plan.q[-1]], [self.qd, 0.0 * self.qd])
             self._clock_s = 0.0
         before = self.q
         if self._spline is None:
