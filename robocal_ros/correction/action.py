@@ -1,15 +1,17 @@
 """The action FollowJointTrajectory before a controller: taught goals in, corrected ones out.
 
 Each goal is corrected and forwarded; it ends as the controller ends it. Nothing here waits: goals
-are ended from callbacks, so that a cancel passes at once in whatever executor the node runs.
-docs/joint_correction_action.md tells it to users.
+are ended from callbacks, so that a cancel passes at once in whatever executor the node runs. No
+callback lets an exception out: in rclpy's events executor one of an action's client ends the
+process. docs/joint_correction_action.md tells it to users.
 """
 
+import functools
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from action_msgs.msg import GoalStatus
@@ -23,7 +25,7 @@ from rclpy.task import Future
 
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.samples import TAUGHT
-from robocal_ros.correction.courses import Course
+from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.nodes.deferred_action import DeferredActionServer
 from robocal_ros.nodes.endpoints import EndpointNode
@@ -50,7 +52,8 @@ class _Goal:
     asked_s : since when the controller owes an answer; None when it owes none.
     accepted : the goal at the controller.
     result : what it will answer in the end.
-    course : its corrected trajectory; None without one.
+    path : its corrected trajectory; None in shadow mode.
+    stopped : why it was stopped here; empty when it was not.
     """
 
     caller: ServerGoalHandle
@@ -58,9 +61,28 @@ class _Goal:
     asked_s: float | None = None
     accepted: ClientGoalHandle | None = None
     result: Future | None = None
-    course: Course | None = None
+    path: SentPath | None = None
+    stopped: str = ""
     cancel: bool = False
     over: bool = False
+
+
+class GoalHandling(Protocol):
+    """What the node does for the goals."""
+
+    def correct_goal(self, trajectory: Any) -> tuple[Any, SentPath | None]:
+        """The corrected trajectory of a taught one, and its path; raises `RefusedError`."""
+
+    def goal_sent(self) -> None:
+        """A corrected goal has gone out."""
+
+    def goal_rejected(self, path: SentPath) -> None:
+        """The controller did not take it."""
+
+    def uncorrect(
+        self, names: tuple[str, ...], position: Array, velocity: Array | None
+    ) -> tuple[Array, Array | None]:
+        """Taught positions and velocities, (k,) each; raises `RefusedError`."""
 
 
 class TrajectoryProxy:
@@ -69,37 +91,22 @@ class TrajectoryProxy:
     Both ends stay until `destroy`, which must not be called while the node spins: rclpy's events
     executor reads freed memory when an action goes that something waits for. When closed, goals
     are rejected.
-
-    Parameters
-    ----------
-    correct : the corrected trajectory of a taught one, and its course; raises `RefusedError`.
-    taught : taught positions and velocities of (names, positions, velocities or None), each (k,).
-    stop, sent : called for a goal that is a stop; after any other one has gone out.
     """
 
-    def __init__(
-        self,
-        node: EndpointNode,
-        name: str,
-        correct: Callable[[Any], tuple[Any, Course | None]],
-        taught: Callable[[tuple[str, ...], Array, Array | None], tuple[Array, Array | None]],
-        stop: Callable[[], None],
-        sent: Callable[[], None],
-    ) -> None:
-        self._node, self._correct, self._taught = node, correct, taught
-        self._stop, self._sent = stop, sent
+    def __init__(self, node: EndpointNode, name: str, handling: GoalHandling) -> None:
+        self._node, self._handling = node, handling
         self._goals: list[_Goal] = []
         self._clients: dict[str, ActionClient] = {}
-        self._name = ""  # of the controller's action; empty when closed
+        self.controller = ""  # resolved name of the controller's action; empty when closed
         # rclpy remaps the topics and services of an action, but not its name.
         self._own_name = node.resolve_topic_name(name)
         self._server = DeferredActionServer(
             node,
             FollowJointTrajectory,
             self._own_name,
-            goal_callback=self._asked,
-            handle_accepted_callback=self._begin,
-            cancel_callback=self._cancelled,
+            goal_callback=self._safe(self._asked, GoalResponse.REJECT),
+            handle_accepted_callback=self._safe(self._begin),
+            cancel_callback=self._safe(self._cancelled, CancelResponse.REJECT),
         )
 
     def open(self, controller: str) -> None:
@@ -109,30 +116,98 @@ class TrajectoryProxy:
             raise InputError(f"{name} is this node's own action: name the controller's")
         if name not in self._clients:
             self._clients[name] = ActionClient(self._node, FollowJointTrajectory, name)
-        self._name = name
-        self._node.add_timer(WATCH_S, self._watch, steady=True)
+        self.controller = name
+        self._node.add_timer(WATCH_S, self._safe(self._watch), steady=True)
 
-    def deactivate(self) -> None:
-        """Cancel every goal at the controller, and end it."""
-        for goal in list(self._goals):
-            self._forward_cancel(goal)
-            self._fail(goal, "the joint correction was deactivated, it cancelled the goal")
+    @property
+    def clients(self) -> dict[str, int]:
+        """The actions that goals go to or went to, and how many clients of ours each has."""
+        return dict.fromkeys(self._clients, 1)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a goal is under way."""
+        return bool(self._goals)
 
     def close(self) -> None:
         """Take no goals any more."""
-        self._name = ""
+        self.controller = ""
 
     def destroy(self) -> None:
         """Take both ends down."""
         for end in (self._server, *self._clients.values()):
             end.destroy()
 
+    def _safe(self, act: Callable[..., Any], otherwise: Any = None) -> Callable[..., Any]:
+        """``act``, of which no exception gets out; ``otherwise`` is its answer then."""
+
+        @functools.wraps(act)
+        def callback(*given: Any) -> Any:
+            try:
+                return act(*given)
+            except Exception:
+                self._node.get_logger().error(
+                    f"a defect of this software, please report it:\n{traceback.format_exc()}"
+                )
+                return otherwise
+
+        return callback
+
+    def _when_done(self, future: Future, act: Callable[[_Goal, Any], None], goal: _Goal) -> None:
+        future.add_done_callback(self._safe(lambda done: act(goal, done.result())))
+
+    # ---- stops ----------------------------------------------------------------------------------
+
+    def stop(self, message: Any, why: str) -> bool:
+        """Send a trajectory that stops the robot; it preempts the goals, which end for ``why``.
+
+        False when no controller is there to take it. A goal is cancelled only where the controller
+        rejects the stop: a cancel is a dead stop from any speed.
+        """
+        client = self._clients.get(self.controller)
+        if client is None or not client.server_is_ready():
+            return False
+        goals = list(self._goals)
+        for goal in goals:
+            goal.stopped = why
+            goal.cancel = goal.accepted is None  # follows the acceptance, should it come after all
+        future = client.send_goal_async(FollowJointTrajectory.Goal(trajectory=message))
+
+        def answered(done: Future) -> None:
+            handle = done.result()
+            if handle is not None and handle.accepted:
+                return
+            self._node.get_logger().error(
+                f"{self.controller} rejected a stop: its goals are cancelled"
+            )
+            for goal in goals:
+                self._forward_cancel(goal)
+
+        future.add_done_callback(self._safe(answered))
+        return True
+
+    def cancel(self, why: str) -> None:
+        """Cancel the goals, where no stop could be planned: the controller stops as it does."""
+        for goal in self._goals:
+            goal.stopped = why
+            self._forward_cancel(goal)
+
+    def end(self, why: str) -> None:
+        """End the goals for their callers; the controller's were stopped before."""
+        for goal in list(self._goals):
+            self._fail(goal, goal.stopped or why)
+
     # ---- from the caller ------------------------------------------------------------------------
 
     def _asked(self, request: Any) -> GoalResponse:
-        if self._node.is_active and self._name:
+        why = ""
+        if not (self._node.is_active and self.controller):
+            why = f"the node is {self._node.state}"
+        elif not request.trajectory.points:
+            why = "it has no points, which is no stop: cancel the goal that is under way"
+        if not why:
             return GoalResponse.ACCEPT
-        self._node.get_logger().warning(f"goal rejected: the node is {self._node.state}")
+        self._node.get_logger().warning(f"goal rejected: {why}")
         return GoalResponse.REJECT
 
     def _begin(self, caller: ServerGoalHandle) -> None:
@@ -145,37 +220,33 @@ class TrajectoryProxy:
             code = Result.INVALID_JOINTS if about_joints else Result.INVALID_GOAL
             self._fail(goal, str(error), code)
         except Exception as error:
-            if goal.course is not None:  # it never went out
-                goal.course.reject()
+            if goal.path is not None:  # it never went out
+                self._handling.goal_rejected(goal.path)
             self._node.get_logger().error(traceback.format_exc())
             self._fail(goal, f"a defect of this software, please report it: {error!r}")
 
     def _forward(self, goal: _Goal, request: Any) -> None:
-        """Correct the goal and send it; one without points is a stop, which nothing bars."""
-        goal.servers, client = self._servers(), self._clients[self._name]
+        """Correct the goal and send it."""
+        goal.servers, client = self._servers(), self._clients[self.controller]
         if not (goal.servers and client.server_is_ready()):
-            raise ControllerError(f"no controller offers {self._name}: start it")
-        if not request.trajectory.points:
-            for other in self._goals:  # for controllers that know no goal without points
-                self._forward_cancel(other)
-            self._stop()
-        elif len(goal.servers) > 1:  # each of them would move the robot
+            raise ControllerError(f"no controller offers {self.controller}: start it")
+        if len(goal.servers) > 1:  # each of them would move the robot
             raise ControllerError(
-                f"{len(goal.servers)} nodes offer {self._name}: end all but one; one that was "
+                f"{len(goal.servers)} nodes offer {self.controller}: end all but one; one that was "
                 "killed counts until DDS gives it up"
             )
-        else:
-            request.trajectory, goal.course = self._correct(request.trajectory)
+        request.trajectory, goal.path = self._handling.correct_goal(request.trajectory)
         self._goals.append(goal)
         future = client.send_goal_async(
-            request, lambda message: self._feedback(goal, message.feedback), goal.caller.goal_id
+            request,
+            self._safe(lambda message: self._feedback(goal, message.feedback)),
+            goal.caller.goal_id,
         )
         goal.asked_s = time.monotonic()
-        if goal.course is not None:
-            goal.course.begin(goal.asked_s)
-        if request.trajectory.points:
-            self._sent()
-        future.add_done_callback(lambda done: self._answered(goal, done.result()))
+        if goal.path is not None:
+            goal.path.begin(goal.asked_s)
+        self._handling.goal_sent()
+        self._when_done(future, self._answered, goal)
 
     def _cancelled(self, caller: ServerGoalHandle) -> CancelResponse:
         for goal in self._goals:
@@ -188,33 +259,32 @@ class TrajectoryProxy:
         goal.cancel = True
         if goal.accepted is not None:  # else it follows the acceptance
             goal.asked_s = time.monotonic()
-            future = goal.accepted.cancel_goal_async()
-            future.add_done_callback(lambda done: self._cancel_answered(goal, done.result()))
+            self._when_done(goal.accepted.cancel_goal_async(), self._cancel_answered, goal)
 
     # ---- from the controller --------------------------------------------------------------------
 
     def _answered(self, goal: _Goal, accepted: ClientGoalHandle) -> None:
         goal.asked_s = None
         if not accepted.accepted:
-            if goal.course is not None:
-                goal.course.reject()
-            self._fail(goal, f"{self._name} rejected the goal, its log says why")
+            if goal.path is not None:
+                self._handling.goal_rejected(goal.path)
+            self._fail(goal, f"{self.controller} rejected the goal, its log says why")
             return
         goal.accepted = accepted
-        if goal.course is not None:
-            goal.course.accept()
+        if goal.path is not None:
+            goal.path.accept()
         if goal.cancel or goal.over:
             self._forward_cancel(goal)
         if not goal.over:
             goal.result = accepted.get_result_async()
-            goal.result.add_done_callback(lambda done: self._finished(goal, done.result()))
+            self._when_done(goal.result, self._finished, goal)
 
     def _cancel_answered(self, goal: _Goal, answer: Any) -> None:
         goal.asked_s = None
         if answer.return_code == CancelGoal.Response.ERROR_NONE:
             self._stopped(goal)  # it holds from now on, its result follows
         elif answer.return_code == CancelGoal.Response.ERROR_UNKNOWN_GOAL_ID:
-            self._fail(goal, f"{self._name} does not know the goal any more")
+            self._fail(goal, f"{self.controller} does not know the goal any more")
 
     def _feedback(self, goal: _Goal, feedback: Any) -> None:
         if goal.over:
@@ -223,19 +293,27 @@ class TrajectoryProxy:
         try:
             for point in (feedback.desired, feedback.actual):
                 self._make_taught(names, point)
-        except RobocalError:  # counted by the session
+        except RobocalError:
             return
         feedback.header.frame_id = TAUGHT
         _subtract(feedback.desired, feedback.actual, feedback.error)
         goal.caller.publish_feedback(feedback)
 
     def _make_taught(self, names: tuple[str, ...], point: Any) -> None:
-        """Un-correct positions and velocities; accelerations cannot be, and are left out."""
+        """Un-correct positions and velocities; accelerations cannot be, and are left out.
+
+        So are velocities and efforts that are fewer than the joints, or not finite: there are
+        controllers that have none.
+        """
         point.accelerations = []
+        count = len(names)
+        if len(point.effort) != count or not np.all(np.isfinite(point.effort)):
+            point.effort = []
         if not point.positions:
+            point.velocities = []
             return
-        velocity = np.array(point.velocities) if point.velocities else None
-        position, velocity = self._taught(names, np.array(point.positions), velocity)
+        velocity = np.array(point.velocities) if len(point.velocities) == count else None
+        position, velocity = self._handling.uncorrect(names, np.array(point.positions), velocity)
         point.positions = position.tolist()
         point.velocities = [] if velocity is None else velocity.tolist()
 
@@ -244,12 +322,14 @@ class TrajectoryProxy:
             return
         status, result = answer.status, answer.result
         cancelled = status == GoalStatus.STATUS_CANCELED and goal.caller.is_cancel_requested
-        if status == GoalStatus.STATUS_UNKNOWN:
-            self._fail(goal, f"{self._name} does not know the goal any more")
+        if goal.stopped:
+            self._fail(goal, goal.stopped)
+        elif status == GoalStatus.STATUS_UNKNOWN:
+            self._fail(goal, f"{self.controller} does not know the goal any more")
         elif cancelled or status == GoalStatus.STATUS_SUCCEEDED:
             self._end(goal, status, result)
         else:
-            why = result.error_string or f"{self._name} gave the goal up without a reason"
+            why = result.error_string or f"{self.controller} gave the goal up without a reason"
             self._fail(goal, why, result.error_code or Result.INVALID_GOAL)
 
     def _watch(self) -> None:
@@ -260,14 +340,16 @@ class TrajectoryProxy:
             if not goal.servers <= servers:
                 if goal.result is not None:
                     goal.result.cancel()  # rclpy would keep it for ever
-                self._fail(goal, f"the controller that offered {self._name} vanished")
+                self._fail(goal, f"the controller that offered {self.controller} vanished")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
                 what = "cancel, the robot may still move" if goal.cancel else "goal"
-                self._fail(goal, f"{self._name} did not answer within {ANSWER_S:g} s to the {what}")
+                self._fail(
+                    goal, f"{self.controller} did not answer within {ANSWER_S:g} s to the {what}"
+                )
 
     def _servers(self) -> frozenset[bytes]:
         """Who offers the controller's action: a restarted controller is another one."""
-        infos = self._node.get_publishers_info_by_topic(f"{self._name}/_action/status")
+        infos = self._node.get_publishers_info_by_topic(f"{self.controller}/_action/status")
         return frozenset(bytes(info.endpoint_gid) for info in infos)
 
     # ---- the end --------------------------------------------------------------------------------
@@ -287,13 +369,14 @@ class TrajectoryProxy:
         self._server.end(goal.caller, status, result)
 
     def _stopped(self, goal: _Goal) -> None:
-        if goal.course is not None:
-            goal.course.end(time.monotonic())
+        if goal.path is not None and not goal.stopped:
+            goal.path.end(time.monotonic())
 
 
 def _subtract(desired: Any, actual: Any, error: Any) -> None:
     """Make the error that of two un-corrected points; what one of them lacks is left out."""
     error.accelerations = []
+    error.effort = []
     for name in ("positions", "velocities"):
         pair = [np.array(getattr(point, name)) for point in (desired, actual)]
         there = len(pair[0]) == len(pair[1])

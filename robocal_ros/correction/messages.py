@@ -1,4 +1,8 @@
-"""The joint correction's commands, offsets and status as messages: pure mapping."""
+"""What goes in and out of the joint correction node as messages.
+
+Joint states and trajectories are read and written as they come over the wire; irregular ones go by
+way of a message, which is also what names their fault.
+"""
 
 import math
 from array import array
@@ -6,19 +10,35 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from builtin_interfaces.msg import Duration
 from numpy.typing import NDArray
+from rclpy.serialization import deserialize_message
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.inputs import (
+    JointCommand,
+    TrajectoryCommand,
+    finite_command,
+    joint_command,
+    require_finite,
+    trajectory_command,
+)
 from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.serialized_path import SerializedPath, read_path
 from robocal_ros.correction.status import CorrectionStatus, Offset
-from robocal_ros.nodes.conversions import header, transform_message
+from robocal_ros.correction.wire import JointWire
+from robocal_ros.nodes.conversions import NS, header, transform_message
 
 Array = NDArray[np.float64]
 
 POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
+POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = FIELDS = range(4)
 
 
 def doubles(values: Array) -> "array[float]":
@@ -26,61 +46,221 @@ def doubles(values: Array) -> "array[float]":
     return array("d", values.tobytes())
 
 
+def read_message(data: bytes, kind: type) -> Any:
+    """Build a message.
+
+    Raises
+    ------
+    InputError
+        When the bytes are no such message.
+    """
+    try:
+        return deserialize_message(data, kind)
+    except Exception as error:  # what the middleware says has no type of its own
+        raise InputError(f"this is no {kind.__name__}: {error}") from error
+
+
+def all_finite(*rows: Any) -> bool:
+    """Whether every number of these is finite."""
+    return all(all(map(math.isfinite, row)) for row in rows)
+
+
 # ---- commands and readings ----------------------------------------------------------------------
 
 
-def array_command(names: tuple[str, ...], message: Any) -> JointCommand:
-    """Build from a ``std_msgs/Float64MultiArray``, whose data are the positions of ``names``."""
-    return JointCommand(names, np.array(message.data, dtype=np.float64))
+class JointMessage:
+    """A serialized ``JointState`` that came in, its command, and what goes out for it.
 
+    Parameters
+    ----------
+    wire : of its topic.
+    is_reading : velocities that are as many as joints, and efforts, go out empty where one is not
+        finite: many drivers have none.
 
-def fill_array(message: Any, command: JointCommand) -> None:
-    """Put corrected positions into a ``Float64MultiArray``; its layout stays."""
-    message.data = doubles(command.position)
-
-
-def fill_joints(message: Any, command: JointCommand) -> None:
-    """Put positions and velocities into a ``JointState``; what they do not change stays.
-
-    Velocities of which one is not finite (that of another's joint: a gripper) go out empty.
+    Raises
+    ------
+    InputError
+        When it cannot be read.
     """
-    message.header.frame_id = command.mark
-    message.position = doubles(command.position)
+
+    def __init__(self, wire: JointWire, data: bytes, *, is_reading: bool = False) -> None:
+        self._wire, self._data, self._is_reading = wire, data, is_reading
+        self._command = wire.read(data)
+        self._message: Any = None
+        if self._command is None:
+            self._message = read_message(data, JointState)
+            if is_reading:
+                self._drop_unknown(self._message)
+
+    @staticmethod
+    def _drop_unknown(message: Any) -> None:
+        """Empty what a driver does not know: numbers that are not finite, or too few."""
+        for name in ("velocity", "effort"):
+            values = getattr(message, name)
+            if not (all_finite(values) and len(values) in (0, len(message.name))):
+                setattr(message, name, array("d"))
+
+    def is_finite(self) -> bool:
+        """Whether every number is finite."""
+        message = self._message
+        return message is None or all_finite(message.position, message.velocity, message.effort)
+
+    def command(self) -> JointCommand:
+        """Build the session's command; raises `RefusedError` as `finite_command`."""
+        if self._command is not None:
+            return self._command
+        return joint_command(self._message) if self._is_reading else finite_command(self._message)
+
+    def unchanged(self) -> Any:
+        """What came, to publish."""
+        return self._data if self._message is None else self._message
+
+    def changed(self, command: JointCommand) -> Any:
+        """What to publish: with the command's positions, velocities and mark."""
+        message = self._message
+        if message is None:
+            return self._wire.written(self._data, command)
+        message.header.frame_id = command.mark
+        message.position = doubles(command.position)
+        if command.velocity is not None:
+            message.velocity = doubles(command.velocity)
+        elif self._is_reading:
+            message.velocity = array("d")
+        return message
+
+
+class ArrayMessage:
+    """A ``Float64MultiArray`` that came in, whose data are the positions of ``names``."""
+
+    def __init__(self, names: tuple[str, ...], message: Any) -> None:
+        self._names, self._message = names, message
+
+    def is_finite(self) -> bool:
+        """Whether every number is finite."""
+        return all_finite(self._message.data)
+
+    def command(self) -> JointCommand:
+        """Build the session's command."""
+        return JointCommand(self._names, np.array(self._message.data, dtype=np.float64))
+
+    def unchanged(self) -> Any:
+        """What came, to publish."""
+        return self._message
+
+    def changed(self, command: JointCommand) -> Any:
+        """What to publish: with the command's positions; the layout stays."""
+        self._message.data = doubles(command.position)
+        return self._message
+
+
+def tail_message(command: JointCommand, kind: type, stamp_ns: int) -> Any:
+    """What goes out without a message that came: ``JointState`` or ``Float64MultiArray``."""
+    if kind is Float64MultiArray:
+        return Float64MultiArray(data=doubles(command.position))
+    message = JointState(name=list(command.names), position=doubles(command.position))
+    message.header = header(stamp_ns, command.mark)
     if command.velocity is not None:
-        known = np.all(np.isfinite(command.velocity))
-        message.velocity = doubles(command.velocity if known else np.empty(0))
+        message.velocity = doubles(command.velocity)
+    return message
 
 
-def fill_path(message: Any, command: TrajectoryCommand) -> None:
-    """Put corrected positions and rates into a ``JointTrajectory``; times and efforts stay."""
-    message.header.frame_id = command.mark
-    changed = (command.position, command.velocity, command.acceleration)
-    for name, values in zip(POINT_FIELDS, changed, strict=False):
-        if values is not None:
-            for point, row in zip(message.points, values, strict=True):
-                setattr(point, name, doubles(row))
+class PathMessage:
+    """A trajectory that came in, its command, and what goes out for it.
 
+    Parameters
+    ----------
+    came : serialized, or as a message.
 
-def drop_unknown_rates(message: Any) -> None:
-    """Empty velocities and efforts of a ``JointState`` that are not finite, or of another number.
+    Raises
+    ------
+    InputError
+        When it cannot be read.
 
-    joint_state_broadcaster writes NaN for what the hardware has not: absent ones.
+    Attributes
+    ----------
+    points : how many.
     """
-    for field in ("velocity", "effort"):
-        values = getattr(message, field)
-        if len(values) != len(message.position) or not np.all(np.isfinite(values)):
-            setattr(message, field, doubles(np.empty(0)))
+
+    def __init__(self, came: bytes | JointTrajectory) -> None:
+        self._came = came
+        self._path: SerializedPath | None = read_path(came) if isinstance(came, bytes) else None
+        self._read: Any = None
+        self.points = len(self._message().points) if self._path is None else len(self._path)
+
+    def _message(self) -> Any:
+        if self._read is None:
+            came = self._came
+            self._read = read_message(came, JointTrajectory) if isinstance(came, bytes) else came
+        return self._read
+
+    def is_finite(self) -> bool:
+        """Whether every number is finite."""
+        if self._path is None:
+            points = self._message().points
+            return all_finite(*(getattr(point, name) for point in points for name in POINT_FIELDS))
+        rows = [self._path.rows(field) for field in FIELDS]
+        return all(bool(np.isfinite(values).all()) for values in rows if values is not None)
+
+    def command(self) -> TrajectoryCommand:
+        """Build the session's command.
+
+        Raises
+        ------
+        RefusedError
+            As `trajectory_command`.
+        """
+        path = self._path
+        if path is None:
+            return trajectory_command(self._message())
+        position, counts = path.rows(POSITIONS), path.places[0, :, 1]
+        odd = any(count not in (0, len(path.names)) for count in counts[:EFFORTS])
+        if position is None or odd or counts[ACCELERATIONS] > counts[VELOCITIES]:
+            return trajectory_command(self._message())  # says why
+        efforts = path.rows(EFFORTS)
+        if efforts is not None:
+            require_finite(tuple(f"effort {i + 1}" for i in range(efforts.shape[1])), efforts)
+        rates = path.rows(VELOCITIES), path.rows(ACCELERATIONS)
+        return TrajectoryCommand(
+            path.names, position, path.times_s, *rates, path.stamp_ns, path.frame_id
+        )
+
+    def unchanged(self) -> Any:
+        """What came, to publish."""
+        return self._came
+
+    def changed(self, command: TrajectoryCommand) -> Any:
+        """What to publish: with the command's positions, rates and mark."""
+        if self._path is not None and self._path.takes(command.mark):
+            changed = {
+                POSITIONS: command.position,
+                VELOCITIES: command.velocity,
+                ACCELERATIONS: command.acceleration,
+            }
+            rows = {field: values for field, values in changed.items() if values is not None}
+            return self._path.changed(command.mark, rows)
+        message = self._message()
+        message.header.frame_id = command.mark
+        rates = (command.position, command.velocity, command.acceleration)
+        for name, values in zip(POINT_FIELDS, rates, strict=False):
+            if values is not None:
+                for point, row in zip(message.points, values, strict=True):
+                    setattr(point, name, doubles(row))
+        return message
 
 
-def is_finite(message: Any) -> bool:
-    """Whether every number of a command or reading is finite."""
-    if hasattr(message, "points"):
-        rows = [getattr(point, name) for point in message.points for name in POINT_FIELDS]
-    elif hasattr(message, "data"):
-        rows = [message.data]
-    else:
-        rows = [message.position, message.velocity, message.effort]
-    return all(all(map(math.isfinite, row)) for row in rows)
+def stop_message(names: Sequence[str], position: Array, after_s: float) -> JointTrajectory:
+    """To rest at ``position`` (k,) after a time, at once.
+
+    One point: a controller makes a cubic to it, from where and as fast as it is when the message
+    comes, so that nothing of the time on the way is a step.
+    """
+    ns = round(after_s * NS)
+    point = JointTrajectoryPoint(
+        positions=doubles(position),
+        velocities=doubles(np.zeros(len(position))),
+        time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
+    )
+    return JointTrajectory(joint_names=list(names), points=[point])
 
 
 # ---- what the node tells ------------------------------------------------------------------------
@@ -100,6 +280,7 @@ class CorrectionMessages:
     ) -> None:
         self._name = name
         self._shadow = shadow
+        self._joint_names = list(nominal.joint_names)
         self._own = {
             "robot": nominal.name,
             "serial": serial,
@@ -121,8 +302,14 @@ class CorrectionMessages:
             shadow=self._shadow,
         )
 
-    def status(self, status: CorrectionStatus, sources: str, stamp_ns: int) -> StatusMessage:
-        """What the correction does; ``sources``: what is wrong with who sends commands."""
+    def status(
+        self, status: CorrectionStatus, commanders: str, lease: str, history: str, stamp_ns: int
+    ) -> StatusMessage:
+        """What the correction does.
+
+        ``commanders``: who else commands; ``lease``: who holds one; ``history``: what is wrong
+        with it; empty where all is well.
+        """
         return StatusMessage(
             header=header(stamp_ns, ""),
             **self._own,
@@ -139,7 +326,16 @@ class CorrectionMessages:
             waiting_tool_revision=status.waiting_tool or 0,
             stale=status.stale,
             mismatch=status.mismatch,
-            commanders=sources,
+            commanders=commanders,
+            lease=lease,
+            history=history,
+            joint_names=self._joint_names,
+            withheld=doubles(status.withheld),
+            withheld_most=doubles(status.withheld_most),
+            withheld_mm=status.withheld_m * 1e3,
+            withheld_most_mm=status.withheld_most_m * 1e3,
+            lag_s=status.lag_s,
+            overtaken=status.overtaken,
             tool_shift_mm=status.tcp_shift_m * 1e3,
             remaining_mm=status.remaining_m * 1e3,
             largest_offset=status.largest_shift,
@@ -162,13 +358,15 @@ def in_words(status: CorrectionStatus) -> str:
 
 
 def _said(status: CorrectionStatus) -> str:
+    for reason, detail in status.held.items():
+        return f"nothing goes out, {reason.value}: {detail}"
     if status.mismatch:
         return f"nothing goes out, {Reason.START_MISMATCH.value}: {status.mismatch}"
     if not status.enabled:
-        return "off, blending out with the next commands" if status.active else "off"
+        return "off, the offset goes to zero with the next commands" if status.active else "off"
     parts = [] if status.revision is None else [f"model revision {status.revision}"]
     parts += [f"tool revision {status.tool_revision}"] if status.new_tool else []
     if not parts:
-        return "on, but there is no model and no tool yet"
-    settled = "on" if status.settled else "on, blending with the next commands"
+        return "on, but there is no model and no tool yet: nothing is corrected"
+    settled = "on" if status.settled else "on, the offset changes with the next commands"
     return f"{settled}: {' and '.join(parts)}"

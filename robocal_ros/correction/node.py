@@ -1,5 +1,6 @@
 """The joint correction node: taught joints in, corrected ones out (docs/joint_correction.md)."""
 
+import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -7,33 +8,50 @@ from typing import Any
 
 import numpy as np
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
-from robocal_msgs.msg import JointOffset, KinematicModel, ToolFrame
+from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import SetBool
+from std_msgs.msg import Float64, Float64MultiArray
+from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.correction import messages, serialized_path
+from robocal_ros.core.codes import Code
+from robocal_ros.correction import serialized_path
 from robocal_ros.correction.action import TrajectoryProxy
-from robocal_ros.correction.command_sources import CommandSources
-from robocal_ros.correction.courses import Course
+from robocal_ros.correction.graph import (
+    CommandSources,
+    GraphViolation,
+    GraphWatch,
+    JointSources,
+    Leases,
+)
 from robocal_ros.correction.inputs import TrajectoryCommand, offered_model, offered_tool
-from robocal_ros.correction.path_messages import PathMessage
-from robocal_ros.correction.periods import LONGEST_GAP_S
+from robocal_ros.correction.messages import (
+    ArrayMessage,
+    JointMessage,
+    PathMessage,
+    in_words,
+    stop_message,
+    tail_message,
+)
+from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
+from robocal_ros.correction.reported import CorrectionState
+from robocal_ros.correction.robot_stop import REACTION_S, RobotStop, RobotTrack
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.settings import (
     SETTINGS,
     arms,
     command_joints,
+    joint_limits,
     session_config,
 )
-from robocal_ros.correction.settled_streams import JointStream, ReadingStream, TargetStream
 from robocal_ros.correction.staged import load_kernels
-from robocal_ros.correction.stream_messages import ArrayMessage, JointMessage
+from robocal_ros.correction.wire import JointWire
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.nodes.diagnostics import Health
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
@@ -45,12 +63,23 @@ STATES = "joint_states"
 ACTION = "follow_joint_trajectory"
 MODEL = "kinematic_model"
 TOOL = "tool"
+LEASE = "motion_lease"
+CONTROLLER = "controller_state"
+SCALING = "speed_scaling"
 KINDS = {
     TRAJECTORY: JointTrajectory,
     TARGETS: JointState,
     COMMANDS: Float64MultiArray,
     STATES: JointState,
 }
+ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
+AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
+STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither hastens nor turns back
+TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
+TAIL_LASTS_S = 0.5  # after the last message nothing more may be to go out
+ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
+STOP_LOOK_S = 0.02
+PERCENT = 0.01
 
 
 class JointCorrectionNode(HouseNode):
@@ -60,6 +89,12 @@ class JointCorrectionNode(HouseNode):
     SETTINGS = SETTINGS
     _made_for = ""  # serial of the model in use
     _proxy: TrajectoryProxy | None = None
+    _ending = False
+
+    @property
+    def is_active(self) -> bool:
+        """True while the node acts; it does so until it has stopped what it moves."""
+        return self._ending or super().is_active
 
     def configure(self) -> None:
         """Load the models, then open the topics."""
@@ -71,15 +106,29 @@ class JointCorrectionNode(HouseNode):
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
         serialized_path.load_kernels()
-        self._session.enable(self.settings["enable_on_start"])
-        self._streams = CommandSources(max(config.stream_gap_s, LONGEST_GAP_S))
+        if self.settings["enable_on_start"]:
+            self._session.enable(True)
+        near = config.start_near(nominal)
+        self._track = RobotTrack(nominal, near, config.joint_state_age_s)
+        self._stopping = RobotStop(
+            nominal, joint_limits(self.settings)[1], self._track, self._send_plan
+        )
+        self._arm_names = nominal.joint_names
+        self._streams = CommandSources(max(config.stream_gap_s, ONE_SOURCE_S))
         self._paths = CommandSources(config.stream_gap_s)
         self._senders = {TARGETS: self._streams, COMMANDS: self._streams, TRAJECTORY: self._paths}
         self._sources = {topic: SourceGuard(self, topic) for topic in KINDS}
-        self._commanded = False
+        self._leases = Leases(nominal.name, serial)
+        self._violation: GraphViolation | None = None
+        self._commanded = self._by_action = False
+        self._stream, self._stream_s = TARGETS, -math.inf
+        self._scalings: dict[str, float] = {}
         self._open_topics()
-        told = self._session, self.settings, nominal, reference
-        self._report = CorrectionReport(*told, self._offsets, self._statuses, self.now_ns)
+        self._open_action()
+        self._report = CorrectionReport(
+            self._session, self.settings, nominal, reference, self._offsets, self._statuses,
+            self.now_ns,
+        )  # fmt: skip
         self._release.append(self._report.close)
 
     def _open_topics(self) -> None:
@@ -91,42 +140,84 @@ class JointCorrectionNode(HouseNode):
         self._statuses = self.add_output(StatusMessage, "~/status", qos.LATCHED)
         self.add_input(KinematicModel, MODEL, self._on_model, qos.LATCHED)
         self.add_input(ToolFrame, TOOL, self._on_tool, qos.LATCHED)
-        targets = self._session, self._outputs[TARGETS], TARGETS, self._streams
-        streams: dict[str, JointStream] = {
-            STATES: ReadingStream(self._session, self._outputs[STATES], self.now_ns),
-            TARGETS: TargetStream(*targets, partial(self._tell_offset, JointOffset.STREAM)),
+        self.add_input(MotionLease, LEASE, self._on_lease, qos.LATCHED)
+        self.add_input(Float64, SCALING, self._on_scaling, qos.NEWEST)
+        try:
+            from control_msgs.msg import JointTrajectoryControllerState as ControllerState
+        except ImportError:  # an old control_msgs
+            pass
+        else:
+            self.add_input(ControllerState, CONTROLLER, self._on_controller, qos.NEWEST)
+        states = partial(JointMessage, JointWire(is_reading=True), is_reading=True)
+        acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None], Any]] = {
+            STATES: (states, self._on_states, qos.SENSOR),
+            TARGETS: (
+                partial(JointMessage, JointWire()),
+                partial(self._on_target, TARGETS),
+                qos.HEARTBEAT,
+            ),
+            COMMANDS: (
+                partial(ArrayMessage, self._names),
+                partial(self._on_target, COMMANDS),
+                qos.HEARTBEAT,
+            ),
+            TRAJECTORY: (PathMessage, self._on_path, qos.RELIABLE),
         }
-        acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None]]] = {
-            STATES: (streams[STATES].read, self._on_states),
-            TARGETS: (streams[TARGETS].read, partial(self._on_target, TARGETS)),
-            COMMANDS: (partial(ArrayMessage, self._names), partial(self._on_target, COMMANDS)),
-            TRAJECTORY: (PathMessage, self._on_path),
-        }
-        for topic, (read, act) in acts.items():
-            receive, kind = self._guarded(topic, read, act), KINDS[topic]
-            if topic in streams:
-                receive = streams[topic].before(self._sources[topic], receive)
-            profile = qos.SENSOR if topic == STATES else qos.RELIABLE
-            opened = self.add_input(kind, topic, receive, profile, raw=topic != COMMANDS)
+        for topic, (read, act, profile) in acts.items():
+            receive = self._guarded(topic, read, act)
+            opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
             if topic in self._senders:
                 self._senders[topic].inputs[topic] = opened
         self.add_service(SetBool, "~/enable", self._on_enable)
+        self.add_service(Trigger, "~/acknowledge", self._on_acknowledge)
+        self.add_service(Trigger, "~/take_over", self._on_take_over)
         self.add_timer(POLL_S, self._look_at_graph, steady=True)
         self.add_timer(LOOK_S, self._look, steady=True)
+        self._tail_timer = self.add_timer(TAIL_S, self._on_tail, steady=True)
+        self._tail_timer.cancel()
+        self._stop_timer = self.add_timer(STOP_LOOK_S, self._watch_stop, steady=True)
+        self._stop_timer.cancel()
+
+    def _open_action(self) -> None:
         if self.settings[ACTION]:
             if self._proxy is None:
-                acting = self._goal, self._taught, self._stop, self._tell_path
-                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", *acting)
+                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", self)
             self._proxy.open(self.settings[ACTION])
+        commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
+        self._graph = GraphWatch(
+            self,
+            commands,
+            {} if self._proxy is None else self._proxy.clients,
+            JointSources(self, self.resolve_topic_name(STATES), self._arm_names),
+            self._leases,
+            self.resolve_topic_name(LEASE),
+        )
+        self._release.append(self._graph.close)
 
     def activate(self) -> None:
-        """Tell at once what is done."""
+        """Look who else is there, and tell at once what is done."""
+        self._look_at_graph()
         self._tell()
 
     def deactivate(self) -> None:
-        """Cancel the goals under way."""
-        if self._proxy is not None:
-            self._proxy.deactivate()
+        """Bring the robot to rest, for half a second at most; goals under way are stopped."""
+        why = "the joint correction is deactivated"
+        self._ending, until_s = True, time.monotonic() + ENDING_S
+        try:
+            self._session.hold(Reason.STOPPED, why, time.monotonic())
+            self._stop(why)
+            while time.monotonic() < until_s and (
+                self._emit_tail() or self._stopping.look(time.monotonic(), self._scaling)
+            ):
+                time.sleep(self._tail_period_s())
+                self.take_waiting()  # where the robot is
+            if self._proxy is not None:
+                self._proxy.end(why)
+            if self._stopping.why:
+                self.get_logger().warning(f"{why} while the robot is still being stopped")
+        finally:
+            self._session.release(Reason.STOPPED)
+            self._ending = False
 
     def cleanup(self) -> None:
         """Take no goals any more."""
@@ -153,10 +244,35 @@ class JointCorrectionNode(HouseNode):
         self._tell()
 
     def _on_enable(self, request: Any, response: Any) -> Any:
+        """Answer whether what was asked for is so now."""
         self._session.enable(request.data)
-        response.success = True
-        response.message = messages.in_words(self._session.status())
+        status = self._session.status(time.monotonic())
+        wanted = CorrectionState.ON if request.data else CorrectionState.OFF
+        response.success = status.state is wanted and not status.shadow
+        response.message = in_words(status)
         self.get_logger().info(f"enable {request.data}: {response.message}")
+        self._tell()
+        return response
+
+    def _on_acknowledge(self, _: Any, response: Any) -> Any:
+        """End a START_MISMATCH, and take note of a damaged history."""
+        self._session.acknowledge()
+        self._report.acknowledge()
+        return self._answer("acknowledge", "", response)
+
+    def _on_take_over(self, _: Any, response: Any) -> Any:
+        """Look again at what was refused for its revision or its size."""
+        self._session.take_over()
+        status = self._session.status()
+        refused = status.last_refusal if status.waiting_revision is not None else ""
+        return self._answer("take_over", refused, response)
+
+    def _answer(self, what: str, refused: str, response: Any) -> Any:
+        words = refused or in_words(self._session.status(time.monotonic()))
+        response.success = not refused
+        code = Code.CONFLICT if refused else Code.ACCEPT
+        response.message = trigger_text(0, code, words)
+        self.get_logger().info(f"{what}: {words}")
         self._tell()
         return response
 
@@ -174,12 +290,11 @@ class JointCorrectionNode(HouseNode):
 
         def receive(came: Any) -> None:
             message = read(came)
-            stop = topic == TRAJECTORY and not message.points  # nothing may hold it up
-            if guard.fault and not stop:
+            if guard.fault:
                 self._session.refuse(Reason.OWN_OUTPUT, guard.fault)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
-            rivals = senders.hear(topic, time.monotonic()) if senders and not stop else ""
+            rivals = senders.hear(topic, time.monotonic()) if senders else ""
             if rivals:
                 self._session.refuse(Reason.TWO_SOURCES, rivals)
             act(message)
@@ -187,24 +302,42 @@ class JointCorrectionNode(HouseNode):
         return receive
 
     def _on_target(self, topic: str, message: JointMessage | ArrayMessage) -> None:
-        command, now = self._session.counted(message.command), time.monotonic()
-        self._put_out(topic, message, command, self._session.target(command, now))
+        now = time.monotonic()
+        self._stream, self._stream_s = topic, now
+        try:
+            command = self._session.counted(message.command)
+            self._put_out(topic, message, command, self._session.target(command, now))
+        finally:
+            self._arm_tail()
         self._tell_offset(JointOffset.STREAM, now)
 
     def _on_states(self, message: JointMessage) -> None:
-        command, act = self._session.counted(message.command), self._session.reading
+        command, now = self._session.counted(message.command), time.monotonic()
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
-        self._put_out(STATES, message, command, act(command, time.monotonic(), age))
+        taught = self._session.reading(command, now, age)
+        self._track.read(command, now)
+        self._put_out(STATES, message, command, taught)
 
     def _on_path(self, message: PathMessage) -> None:
-        if message.points:
-            self._put_out(TRAJECTORY, message, *self._corrected(message))
-            if self._session.course is not None:
-                self._session.course.begin(time.monotonic())
-            self._tell_path()
-        else:
-            self._put_out(TRAJECTORY, message, _STOP, _STOP)
-            self._stop()
+        if not message.points:
+            self._stop_for_no_points()
+            return
+        self._put_out(TRAJECTORY, message, *self._corrected(message))
+        self._by_action = False
+        if self._session.path is not None:
+            self._session.path.begin(time.monotonic())
+        self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
+
+    def _stop_for_no_points(self) -> None:
+        """Do what its sender means: a controller drops such a trajectory and drives on."""
+        words = (
+            f"{TRAJECTORY} has no points, which stops no robot: a controller drops it and drives "
+            "on; the robot is slowed down in its place"
+        )
+        if self._log_limit.allows(TRAJECTORY, words, time.monotonic()):
+            self.get_logger().error(words)
+        if not self._shadow:
+            self._stop(f"{TRAJECTORY} without points")
 
     def _corrected(
         self, message: PathMessage, *, is_goal: bool = False
@@ -220,8 +353,10 @@ class JointCorrectionNode(HouseNode):
             same = command is came
             self._outputs[topic].publish(message.unchanged() if same else message.changed(command))
 
-    def _goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, Course | None]:
-        """A goal's trajectory, corrected, and its course; as it came in shadow mode."""
+    # ---- goals of the action --------------------------------------------------------------------
+
+    def correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
+        """A goal's trajectory, corrected, and its path; as it came in shadow mode."""
         message = PathMessage(trajectory)
         try:
             came, command = self._corrected(message, is_goal=True)
@@ -230,33 +365,152 @@ class JointCorrectionNode(HouseNode):
             if held_back or not self._shadow:
                 raise
             return trajectory, None
-        course = self._session.course
+        path = None if self._shadow else self._session.path
         try:
-            return trajectory if command is came else message.changed(command), course
+            return trajectory if command is came else message.changed(command), path
         except Exception:
-            if course is not None:  # it never goes out
-                course.reject()
+            if path is not None:  # it never goes out
+                self._session.reject(path)
             raise
 
-    def _taught(self, names: Any, position: Any, velocity: Any) -> Any:
+    def goal_sent(self) -> None:
+        """Tell what a goal is corrected by."""
+        self._by_action = True
+        self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
+
+    def goal_rejected(self, path: SentPath) -> None:
+        """What the goal took the place of goes on."""
+        self._session.reject(path)
+
+    def uncorrect(self, names: Any, position: Any, velocity: Any) -> Any:
+        """As `CorrectionSession.taught`, now."""
         return self._session.taught(names, position, velocity, time.monotonic())
 
-    def _stop(self) -> None:
-        self._session.trajectory(_STOP, time.monotonic())
+    # ---- stops, and what goes out without a message ---------------------------------------------
+
+    def _stop(self, why: str) -> None:
+        """Bring what this node moves to rest: by what was put out, else by where the robot is."""
+        now = time.monotonic()
+        if self._shadow:
+            return
+        planned = self._session.stop(now, AHEAD_S)
+        self._arm_tail()
+        sent = True
+        if planned is not None:
+            way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
+            after_s = way_s / STOP_SHARE
+            sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
+            self._stopping.watch(why, after_s, now)
+        elif self._by_action and self._proxy is not None and self._proxy.busy:
+            sent = self._stopping.begin(why, now)
+        if not sent and self._proxy is not None:
+            self._proxy.cancel(why)
+        if self._stopping.why:
+            self._stop_timer.reset()
+
+    def _send_plan(self, plan: JointPlan) -> None:
+        self._send_stop(self._arm_names, plan.q[-1], plan.duration_s, self._stopping.why)
+
+    def _send_stop(self, names: Any, position: Any, after_s: float, why: str) -> bool:
+        message = stop_message(names, position, after_s)
+        if self._by_action and self._proxy is not None:
+            return self._proxy.stop(message, why)
+        self._outputs[TRAJECTORY].publish(message)
+        return True
+
+    def _watch_stop(self) -> None:
+        if not self._stopping.look(time.monotonic(), self._scaling):
+            self._stop_timer.cancel()
+            if self._stopping.fault:
+                self.get_logger().error(self._stopping.fault)
+            if self._proxy is not None:
+                self._proxy.end("stopped")
+
+    def _arm_tail(self) -> None:
+        """Look after a period of the stream whether something goes out without a message."""
+        if not self._shadow:
+            self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
+            self._tail_timer.reset()
+
+    def _tail_period_s(self) -> float:
+        period = self._session.stream_period_s
+        return min(max(period, 1e-3), 0.1) if math.isfinite(period) else TAIL_S
+
+    def _on_tail(self) -> None:
+        if not self._emit_tail() and time.monotonic() - self._stream_s > TAIL_LASTS_S:
+            self._tail_timer.cancel()
+
+    def _emit_tail(self) -> bool:
+        """Put out what must go out now although no message came; whether something did."""
+        command = self._session.tail(time.monotonic())
+        if command is not None:
+            kind = KINDS[self._stream]
+            self._outputs[self._stream].publish(tail_message(command, kind, self.now_ns()))
+        return command is not None
+
+    # ---- the controller -------------------------------------------------------------------------
+
+    @property
+    def _scaling(self) -> float:
+        """How fast the controller's clock runs, by who says least."""
+        return min(self._scalings.values(), default=1.0)
+
+    def _on_controller(self, message: Any) -> None:
+        """Where the controller is. Older ones leave the scaling at 0, and so say nothing by it."""
+        self._scale(CONTROLLER, float(getattr(message, "speed_scaling_factor", math.nan)))
+        position = np.array(message.reference.positions, dtype=np.float64)
+        self._session.controller(
+            tuple(message.joint_names),
+            position if len(position) == len(message.joint_names) else np.empty(0),
+            self._scaling,
+            time.monotonic(),
+        )
+
+    def _on_scaling(self, message: Any) -> None:
+        """In percent, as ur_robot_driver's speed_scaling_state_broadcaster publishes it."""
+        self._scale(SCALING, float(message.data) * PERCENT)
+        self._session.controller((), np.empty(0), self._scaling, time.monotonic())
+
+    def _scale(self, topic: str, scaling: float) -> None:
+        if math.isfinite(scaling) and (scaling > 0.0 or topic in self._scalings):
+            self._scalings[topic] = min(max(scaling, 0.0), 1.0)
+
+    # ---- who else commands ----------------------------------------------------------------------
+
+    def _on_lease(self, message: Any) -> None:
+        self._leases.hear(message, time.monotonic())
+        self._judge_graph()
+
+    def _look_at_graph(self) -> None:
+        for guard in self._sources.values():
+            guard.look()
+        self._streams.look()
+        self._judge_graph()
+
+    def _judge_graph(self) -> None:
+        """Hold the program's commands while somebody else may move the robot."""
+        now, before = time.monotonic(), self._violation
+        found = self._violation = self._graph.look(now)
+        for reason in (Reason.OTHER_COMMANDER, Reason.LEASED):
+            if found is not None and found.reason is reason:
+                self._session.hold(reason, found.detail, now)
+            else:
+                self._session.release(reason)
+        if found is not None and (before is None or before.reason is not found.reason):
+            log = self.get_logger()
+            tell = log.info if found.reason is Reason.LEASED else log.error
+            tell(f"nothing goes out, {found.reason.value}: {found.detail}")
+            self._stop(f"{found.reason.value}: {found.detail}")
+        elif found is None and before is not None:
+            self.get_logger().info(f"over: {before.reason.value}")
+        if (found is None) is not (before is None):
+            self._tell()
 
     # ---- what is reported -----------------------------------------------------------------------
 
     def _tell_offset(self, cause: int, now_s: float) -> None:
         self._commanded = True
         self._report.offset(cause, now_s)
-
-    def _tell_path(self) -> None:
-        self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
-
-    def _look_at_graph(self) -> None:
-        for guard in self._sources.values():
-            guard.look()
-        self._streams.look()
 
     def _look(self) -> None:
         """Let time pass, and tell what has changed."""
@@ -267,11 +521,13 @@ class JointCorrectionNode(HouseNode):
         self._tell(only_news=True)
 
     def _tell(self, *, only_news: bool = False) -> None:
-        sources = "; ".join([*self._faults(), *self._rivals()])
-        self._report.status(sources, only_news=only_news)
+        commanders = "; ".join([*self._faults(), *self._rivals()])
+        self._report.status(commanders, self._graph.lease, only_news=only_news)
 
     def _faults(self) -> list[str]:
-        return [guard.fault for guard in self._sources.values() if guard.fault]
+        """Who must not be there."""
+        faults = [guard.fault for guard in self._sources.values() if guard.fault]
+        return [*faults, *filter(None, [self._graph.commanders])]
 
     def _rivals(self) -> list[str]:
         now = time.monotonic()
@@ -283,10 +539,8 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        return self._report.health(self._faults(), self._rivals())
-
-
-_STOP = TrajectoryCommand((), np.empty((0, 0)), np.empty(0))
+        faults = [*self._faults(), *filter(None, [self._stopping.fault])]
+        return self._report.health(faults, self._rivals())
 
 
 def main() -> None:

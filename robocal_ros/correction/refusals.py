@@ -52,6 +52,8 @@ _CODES = {
     Reason.STALE_JOINTS: Code.STALE,
     Reason.START_MISMATCH: Code.CONFLICT,
     Reason.TWO_SOURCES: Code.CONFLICT,
+    Reason.OTHER_COMMANDER: Code.CONFLICT,
+    Reason.LEASED: Code.CONFLICT,
 }
 
 

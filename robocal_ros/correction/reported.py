@@ -83,7 +83,7 @@ def _idle(told: ToldCorrection, thermal: Head) -> str:
     if told.shadow:
         return "is in shadow mode, nothing is corrected: start it with shadow false"
     if told.state is CorrectionState.MISMATCH:
-        return f"puts nothing out, {told.mismatch}: see where the robot stands, call ~/enable"
+        return f"puts nothing out, {told.mismatch}: see where the robot stands, call ~/acknowledge"
     if not told.enabled:
         return "is OFF: call ~/enable"
     if told.state is CorrectionState.WITHOUT_MODEL:

@@ -12,10 +12,18 @@ from robocal_ros.core import frames
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
+from robocal_ros.correction.limiter import OffsetLimits
 from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.storage.robots import load_description, load_robot, robot_file_hash
+from robocal_ros.storage.robots import (
+    FULL_SPEED_IN_S,
+    load_description,
+    load_robot,
+    robot_file_hash,
+)
+
+Array = NDArray[np.float64]
 
 NOMINAL = "nominal"
 
@@ -79,7 +87,7 @@ SETTINGS = (
         "velocity_limits",
         [0.0],
         "Largest speed of each joint after correction, rad/s (sliding: m/s), one number for each; "
-        "0: as the robot file says",
+        "0: as the robot file says; without any the correction cannot be enabled",
         low=0.0,
         high=1e3,
     ),
@@ -134,33 +142,27 @@ SETTINGS = (
         high=30.0,
     ),
     Setting(
-        "blend_deg_s",
-        0.5,
-        "Fastest change of a joint's correction",
+        "offset_deg_s",
+        2.0,
+        "Fastest change of what is added to a joint while the program moves none; its acceleration "
+        "is 10 times that, and in motion both are larger: 5 and 100 times that",
         unit="deg/s",
-        low=0.001,
-        high=5.0,
+        low=0.01,
+        high=2.0,
     ),
     Setting(
-        "blend_mm_s",
-        1.0,
-        "Fastest change of a sliding joint's correction",
+        "offset_mm_s",
+        5.0,
+        "and to a sliding joint",
         unit="mm/s",
-        low=0.001,
-        high=20.0,
-    ),
-    Setting(
-        "longest_step_s",
-        0.02,
-        "A pause in a stream of targets advances a blend by no more than this",
-        unit="s",
-        low=1e-4,
-        high=0.1,
+        low=0.01,
+        high=5.0,
     ),
     Setting(
         "stream_gap_s",
         0.1,
-        "After a longer pause a stream of targets must begin again where the robot stands",
+        "After a longer pause, and one of two periods, a stream of targets goes on only where the "
+        "robot can be soon",
         unit="s",
         low=0.01,
         high=10.0,
@@ -226,13 +228,29 @@ def command_joints(settings: Mapping[str, Any], arm: SerialArm) -> tuple[str, ..
     return names
 
 
-def _velocity_limits(settings: Mapping[str, Any]) -> NDArray[np.float64]:
-    """(n,) largest speeds, rad/s (prismatic: m/s); infinite where neither says one."""
+def _offset_limits(rate: float) -> OffsetLimits:
+    """The limits at rest and in motion that belong to a rate at rest (docs/joint_correction.md)."""
+    return OffsetLimits(rate, 10.0 * rate, 5.0 * rate, 100.0 * rate)
+
+
+def joint_limits(settings: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Speeds and accelerations (n,), rad/s (prismatic: m/s) ...; infinite where none is known.
+
+    An acceleration that nobody says is that to full speed in half a second.
+
+    Raises
+    ------
+    InputError
+        When the numbers of joints and of velocity limits differ.
+    """
     robot = load_description(settings["robot"])
     given, count = np.array(settings["velocity_limits"]), robot.arm.n
     if len(given) != count and given.any():
         raise InputError(f"velocity_limits has {len(given)} numbers, the arm {count} joints")
-    return np.where(given > 0.0, given, np.nan_to_num(robot.max_velocity, nan=np.inf))
+    file = np.where(np.isfinite(robot.max_velocity), robot.max_velocity, np.inf)
+    speed = np.where(given > 0.0, given, file)
+    known = np.isfinite(robot.max_acceleration)
+    return speed, np.where(known, robot.max_acceleration, speed / FULL_SPEED_IN_S)
 
 
 def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
@@ -250,13 +268,13 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
             settings[f"{what}_tcp_mm"] * 1e-3, *(float(np.radians(x)) for x in degrees)
         )
 
+    speeds, accelerations = joint_limits(settings)
     nameless = settings["serial"] in ("", NO_SERIAL)
     return CorrectionConfig(
         thermal=bounds("thermal"),
         tool=bounds("tool"),
-        blend_rad_s=float(np.radians(settings["blend_deg_s"])),
-        blend_m_s=settings["blend_mm_s"] * 1e-3,
-        longest_step_s=settings["longest_step_s"],
+        turning=_offset_limits(float(np.radians(settings["offset_deg_s"]))),
+        sliding=_offset_limits(settings["offset_mm_s"] * 1e-3),
         stream_gap_s=settings["stream_gap_s"],
         start_rad=float(np.radians(settings["start_deg"])),
         start_m=settings["start_mm"] * 1e-3,
@@ -266,7 +284,8 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         policy=Policy(settings["policy"]),
         model_age_s=settings["model_age_s"],
         free_axis=settings["free_axis"],
-        velocity_limits=_velocity_limits(settings),
+        velocity_limits=speeds,
+        acceleration_limits=accelerations,
         robot_file_hash=robot_file_hash(settings["robot"]) if nameless else "",
         shadow=settings["shadow"],
     )

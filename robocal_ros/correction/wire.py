@@ -9,10 +9,8 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.correction.inputs import JointCommand
-from robocal_ros.correction.joint_lanes import BEGIN, lanes
 
 HEAD = b"\0\1\0\0"  # plain, little endian
 STAMP, FRAME = len(HEAD), len(HEAD) + 8  # where they begin
@@ -41,36 +39,22 @@ class _Layout:
         )
 
 
-@dataclass(frozen=True)
-class Lanes:
-    """What compiled code needs to know of messages that are laid out alike.
+class JointWire:
+    """Reads the joint messages of one topic and writes what goes out for them.
 
-    Attributes
+    Parameters
     ----------
-    names, frame_id : in them.
-    form : (2, lanes) what all have, and a mask of it.
-    goes : (lanes,) room for what goes out, laid out.
-    layout : of both: see `joint_lanes`.
-    sizes : of both, bytes.
+    is_reading : velocities and efforts of which one is not finite are none: many drivers have
+        none, and say NaN.
     """
 
-    names: tuple[str, ...]
-    frame_id: str
-    form: NDArray[np.float64]
-    goes: NDArray[np.float64]
-    layout: NDArray[np.int64]
-    sizes: tuple[int, int]
-
-
-class JointWire:
-    """Reads the joint messages of one topic and writes what goes out for them."""
-
-    def __init__(self) -> None:
+    def __init__(self, *, is_reading: bool = False) -> None:
+        self._is_reading = is_reading
         self._layout: _Layout | None = None
+        self._counts: tuple[int, ...] = ()  # of what goes out: positions, velocities, efforts
         self._out = bytearray()
-        self._made_for: tuple[_Layout | None, str] = (None, "")
+        self._made_for: tuple[_Layout | None, str, tuple[int, ...]] = (None, "", ())
         self._places: list[int] = []
-        self._lanes: Lanes | None = None
 
     def read(self, data: bytes) -> JointCommand | None:
         """The command in a message; None for one that is not regular, finite and whole."""
@@ -84,10 +68,14 @@ class JointWire:
             for (_, count), place in zip(layout.counts, layout.places, strict=True)
         )
         # for so few numbers this takes a fifth of the time of NumPy's isfinite
-        if not all(all(map(math.isfinite, n.tolist())) for n in (position, velocity, effort)):
+        finite = [all(map(math.isfinite, n.tolist())) for n in (position, velocity, effort)]
+        if not (all(finite) or (finite[0] and self._is_reading)):
             return None
+        self._counts = tuple(
+            count if known else 0 for (_, count), known in zip(layout.counts, finite, strict=True)
+        )
         sec, nanosec = struct.unpack_from("<iI", data, STAMP)
-        rates = velocity.copy() if len(velocity) else None
+        rates = velocity.copy() if self._counts[1] else None
         stamp = sec * NS + nanosec
         return JointCommand(layout.names, position.copy(), rates, stamp, layout.frame_id)
 
@@ -96,69 +84,59 @@ class JointWire:
         layout = self._layout
         if layout is None:
             raise ValueError("no message was read")
-        self._make(layout, command.mark)
+        velocity = b"" if command.velocity is None else command.velocity.tobytes()
+        counts = (self._counts[0], len(velocity) // 8, self._counts[2])
+        self._make(layout, command.mark, counts)
         out = self._out
         out[STAMP:FRAME] = data[STAMP:FRAME]
-        effort = data[layout.places[2] : layout.places[2] + 8 * layout.counts[2][1]]
-        velocity = b"" if command.velocity is None else command.velocity.tobytes()
+        effort = data[layout.places[2] : layout.places[2] + 8 * counts[2]]
         for at, values in zip(
             self._places, (command.position.tobytes(), velocity, effort), strict=True
         ):
             out[at : at + len(values)] = values
         return bytes(out)
 
-    def lanes(self, mark: str) -> Lanes | None:
-        """Room for messages laid out as the one read last; None after an irregular one."""
-        layout = self._layout
-        if layout is None:
-            return None
-        self._make(layout, mark)
-        if self._lanes is None:
-            self._lanes = self._in_lanes(layout)
-        return self._lanes
-
-    def _in_lanes(self, layout: _Layout) -> Lanes:
-        known, mask = bytearray(layout.size), bytearray(layout.size)
-        pieces = [(0, HEAD), (FRAME, layout.head)]
-        pieces += [(at, struct.pack("<I", count)) for at, count in layout.counts]
-        for at, piece in pieces:
-            known[at : at + len(piece)], mask[at : at + len(piece)] = piece, b"\xff" * len(piece)
-        ends = [(BEGIN + at) // 8 for at in (*layout.places, *self._places)]
-        return Lanes(
-            layout.names,
-            layout.frame_id,
-            np.stack([_in_lanes(known), _in_lanes(mask)]),
-            _in_lanes(self._out),
-            np.array([*ends, *(count for _, count in layout.counts)]),
-            (layout.size, len(self._out)),
-        )
-
-    def _make(self, layout: _Layout, mark: str) -> None:
+    def _make(self, layout: _Layout, mark: str, counts: tuple[int, ...]) -> None:
         """Lay the outgoing message out."""
-        if self._made_for[0] is layout and self._made_for[1] == mark:
+        if self._made_for[0] is layout and self._made_for[1:] == (mark, counts):
             return
-        self._lanes = None
         text = mark.encode() + b"\0"
         out = bytearray(HEAD + bytes(8) + struct.pack("<I", len(text)) + text)
         out += bytes(-len(out) % 4) + layout.head[layout.names_begin - FRAME :]
         self._places = []
-        for _, count in layout.counts:
+        for count in counts:
             out += bytes(-len(out) % 4) + struct.pack("<I", count)
             if count:
                 out += bytes((len(HEAD) - len(out)) % 8)
             self._places.append(len(out))
             out += bytes(8 * count)
-        self._out, self._made_for = out, (layout, mark)
-
-
-def _in_lanes(data: bytearray) -> NDArray[np.float64]:
-    out = np.zeros(lanes(len(data)))
-    out.view(np.uint8)[BEGIN : BEGIN + len(data)] = data
-    return out
+        self._out, self._made_for = out, (layout, mark, counts)
 
 
 def _number(data: bytes, at: int) -> int:
     return int.from_bytes(data[at : at + 4], "little")
+
+
+def joint_names(data: bytes) -> tuple[str, ...]:
+    """The joints that a serialized message names; none where it cannot be read."""
+    if data[: len(HEAD)] != HEAD:
+        return ()
+    try:
+        return _names(data, _string(data, FRAME)[1])[0]
+    except (struct.error, UnicodeDecodeError):
+        return ()
+
+
+def _names(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
+    """Names and where the next number begins."""
+    (count,) = struct.unpack_from("<I", data, at)
+    if count > len(data):
+        raise struct.error("more names than the message is long")
+    names, at = [], at + 4
+    for _ in range(count):
+        name, at = _string(data, at)
+        names.append(name)
+    return tuple(names), at
 
 
 def _layout(data: bytes) -> _Layout | None:
@@ -168,13 +146,7 @@ def _layout(data: bytes) -> _Layout | None:
     try:
         frame_id, at = _string(data, FRAME)
         names_begin = at
-        (count,) = struct.unpack_from("<I", data, at)
-        names, at = [], at + 4
-        if count > len(data):
-            return None
-        for _ in range(count):
-            name, at = _string(data, at)
-            names.append(name)
+        names, at = _names(data, at)
         names_end, counts, places = at, [], []
         for _ in range(3):
             (count,) = struct.unpack_from("<I", data, at)
@@ -192,7 +164,7 @@ def _layout(data: bytes) -> _Layout | None:
     return _Layout(
         head,
         frame_id,
-        tuple(names),
+        names,
         names_begin,
         names_end,
         tuple(counts),

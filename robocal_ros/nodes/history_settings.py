@@ -1,5 +1,6 @@
 """Whose history a node keeps, and where."""
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.diagnostics import WARN, Health
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_damage import damage_notice
+from robocal_ros.storage.history_damage import acknowledge, damage_notice
 from robocal_ros.storage.history_paths import history_path, state_folder
 from robocal_ros.storage.robots import robot_file_hash
 from robocal_ros.storage.state_files import StateFile
@@ -72,6 +73,18 @@ def history_notice(settings: Mapping[str, Any]) -> str:
     """
     folder = _folder(settings) or state_folder()
     return damage_notice(history_path(settings["serial"] or NO_SERIAL, folder))
+
+
+def acknowledge_history(settings: Mapping[str, Any], by: str) -> None:
+    """Write down that somebody knows of a damaged history.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be written.
+    """
+    folder = _folder(settings) or state_folder()
+    acknowledge(history_path(settings["serial"] or NO_SERIAL, folder), by, time.time_ns())
 
 
 def _folder(settings: Mapping[str, Any]) -> Path | None:

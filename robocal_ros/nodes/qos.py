@@ -31,6 +31,9 @@ RELIABLE = _profile(100, ReliabilityPolicy.RELIABLE)
 HEARTBEAT = _profile(1, ReliabilityPolicy.RELIABLE)
 """What holds for a short time only: an older one that still waits says nothing."""
 
+NEWEST = _profile(1, ReliabilityPolicy.BEST_EFFORT)
+"""States of others of which only the newest says something."""
+
 STREAM = _profile(1000, ReliabilityPolicy.BEST_EFFORT)
 """What a session is computed from: deep enough for the seconds that a large solution takes."""
 

@@ -1,9 +1,13 @@
 """A simulated controller with the action FollowJointTrajectory, as joint_trajectory_controller.
 
-It follows with a lag, watches the path tolerance, aborts a goal for a newer one, holds when it is
-cancelled, and rejects a goal without points. Run as a script it is a process of its own.
+It begins where it is and as fast as it is, follows with a lag, watches the path tolerance, aborts a
+goal for a newer one, holds when it is cancelled, and rejects a goal without points. Run as a script
+it is a process of its own; with ``hostile`` its feedback is what vendors send, and worse.
 """
 
+import copy
+import sys
+from array import array
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +17,7 @@ from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.node import Node
 from rclpy.task import Future
+from scipy.interpolate import CubicHermiteSpline
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectoryPoint
 
@@ -32,6 +37,7 @@ class Path:
     goal: Any
     times: np.ndarray
     points: np.ndarray
+    spline: Any  # where all points have velocities
     begun_s: float
     ended: Future
 
@@ -49,6 +55,7 @@ class Follower(Node):
     feedback : what it sent.
     stuck : the robot does not move.
     rejects : all goals.
+    hostile : feedback of odd lengths and with numbers that are none.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -56,7 +63,8 @@ class Follower(Node):
         self.q, self.hold = HOME.copy(), HOME.copy()
         self.goals: list[Any] = []
         self.feedback: list[Any] = []
-        self.stuck = self.rejects = False
+        self.stuck = self.rejects = self.hostile = False
+        self.speed = np.zeros(6)
         self.path: Path | None = None
         self._states = self.create_publisher(JointState, "joint_states", 10)
         self._server = ActionServer(
@@ -87,7 +95,14 @@ class Follower(Node):
         from_start = [p.time_from_start for p in trajectory.points]
         times = np.array([t.sec + t.nanosec * 1e-9 for t in from_start])
         points = np.array([p.positions for p in trajectory.points])[:, order]
-        path = self.path = Path(goal, times, points, self._now_s(), Future())
+        spline = None
+        if times[0] > 0.0:  # it leads in from where it is, as fast as it is
+            times, points = np.array([0.0, *times]), np.vstack([self.hold, points])
+        if all(len(p.velocities) for p in trajectory.points):
+            speeds = np.array([p.velocities for p in trajectory.points])[:, order]
+            speeds = np.vstack([self.speed, speeds])[-len(times) :]
+            spline = CubicHermiteSpline(times, points, speeds)
+        path = self.path = Path(goal, times, points, spline, self._now_s(), Future())
         result = await path.ended
         if goal.is_cancel_requested:
             goal.canceled()
@@ -110,7 +125,14 @@ class Follower(Node):
         path = self.path
         if path is not None:
             at = self._now_s() - path.begun_s
-            self.hold = np.array([np.interp(at, path.times, column) for column in path.points.T])
+            before = self.hold
+            if path.spline is not None:
+                self.hold = path.spline(np.clip(at, path.times[0], path.times[-1]))
+            else:
+                self.hold = np.array([np.interp(at, path.times, row) for row in path.points.T])
+            self.speed = (self.hold - before) / TICK_S
+        else:
+            self.speed = np.zeros(6)
         lag = 0.0 if self.stuck else LAG
         moved = lag * (self.hold - self.q)
         self.q = self.q + moved
@@ -137,6 +159,9 @@ class Follower(Node):
         message.multi_dof_joint_names = ["rail"]
         self.feedback.append(message)
         path.goal.publish_feedback(message)
+        if self.hostile:
+            for strange in hostile_feedback(message):
+                path.goal.publish_feedback(strange)
 
     def _judge(self, path: Path, at: float) -> None:
         error = np.abs(self.hold - self.q)
@@ -150,6 +175,33 @@ class Follower(Node):
             self.path = None
 
 
+def hostile_feedback(message: Any) -> list[Any]:
+    """What some controllers send, and what none should."""
+    out = []
+    for velocities, positions, names in (
+        (array("d", [0.1] * 3), None, None),
+        (array("d", [np.nan] * 6), None, None),
+        (array("d", [0.1] * 9), None, None),
+        (None, array("d", [np.nan] * 6), None),
+        (None, array("d", [0.1] * 2), None),
+        (None, array("d"), None),
+        (None, None, []),
+        (None, None, ["x"] * 6),
+        (None, None, [NAMES[0]] * 6),
+        (array("d"), array("d", [1e300] * 6), None),
+    ):
+        strange = copy.deepcopy(message)
+        for point in (strange.desired, strange.actual):
+            point.velocities = point.velocities if velocities is None else velocities
+            point.positions = point.positions if positions is None else positions
+            point.effort = array("d", [np.nan] * 2)
+        strange.joint_names = strange.joint_names if names is None else names
+        out.append(strange)
+    return out
+
+
 if __name__ == "__main__":
     rclpy.init()
-    rclpy.spin(Follower())
+    robot = Follower()
+    robot.hostile = "hostile" in sys.argv
+    rclpy.spin(robot)

@@ -1,5 +1,6 @@
 """A joint correction node between a planner and a controller, both played by the test."""
 
+import time
 from array import array
 from typing import Any
 
@@ -78,6 +79,9 @@ def trajectory(q: np.ndarray, times: np.ndarray, **fields: Any) -> JointTrajecto
 PATIENT = {"joint_state_age_s": 5.0}
 
 
+REST_S = 0.3
+
+
 class Line:
     """The node between a planner and a controller, both played by the probe.
 
@@ -87,7 +91,16 @@ class Line:
     def __init__(self, graph: Any, **parameters: Any) -> None:
         self.graph = graph
         self.at: Any = HOME
+        self.rested = False
         self.node = graph.add(JointCorrectionNode, {"serial": "s1"} | PATIENT | parameters)
+        self._connect(graph)
+        outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
+        graph.spin_until(
+            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
+        )
+
+    def _connect(self, graph: Any) -> None:
+        """Listen to all outputs, and wait for the inputs."""
         self.targets = graph.collect(JointState, f"{NODE}/joint_targets")
         self.paths = graph.collect(JointTrajectory, f"{NODE}/joint_trajectory")
         self.arrays = graph.collect(Float64MultiArray, f"{NODE}/joint_commands")
@@ -101,10 +114,6 @@ class Line:
         self.to_states = graph.publisher(JointState, "joint_states")
         self.to_model = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
         self.to_tool = graph.publisher(ToolFrame, "tool", qos.LATCHED)
-        outputs = (*self.node._outputs.values(), self.node._offsets, self.node._statuses)
-        graph.spin_until(
-            lambda: all(output.get_subscription_count() for output in outputs), "the outputs"
-        )
 
     def wait(self, inbox: list[Any], count: int = 1) -> Any:
         self.graph.spin_until(lambda: len(inbox) >= count, f"{count} outputs")
@@ -113,8 +122,16 @@ class Line:
     def stand(self, **fields: Any) -> None:
         self.take(joints(self.at, **fields), self.to_states, "joint_states")
 
+    def rest(self) -> None:
+        """Stand for so long that the node knows it."""
+        until = time.monotonic() + REST_S
+        while time.monotonic() < until:
+            self.stand()
+            self.graph.spin_for(0.02)
+        self.rested = True
+
     def target(self, q: Any = HOME, **fields: Any) -> JointState:
-        self.stand()
+        self.stand() if self.rested else self.rest()
         count = len(self.targets)
         self.to_target.publish(joints(q, **fields))
         out = self.wait(self.targets, count + 1)
@@ -150,9 +167,8 @@ class Line:
         return found[-1]
 
     def enable(self, on: bool = True) -> str:
-        answer = self.graph.call(SetBool, f"{NODE}/enable", data=on)
-        assert answer.success
-        return str(answer.message)
+        """Ask for the correction or its end; what the node answers."""
+        return str(self.graph.call(SetBool, f"{NODE}/enable", data=on).message)
 
     def take(self, message: Any, publisher: Any, topic: str) -> None:
         count = self.node.inputs[topic]

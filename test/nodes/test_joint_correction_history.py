@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joint_correction_live import NOMINAL, Line, drifted, model_message, tool_message
+from joint_correction_live import NODE, NOMINAL, Line, drifted, model_message, tool_message
 from robocal_msgs.msg import CorrectionStatus
+from std_srvs.srv import Trigger
 
 from robocal_ros import __version__
 from robocal_ros.core import frames
 from robocal_ros.core.correction_record import CALIBRATED, CorrectionRecord
 from robocal_ros.core.correction_record import NOMINAL as AS_NOMINAL
-from robocal_ros.correction import log as correction_log
+from robocal_ros.correction import report as correction_log
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_description, save_robot
 
@@ -132,3 +133,19 @@ def test_a_damaged_history_is_not_touched_and_what_could_not_be_written_comes_la
     assert len(list(graph.state.glob("*.damaged-*"))) == 1
     after(graph, 1)
     assert "is damaged" not in line.node.health().message
+
+
+def test_a_damaged_history_is_told_until_a_person_acknowledges_it(
+    graph: Any, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(correction_log, "RETRY_S", 0.1)
+    graph.state.mkdir(exist_ok=True)
+    (graph.state / "s1.sqlite").write_bytes(b"\xff" * 5000)
+    CalibrationHistory.open("s1", state_dir=graph.state).close()  # its owner sets it aside
+    line = Line(graph)
+    graph.spin_until(lambda: line.statuses and line.statuses[-1].history, "the status says so")
+    assert "was set aside as" in line.statuses[-1].history
+    assert "was set aside as" in line.report(b"\x01", "set aside").message
+    assert graph.call(Trigger, f"{NODE}/acknowledge").success
+    graph.spin_until(lambda: not line.statuses[-1].history, "it is acknowledged")
+    assert len(list(graph.state.glob("*.damaged-*"))) == 1

@@ -1,0 +1,218 @@
+"""Who else commands the robot: told by the graph, over DDS."""
+
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from control_msgs.action import FollowJointTrajectory
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.node import Node
+from robocal_msgs.msg import MotionLease
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory
+
+from robocal_ros.correction.graph import GraphWatch, JointSources, Leases, own_participant
+from robocal_ros.correction.refusals import Reason
+from robocal_ros.nodes import qos
+
+PATH = "/arm_controller/joint_trajectory"
+ACTION = "/arm_controller/follow_joint_trajectory"
+NAMES = [f"joint_a{i}" for i in range(1, 7)]
+
+
+class Process:
+    """A DDS participant of its own, as another process has."""
+
+    def __init__(self, domain: int, name: str) -> None:
+        self.context = Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.node = Node(name, context=self.context)
+
+    def end(self) -> None:
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+class Watched:
+    """A correction node's endpoints before a controller, and a watch on who else is there."""
+
+    def __init__(self, graph: Any) -> None:
+        self.graph = graph
+        self.others: list[Process] = []
+        self.own = self.process("joint_correction_node").node
+        self.own.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+        self.client = ActionClient(self.own, FollowJointTrajectory, ACTION)
+        self.leases = Leases("kr150", "s1")
+        sources = JointSources(self.own, "/joint_states", NAMES)
+        self.watch = GraphWatch(
+            self.own, {PATH: 1}, {ACTION: 1}, sources, self.leases, "/motion_lease"
+        )
+
+    def process(self, name: str) -> Process:
+        self.others.append(Process(self.graph.domain, name))
+        return self.others[-1]
+
+    def becomes(self, reason: Reason | None, words: str = "", within_s: float = 10.0) -> None:
+        """Wait until the watch says so."""
+        found: list[Any] = []
+
+        def look() -> bool:
+            found[:] = [self.watch.look(time.monotonic())]
+            if reason is None or found[0] is None:
+                return found[0] is reason
+            return found[0].reason is reason and words in found[0].detail
+
+        self.graph.spin_until(look, f"{reason} {words}, not {found}", within_s)
+
+    def end(self) -> None:
+        self.watch.close()
+        self.client.destroy()
+        for other in self.others:
+            other.end()
+
+
+@pytest.fixture
+def watched(graph: Any) -> Iterator[Watched]:
+    watched = Watched(graph)
+    yield watched
+    watched.end()
+
+
+def test_endpoints_of_a_process_share_a_participant(watched: Watched) -> None:
+    same = Node("another", context=watched.own.context)
+    assert own_participant(watched.own) == own_participant(same)
+    assert own_participant(watched.process("another").node) != own_participant(same)
+    same.destroy_node()
+
+
+@pytest.mark.parametrize("name", ["joint_correction_node", "another_name"])
+def test_a_second_correction_node_under_the_same_or_another_name(
+    watched: Watched, name: str
+) -> None:
+    watched.becomes(None)
+    other = watched.process(name)
+    publisher = other.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    second = "a second /joint_correction_node" if name == "joint_correction_node" else f"/{name}"
+    watched.becomes(Reason.OTHER_COMMANDER, f"{second} publishes {PATH}")
+    other.node.destroy_publisher(publisher)
+    watched.becomes(None)
+    client = ActionClient(other.node, FollowJointTrajectory, ACTION)
+    watched.becomes(Reason.OTHER_COMMANDER, f"{second} is a client of {ACTION}")
+    client.destroy()
+    watched.becomes(None)
+    watched.own.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.becomes(Reason.OTHER_COMMANDER, "a second /joint_correction_node in this process")
+
+
+def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None:
+    own = watched.process("some_name")
+    own.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
+    own.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    inbox = watched.graph.collect(MotionLease, "/motion_lease", qos.LATCHED)
+    watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
+    watched.becomes(None)
+    lease = MotionLease(robot="kr150", serial="s1", holder="/some_name", held=True, purpose="tool")
+    now = time.monotonic()
+    watched.leases.hear(lease, now)
+    assert watched.watch.look(now) == (Reason.LEASED, "/some_name: tool")
+    assert watched.watch.lease == "/some_name: tool"
+    assert watched.watch.look(now + 0.99) is not None
+    assert watched.watch.look(now + 1.01) is None  # it was not renewed
+    watched.leases.hear(lease, now + 1.02)
+    lease.held = False
+    watched.leases.hear(lease, now + 1.1)
+    assert watched.watch.look(now + 1.1) is None
+    assert not inbox
+
+
+def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:
+    other = watched.process("next_cell")
+    other.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
+    other.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    lease = MotionLease(robot="kr150", serial="s2", holder="/next_cell", held=True)
+    watched.leases.hear(lease, time.monotonic())
+    watched.becomes(Reason.OTHER_COMMANDER, f"/next_cell publishes {PATH}")
+    assert not watched.watch.lease
+
+
+def test_two_publishers_of_the_arms_joints_and_one_of_a_gripper(watched: Watched) -> None:
+    driver, gripper = watched.process("driver"), watched.process("gripper")
+    arm = driver.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
+    hand = gripper.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
+    message = JointState(name=NAMES, position=[0.0] * 6, velocity=[float("nan")] * 6)
+
+    def publish(*which: tuple[Any, list[str]]) -> None:
+        for publisher, names in which:
+            publisher.publish(JointState(name=names, position=[0.0] * len(names)))
+
+    def look(count: int = 20) -> Any:
+        found = None
+        for _ in range(count):
+            arm.publish(message)
+            publish((hand, ["finger"]), (hand, ["finger"]))
+            watched.graph.spin_for(0.01)
+            found = watched.watch.look(time.monotonic()) or found
+        return found
+
+    watched.graph.spin_until(lambda: watched.own.count_publishers("/joint_states") == 2, "both")
+    read: list[Any] = []
+    watched.graph.spin_until(
+        lambda: look(1) or arm.get_subscription_count() == hand.get_subscription_count() == 1, "it"
+    )
+    assert look() is None
+    assert watched.watch._sources._last["joint_a1"] > 5  # the arm's were read
+    for _ in range(20):
+        arm.publish(message)
+        publish((hand, [*NAMES[3:], "finger"]))
+        watched.graph.spin_for(0.01)
+        read.append(watched.watch.look(time.monotonic()))
+    assert read[-1].reason is Reason.OTHER_COMMANDER
+    assert "joint_a4, joint_a5, joint_a6 by two of /driver, /gripper" in read[-1].detail
+    gripper.node.destroy_publisher(hand)
+    watched.becomes(None)
+
+
+def test_a_driver_that_was_restarted_is_one_driver(watched: Watched) -> None:
+    """Its predecessor was killed and is still on the graph: its numbers begin anew once."""
+    old, new = watched.process("driver"), watched.process("driver")
+    before = old.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
+    after = new.node.create_publisher(JointState, "/joint_states", qos.RELIABLE)
+    message = JointState(name=NAMES, position=[0.0] * 6)
+    watched.graph.spin_until(lambda: watched.own.count_publishers("/joint_states") == 2, "both")
+    watched.watch.look(time.monotonic())
+    watched.graph.spin_until(
+        lambda: before.get_subscription_count() and after.get_subscription_count(), "the reader"
+    )
+    last = watched.watch._sources._last
+    for publisher in (before, after):
+        for _ in range(10):
+            publisher.publish(message)
+            watched.graph.spin_for(0.01)
+            assert watched.watch.look(time.monotonic()) is None
+    assert last["joint_a1"] == 10
+
+
+def test_a_killed_predecessor_is_told_until_it_is_gone(graph: Any, tmp_path: Path) -> None:
+    script = tmp_path / "predecessor.py"
+    script.write_text(
+        "import rclpy\nfrom trajectory_msgs.msg import JointTrajectory\nrclpy.init()\n"
+        "node = rclpy.create_node('joint_correction_node')\n"
+        f"node.create_publisher(JointTrajectory, '{PATH}', 10)\nrclpy.spin(node)\n"
+    )
+    process = graph.start(script)
+    watched = Watched(graph)
+    try:
+        watched.becomes(Reason.OTHER_COMMANDER, "a second /joint_correction_node")
+        process.process.send_signal(signal.SIGKILL)
+        process.process.wait()
+        violation = watched.watch.look(time.monotonic())
+        assert violation is not None
+        assert "one that was killed counts until DDS gives it up" in violation.detail
+        watched.becomes(None, within_s=30.0)
+    finally:
+        watched.end()

@@ -1,0 +1,304 @@
+"""What ends a motion of the program: others on the graph, a lease, a stop, deactivation. Over DDS.
+
+The controllers are played by the test: a stream is followed at once, a trajectory as
+joint_trajectory_controller does it, by cubics from where it is.
+"""
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from joint_correction_live import HOME, NAMES, NODE, NOMINAL, Line, drifted, joints, model_message
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.context import Context
+from rclpy.node import Node
+from robocal_msgs.msg import CorrectionStatus, MotionLease
+from scipy.interpolate import CubicHermiteSpline
+from sensor_msgs.msg import JointState
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.nodes import conversions, qos
+
+PERIOD_S = 0.008
+SPEED = np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.3])  # rad/s
+OUTPUT = f"{NODE}/joint_targets"
+PATH = f"{NODE}/joint_trajectory"
+# A machine that is busy stops all of it now and then: what went out is judged over its own time.
+PATIENT = {"joint_state_age_s": 0.5, "stream_gap_s": 0.5}
+
+
+class Moving(Line):
+    """A line whose robot follows a stream, or a trajectory as a controller does."""
+
+    def __init__(self, graph: Any, process: bool = False, **parameters: Any) -> None:
+        self.graph, self.at, self.rested = graph, HOME, True
+        if process:
+            graph.start("joint_correction_node", {"serial": "s1"} | PATIENT | parameters)
+            self._connect(graph)
+        else:
+            super().__init__(graph, **(PATIENT | parameters))
+        self.others: list[tuple[Context, Node]] = []
+        self.out: list[tuple[float, np.ndarray]] = []
+        self._stream_from: float | None = None
+        self._spline: Any = None
+        self._spline_s = 0.0
+        graph.probe.create_subscription(JointState, OUTPUT, self._obey, qos.own(qos.RELIABLE))
+        graph.probe.create_subscription(JointTrajectory, PATH, self._plan, qos.own(qos.RELIABLE))
+        graph.probe.create_timer(PERIOD_S, self._tick)
+        graph.spin_for(0.5)
+
+    def other(self, name: str, **options: Any) -> Node:
+        """A node of another process."""
+        context = Context()
+        rclpy.init(args=[], context=context, domain_id=self.graph.domain)
+        node = Node(name, context=context, **options)
+        self.others.append((context, node))
+        return node
+
+    def end(self) -> None:
+        for context, node in self.others:
+            node.destroy_node()
+            context.try_shutdown()
+
+    def _obey(self, message: JointState) -> None:
+        self.at = np.array(message.position)
+        stamp = message.header.stamp
+        self.out.append((stamp.sec + 1e-9 * stamp.nanosec, self.at))
+
+    def _plan(self, message: JointTrajectory) -> None:
+        """Go on from here, as fast as it is, by cubics; the last point is the end."""
+        now = time.time()
+        q, qd = self._now(now)
+        points = [p for p in message.points if p.time_from_start.sec or p.time_from_start.nanosec]
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points]
+        speeds = [np.array(p.velocities) if p.velocities else 0.0 * q for p in points]
+        places = [np.array(p.positions) for p in points]
+        self._spline = CubicHermiteSpline([0.0, *times], [q, *places], [qd, *speeds])
+        self._spline_s = now
+
+    def _now(self, now_s: float) -> tuple[np.ndarray, np.ndarray]:
+        if self._spline is None:
+            return np.array(self.at), np.zeros(6)
+        t = min(now_s - self._spline_s, self._spline.x[-1])
+        moving = t < self._spline.x[-1]
+        return self._spline(t), self._spline(t, 1) if moving else np.zeros(6)
+
+    def _tick(self) -> None:
+        now = time.time()
+        speed = np.zeros(6)
+        if self._spline is not None:
+            self.at, speed = self._now(now)
+            self.out.append((now, np.array(self.at)))
+        self.to_states.publish(joints(self.at, velocity=speed.tolist()))
+        if self._stream_from is not None:
+            t = now - self._stream_from
+            header = conversions.header(round(now * 1e9), "")
+            place = HOME + SPEED * (0.5 * t * t if t < 1.0 else t - 0.5)
+            self.to_target.publish(joints(place, header=header))
+
+    def streams(self) -> None:
+        """Begin a stream, and let it come to its speed."""
+        self._stream_from = time.time()
+        moved = 0.8 * SPEED[0]
+        self.graph.spin_until(lambda: self.at[0] - HOME[0] > moved, "the stream runs", 20.0)
+
+    def drives(self, lasts_s: float = 4.0) -> None:
+        """Send a trajectory, and wait until the robot is in the middle of it."""
+        message = JointTrajectory(joint_names=NAMES)
+        for seconds, way, speed in (
+            (1.0, 0.5, 1.0),
+            (lasts_s - 1.0, lasts_s - 1.5, 1.0),
+            (lasts_s, lasts_s - 1.0, 0.0),
+        ):
+            point = JointTrajectoryPoint(positions=(HOME + way * SPEED).tolist())
+            point.velocities = (speed * SPEED).tolist()
+            point.time_from_start.sec = int(seconds)
+            point.time_from_start.nanosec = round(seconds % 1 * 1e9)
+            message.points.append(point)
+        self.to_path.publish(message)
+        self.graph.spin_until(lambda: self.at[0] - HOME[0] > 0.3, "the robot moves", 20.0)
+
+    def comes_to_rest(self, began_s: float, within_s: float = 2.0) -> None:
+        """It slows down without a step and without turning back, and stays where it is."""
+
+        def rests() -> bool:
+            lately = [q for t, q in self.out if t > time.time() - 0.3]
+            places = np.array([*lately, self.at, self.at])
+            return time.time() - began_s > 0.4 and np.ptp(places, axis=0).max() < 1e-6
+
+        self.graph.spin_until(rests, "the robot stands", within_s + 8.0)
+        times = np.array([t for t, _ in self.out])
+        q = np.array([q for _, q in self.out])[times > began_s - 0.5][:, 0]
+        times = times[times > began_s - 0.5]
+        moves = np.flatnonzero(np.diff(q) > 1e-7)
+        assert times[moves[-1] + 1] - began_s < within_s
+        assert np.all(np.diff(q) > -1e-9)
+        # what goes out is judged over the time that really passed, and a step of one period
+        span = np.subtract.outer(times, times)
+        way = np.subtract.outer(q, q)
+        assert np.all(way[span > 0] <= 1.15 * SPEED[0] * (span[span > 0] + 3 * PERIOD_S))
+        assert q[-1] - q[0] > 0.01  # it slowed down, it was not cut off
+
+    def held(self, words: str, state: int) -> None:
+        """Status and diagnostics say so, and nothing new begins."""
+        told = self.told(state=state)
+        assert words in told.commanders + told.lease
+        self.refused(self.to_target, joints(self.at), "joint_targets")
+        self.refused(self.to_path, path_of(self.at), "joint_trajectory")
+
+
+def path_of(q: Any) -> JointTrajectory:
+    point = JointTrajectoryPoint(positions=list(q))
+    point.time_from_start.sec = 1
+    return JointTrajectory(joint_names=NAMES, points=[point])
+
+
+@pytest.fixture
+def line(graph: Any) -> Iterator[Moving]:
+    line = Moving(graph)
+    yield line
+    line.end()
+
+
+def test_a_second_correction_node_by_accident_ends_the_stream(line: Moving) -> None:
+    """Finding: corrected and uncorrected targets alternated, both diagnostics OK."""
+    graph = line.graph
+    graph.start(
+        "joint_correction_node",
+        {"serial": "s1", "autostart": "false"},
+        {"__node": "by_accident", "~/joint_targets": OUTPUT},
+    )
+    change = graph.probe.create_client(ChangeState, "/by_accident/change_state")
+    graph.spin_until(change.service_is_ready, "the second node", 20.0)
+    graph.spin_for(0.5)
+    line.streams()
+    change.call_async(
+        ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+    )
+    stamp = line.told(state=CorrectionStatus.OTHER_COMMANDER).header.stamp
+    line.comes_to_rest(stamp.sec + 1e-9 * stamp.nanosec)
+    line._stream_from = None
+    line.held("/by_accident publishes", CorrectionStatus.OTHER_COMMANDER)
+    error = line.report(DiagnosticStatus.ERROR, "/by_accident publishes")
+    assert error.hardware_id == "s1"
+    seen = graph.collect(CorrectionStatus, "/by_accident/status", qos.LATCHED)
+    change.call_async(ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE)))
+    graph.spin_until(
+        lambda: seen and seen[-1].state == CorrectionStatus.OTHER_COMMANDER, "the other says so"
+    )
+    assert f"{NODE} publishes {OUTPUT}" in seen[-1].commanders
+
+
+@pytest.mark.parametrize("how", ["streams", "drives"])
+def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
+    line: Moving, how: str
+) -> None:
+    measuring = line.other("some_name")
+    lease = measuring.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
+    controller = measuring.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    line.graph.spin_until(lambda: line.node.count_publishers(PATH) == 2, "the own node")
+    getattr(line, how)()
+    assert line.statuses[-1].state == CorrectionStatus.OFF  # its publisher is no stranger
+    held = MotionLease(
+        robot=NOMINAL.name, serial="s1", holder="/some_name", held=True, purpose="tool"
+    )
+    began_s = time.time()
+    renewal = line.graph.probe.create_timer(0.2, lambda: lease.publish(held))
+    lease.publish(held)
+    line.told(state=CorrectionStatus.LEASED)
+    line.comes_to_rest(began_s)
+    line._stream_from = None
+    line.held("/some_name: tool", CorrectionStatus.LEASED)
+    line.graph.probe.destroy_timer(renewal)
+    line.statuses.clear()
+    line.told(state=CorrectionStatus.OFF)
+    line.graph.spin_for(0.5)
+    count = len(line.paths)
+    line.to_path.publish(path_of(line.at))
+    line.wait(line.paths, count + 1)
+    assert controller.get_subscription_count()
+
+
+def test_a_second_driver_of_the_arm_is_told_and_one_of_a_gripper_is_not(line: Moving) -> None:
+    gripper = line.other("gripper")
+    hand = gripper.create_publisher(JointState, "joint_states", qos.RELIABLE)
+    sent = line.graph.probe.create_timer(
+        0.02, lambda: hand.publish(JointState(name=["finger"], position=[0.01]))
+    )
+    line.graph.spin_for(2.0)
+    assert line.statuses[-1].commanders == ""
+    assert line.statuses[-1].state == CorrectionStatus.OFF
+    line.graph.probe.destroy_timer(sent)
+    line.graph.probe.create_timer(0.02, lambda: hand.publish(joints(HOME)))
+    told = line.told(state=CorrectionStatus.OTHER_COMMANDER)
+    assert "joint_a1, joint_a2" in told.commanders
+    assert "/gripper" in told.commanders
+
+
+@pytest.mark.parametrize("lost", [0, 1])
+def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> None:
+    """Finding: the controller drops it with an error and drives on."""
+    take, losses = line._plan, [lost]
+
+    def plan(message: JointTrajectory) -> None:
+        if not message.points:
+            return  # as joint_trajectory_controller does
+        if len(message.points) == 1 and losses[0]:
+            losses[0] -= 1
+            return
+        take(message)
+
+    line._plan = plan  # type: ignore[method-assign]
+    line.graph.probe.create_subscription(JointTrajectory, PATH, plan, qos.own(qos.RELIABLE))
+    line.drives()
+    began_s = time.time()
+    count = len(line.paths)
+    line.to_path.publish(JointTrajectory(joint_names=NAMES))
+    line.wait(line.paths, count + 1)
+    line.comes_to_rest(began_s)
+    assert all(len(message.points) for message in line.paths)
+
+
+@pytest.mark.parametrize("how", ["streams", "drives"])
+def test_a_deactivation_brings_the_robot_to_rest(graph: Any, how: str) -> None:
+    """Of a process: it does nothing else meanwhile."""
+    line = Moving(graph, process=True)
+    getattr(line, how)()
+    began_s = time.time()
+    deactivate = Transition(id=Transition.TRANSITION_DEACTIVATE)
+    assert graph.call(ChangeState, f"{NODE}/change_state", transition=deactivate).success
+    line._stream_from = None
+    line.comes_to_rest(began_s)
+    activate = Transition(id=Transition.TRANSITION_ACTIVATE)
+    assert graph.call(ChangeState, f"{NODE}/change_state", transition=activate).success
+    graph.spin_for(0.5)
+    count = len(line.paths)
+    line.to_path.publish(path_of(line.at))
+    line.wait(line.paths, count + 1)
+
+
+def test_a_refused_target_ends_the_stream_in_order(line: Moving) -> None:
+    line.streams()
+    began_s = time.time()
+    line._stream_from = None
+    line.to_target.publish(joints([*HOME[:5], float("nan")]))
+    line.comes_to_rest(began_s)
+    line.graph.spin_for(0.5)
+    line.to_target.publish(joints(line.at))
+    count = len(line.targets)
+    line.wait(line.targets, count + 1)
+
+
+def test_an_enable_while_everything_is_held_says_so(line: Moving) -> None:
+    line.take(model_message(drifted()), line.to_model, "kinematic_model")
+    line.other("planner").create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    line.told(state=CorrectionStatus.OTHER_COMMANDER)
+    answer = line.graph.call(SetBool, f"{NODE}/enable", data=True)
+    assert not answer.success
+    assert "nothing goes out, somebody else commands the robot: /planner" in answer.message

@@ -1,0 +1,143 @@
+"""Stops that are watched, against a simulated controller that does as joint_trajectory_controller."""
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+
+from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.robot_stop import RobotStop, RobotTrack
+from robocal_ros.storage.robots import load_description
+
+ROBOT = load_description("kr150_r3100")
+ARM = ROBOT.arm
+CYCLE_S = 0.004
+DELAY_S = 0.01  # of trajectories, and of readings
+SPEED = np.array([0.9, -0.4, 0.5, 1.0, -0.2, 0.3])
+HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
+
+
+class SimulatedController:
+    """Drives on at constant speed; a trajectory is a cubic from where it is, after `DELAY_S`.
+
+    Parameters
+    ----------
+    losses : so many trajectories are lost.
+    reports : velocities in readings: "measured", "nan" or "zero".
+    """
+
+    def __init__(self, losses: int = 0, reports: str = "measured", scaling: float = 1.0) -> None:
+        self.now_s, self.losses, self.reports, self.scaling = 100.0, losses, reports, scaling
+        self.q, self.qd = HOME.copy(), SPEED.copy()
+        self.track = RobotTrack(ARM, np.full(6, 3.5e-4), 0.2)
+        self.stop = RobotStop(ARM, ROBOT.max_acceleration, self.track, self._take)
+        self.plans: list = []
+        self.out: list = []
+        self._coming: list = []
+        self._spline, self._began_s, self._clock_s = None, 0.0, 0.0
+
+    def _take(self, plan) -> None:
+        self.plans.append(plan)
+        if self.losses:
+            self.losses -= 1
+        else:
+            self._coming.append((self.now_s + DELAY_S, plan))
+
+    def cycle(self) -> None:
+        self.now_s += CYCLE_S
+        while self._coming and self._coming[0][0] <= self.now_s:
+            plan = self._coming.pop(0)[1]
+            ends = np.array([0.0, plan.duration_s])
+            self._spline = CubicHermiteSpline(ends, [self.q, plan.q[-1]], [self.qd, 0.0 * self.qd])
+            self._clock_s = 0.0
+        before = self.q
+        if self._spline is None:
+            self.q = self.q + self.qd * CYCLE_S * self.scaling
+        else:
+            self._clock_s += CYCLE_S * self.scaling
+            at = min(self._clock_s, self._spline.x[-1])
+            self.q = self._spline(at)
+            self.qd = self._spline(at, 1) if at < self._spline.x[-1] else 0.0 * self.qd
+        self.out.append(self.q)
+        told = {
+            "measured": (self.q - before) / CYCLE_S,
+            "nan": np.full(6, np.nan),
+            "zero": np.zeros(6),
+        }[self.reports]
+        self.track.read(JointCommand(ARM.joint_names, self.q.copy(), told), self.now_s)
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / CYCLE_S)):
+            self.cycle()
+
+    def stops(self) -> float:
+        """Time from the stop's begin until the robot stands."""
+        began_s = self.now_s
+        assert self.stop.begin("a test", self.now_s)
+        moved_s = began_s
+        while self.stop.look(self.now_s, self.scaling):
+            before = self.q
+            self.cycle()
+            moved_s = self.now_s if np.any(np.abs(self.q - before) > 1e-9) else moved_s
+        return moved_s - began_s
+
+
+@pytest.mark.parametrize("reports", ["measured", "nan", "zero"])
+def test_a_stop_goes_on_in_its_direction_and_ends_at_rest(reports):
+    robot = SimulatedController(reports=reports)
+    robot.run(0.3)
+    begin = len(robot.out)
+    lasts_s = robot.stops()
+    assert not robot.stop.fault
+    assert robot.stop.sent == 1
+    assert lasts_s <= 1.05 * robot.plans[0].duration_s + DELAY_S + CYCLE_S
+    ways = np.diff(robot.out[begin - 1 :], axis=0)
+    assert np.all(ways * SPEED >= -1e-9)  # never back
+    rates = ways / CYCLE_S
+    most = 2.0 * np.abs(SPEED) / robot.plans[0].duration_s  # a cubic's own is 1.5 at its steepest
+    assert np.all(np.abs(np.diff(rates, axis=0)) <= most * CYCLE_S)
+
+
+@pytest.mark.parametrize("losses", [1, 2])
+def test_a_stop_that_is_lost_is_sent_again(losses):
+    robot = SimulatedController(losses)
+    robot.run(0.3)
+    lasts_s = robot.stops()
+    assert robot.stop.sent == losses + 1
+    assert not robot.stop.fault
+    assert lasts_s <= 1.5 * robot.plans[0].duration_s
+
+
+@pytest.mark.parametrize("scaling", [0.1, 0.5])
+def test_a_controller_that_runs_slowly_is_waited_for(scaling):
+    robot = SimulatedController(scaling=scaling)
+    robot.run(0.3)
+    robot.stops()
+    assert robot.stop.sent == 1
+    assert not robot.stop.fault
+
+
+def test_a_robot_that_does_not_stop_is_told():
+    robot = SimulatedController(losses=10_000)
+    robot.run(0.3)
+    robot.stops()
+    assert "the robot still moves, stop it by hand" in robot.stop.fault
+    assert robot.stop.sent > 5
+
+
+def test_without_readings_no_stop_is_planned():
+    robot = SimulatedController()
+    assert not robot.stop.begin("a test", robot.now_s)
+    assert "joint states are missing or too old" in robot.stop.fault
+    robot.run(0.3)
+    assert robot.stop.begin("a test", robot.now_s)
+    assert not robot.stop.fault
+    assert not robot.stop.begin("a test", robot.now_s + 0.3)
+
+
+def test_a_robot_that_stands_holds_where_it_is():
+    robot = SimulatedController(reports="nan")
+    robot.qd = np.zeros(6)
+    robot.run(0.3)
+    robot.stops()
+    assert robot.stop.sent == 1
+    assert np.abs(np.array(robot.out) - HOME).max() < 1e-12
