@@ -24,16 +24,18 @@ from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message
 from robocal_ros.nodes.replay_topics import chosen_topics, message_class
 from robocal_ros.storage.bags import BagWriter
+from robocal_ros.storage.recorded_names import recorded_name
 from robocal_ros.storage.robots import load_robot
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000
 START_NS = 100 * NS
+NEW = {"/gap_open", "/lease", "/joint_commands"}  # under the names of our recorder; others: older
 HELD_BACK = {
     "/robot/gap_open": ("std_msgs/msg/Bool", "may move now"),
     "/gap_open": ("robocal_msgs/msg/GapOpen", "may move now"),
     "/lease": ("robocal_msgs/msg/MotionLease", "may move now"),
-    "/recorded/joint_commands": ("sensor_msgs/msg/JointState", "move a robot"),
+    "/joint_commands": ("sensor_msgs/msg/JointState", "move a robot"),
     "/arm_controller/joint_trajectory": ("trajectory_msgs/msg/JointTrajectory", "move a robot"),
     "/forward/commands": ("std_msgs/msg/Float64MultiArray", "move a robot"),
     "/joint_targets": ("sensor_msgs/msg/JointState", "move a robot"),
@@ -56,7 +58,8 @@ def write_bag(path: Path, count: int, period_ns: int) -> Path:
         bag.write("/n/session_events", "robocal_msgs/msg/SessionEvent", event, ns)
         bag.write("/odd", "std_msgs/msg/String", {"data": "odd"}, ns)
         for topic, (msgtype, _) in HELD_BACK.items():
-            bag.write(topic, msgtype, message_class(msgtype)(), ns)
+            name = recorded_name(topic, msgtype) if topic in NEW else topic
+            bag.write(name, msgtype, message_class(msgtype)(), ns)
     return path
 
 
