@@ -51,8 +51,8 @@ from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
-from robocal_ros.nodes.conversions import trigger_text
 from robocal_ros.nodes.diagnostics import Health
+from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 

@@ -183,7 +183,7 @@ class CorrectionSession:
     # ---- commands -------------------------------------------------------------------------------
 
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
-        """Correct one message of a stream of joint targets; one to which nothing is added is returned.
+        """Correct one message of a stream of joint targets; itself where nothing is added.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""A stream of joint targets: as new as its newest message, within the joints' speeds, ended in order."""
+"""A stream of joint targets: as new as its newest message, within the speeds, ended in order."""
 
 from collections import deque
 from dataclasses import replace

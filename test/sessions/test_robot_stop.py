@@ -1,4 +1,4 @@
-"""Stops that are watched, against a simulated controller that does as joint_trajectory_controller."""
+"""Stops that are watched, against a simulated controller that does as the real one."""
 
 import numpy as np
 import pytest
