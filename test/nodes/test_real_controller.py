@@ -86,14 +86,13 @@ def test_it_goes_between_points_as_the_polynomials_do(controller, rows):
     states = [m for m in controller.states if seconds(m.header.stamp) > begin_s]
     times = [seconds(m.reference.time_from_start) for m in states]
     first = int(np.argmin(np.diff(times))) + 1  # before it the time is that of standing there
-    seen = 0
-    for state, at in zip(states[first:], times[first:], strict=True):
-        if 0.0 < at < 1.0:
-            wanted = path.sample(np.array([at]))
-            assert state.reference.positions == pytest.approx(wanted[0][0], abs=1e-6)
-            assert state.reference.velocities == pytest.approx(wanted[1][0], abs=1e-4)
-            seen += 1
-    assert seen > 80
+    inside = [i for i in range(first, len(times)) if 0.0 < times[i] < 1.0]
+    wanted, wanted_speed, *_ = path.sample(np.array([times[i] for i in inside]))
+    found = np.array([states[i].reference.positions for i in inside])
+    speed = np.array([states[i].reference.velocities for i in inside])
+    assert len(inside) > 80
+    assert np.max(np.abs(found - wanted)) < 1e-6
+    assert np.max(np.abs(speed - wanted_speed)) < 1e-4
 
 
 # ---- stop, replace, jump -------------------------------------------------------------------------
@@ -144,12 +143,13 @@ def test_a_first_point_ahead_of_now_begins_where_the_robot_is(start, velocities)
     begin_s = on_the_way(controller) - 0.05
     controller.topic.publish(trajectory([(0.5, HOME + 0.6 * STEP, REST)]))
     assert controller.stands() == pytest.approx(HOME + 0.6 * STEP, abs=1e-9)
-    _, sent = controller.sent(begin_s)
-    assert np.max(np.abs(np.diff(sent, axis=0))) < 0.05  # no jump
     _, speed = controller.speeds(begin_s)
-    change = np.abs(np.diff(speed[:, 0]))
-    assert (np.max(change) < 0.15) == velocities
-    assert (np.max(change) > 0.4) == (not velocities)  # from about 0.7 rad/s to 0
+    assert np.max(np.abs(speed)) < 2.0  # no jump: 0.05 rad in a cycle would be 12 rad/s
+    times = [seconds(m.reference.time_from_start) for m in controller.states]
+    taken = 1 + max(i for i, change in enumerate(np.diff(times)) if change < -0.1)
+    first = [m for m, at in zip(controller.states[taken:], times[taken:], strict=True) if at < 0.05]
+    slowest = min(m.reference.velocities[0] for m in first)
+    assert slowest > 0.4 if velocities else slowest < 0.3  # it went at about 0.7 rad/s
 
 
 def test_the_last_command_may_be_the_begin(start):
@@ -263,11 +263,13 @@ def test_a_scaled_motion_takes_longer(controller, factor):
     assert controller.end(handle) == (SUCCEEDED, 0)
     assert controller.stands() == pytest.approx(HOME + STEP, abs=1e-9)
     moving = [
-        seconds(m.header.stamp)
+        (seconds(m.header.stamp), seconds(m.reference.time_from_start))
         for m in controller.states
         if seconds(m.header.stamp) > begin_s and 0.0 < seconds(m.reference.time_from_start) < 0.5
     ]
-    assert moving[-1] - moving[0] == pytest.approx(0.5 / factor, abs=0.05)
+    passed = np.diff(moving, axis=0)  # a busy machine leaves cycles out: the usual one counts
+    assert np.median(passed[:, 1] / passed[:, 0]) == pytest.approx(factor, rel=0.02)
+    assert moving[-1][0] - moving[0][0] > 0.45 / factor
     middle = [m for m in controller.states if 0.2 < seconds(m.reference.time_from_start) < 0.3]
     assert np.max([m.reference.velocities[0] for m in middle]) == pytest.approx(3.0, rel=0.05)
 
