@@ -116,7 +116,7 @@ def test_a_point_at_time_0_makes_the_command_jump(controller):
     assert np.sum(steps < -0.05) <= 2
 
 
-def test_a_start_in_the_past_makes_the_command_jump(controller):
+def test_a_start_in_the_past_leaves_less_time_for_the_way(controller):
     begin_s = controller.now_s
     controller.topic.publish(trajectory([(2.0, HOME + STEP)], stamp_s=begin_s - 1.0))
     controller.moved(0.2)
@@ -124,7 +124,6 @@ def test_a_start_in_the_past_makes_the_command_jump(controller):
     # The way to the first point begins where the robot is, and is gone in the time that is left.
     _, speed = controller.speeds(begin_s)
     assert np.max(speed[:, 0]) == pytest.approx(1.0, rel=0.1)
-    assert np.max(np.abs(np.diff(controller.sent(begin_s)[1][:, 0]))) < 0.05
 
 
 def test_points_in_the_past_are_left_out_with_a_jump(controller):
