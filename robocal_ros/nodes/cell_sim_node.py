@@ -180,4 +180,4 @@ def _mm(place: Any) -> str:
 
 def main() -> None:
     """Run the node."""
-    run(CellSimNode)
+    run(CellSimNode, events=True)
