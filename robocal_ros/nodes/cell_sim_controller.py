@@ -47,7 +47,8 @@ class SimulatedController:
     ) -> None:
         self._node, self._tick, self._start_ns = node, tick, start_ns
         self._cell: SimulatedCell | None = None
-        self._goals: dict[ServerGoalHandle, TrajectoryGoal] = {}
+        self._goals: list[tuple[ServerGoalHandle, TrajectoryGoal]] = []
+        self._told_ns = 0
         self._asked: TrajectoryGoal | None = None
         self._server = DeferredActionServer(
             node,
@@ -119,13 +120,14 @@ class SimulatedController:
         if goal is None or cell is None:
             return
         cell.gate.take(goal, cell.now_s)
-        self._goals[handle] = goal
+        self._goals.append((handle, goal))
         self.monitor()  # the one before it was preempted, which is told at once
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        if self._cell is not None and handle in self._goals:
-            self._tick()
-            self._cell.motion.cancel(self._cell.now_s, self._goals[handle])
+        for known, goal in self._goals:
+            if known is handle and self._cell is not None:
+                self._tick()
+                self._cell.motion.cancel(self._cell.now_s, goal)
         return CancelResponse.ACCEPT
 
     def _ready(self) -> SimulatedCell:
@@ -138,22 +140,23 @@ class SimulatedController:
 
     def monitor(self) -> None:
         """End the goals that are over; tell the others where they are."""
-        for handle, goal in list(self._goals.items()):
+        for handle, goal in list(self._goals):
             if goal.state is GoalState.EXECUTING:
                 if self._cell is not None and self._cell.motion.controller.active is goal:
                     handle.publish_feedback(self._feedback(self._cell))
                 continue
             if goal.state is GoalState.CANCELED and not handle.is_cancel_requested:
                 continue  # rclpy marks it after the callback
-            del self._goals[handle]
+            self._goals.remove((handle, goal))
             result = FollowJointTrajectory.Result(
                 error_code=goal.code.value, error_string=goal.text
             )
             self._server.end(handle, STATUS[goal.state], result)
 
     def tell_state(self, stamp_ns: int) -> None:
-        """Publish the controller's state."""
-        if self._cell is not None:
+        """Publish the controller's state, once for each time."""
+        if self._cell is not None and stamp_ns != self._told_ns:
+            self._told_ns = stamp_ns
             message = JointTrajectoryControllerState(
                 header=header(stamp_ns, ""),
                 joint_names=list(self._cell.motion.controller.names),

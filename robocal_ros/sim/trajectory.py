@@ -62,16 +62,24 @@ class SampledPath:
     """A trajectory with where the joints were when it was first sampled.
 
     Between points lie lines, cubics or quintics, as both have positions alone, velocities too, or
-    accelerations too. The first stretch begins at ``q``, ``qd`` (n,) at ``now_s``; a controller
+    accelerations too. The first stretch begins at ``q``, ``qd`` (n,), at ``before_s`` where that
+    is not ``now_s``, when it is first sampled; a controller
     whose drives give no velocities (``qd`` None) takes them as 0 where the first point has some.
     Accelerations without velocities give 0 for everything, as they do in the original.
     """
 
-    def __init__(self, trajectory: Trajectory, now_s: float, q: Array, qd: Array | None) -> None:
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        now_s: float,
+        q: Array,
+        qd: Array | None,
+        before_s: float | None = None,
+    ) -> None:
         of = trajectory
         start_s = now_s if of.start_s is None else of.start_s
         self.start_s, self.count, self._points_s = start_s, len(of.time_s), start_s + of.time_s
-        self._knots = np.append(now_s, self._points_s)
+        self._knots = np.append(now_s if before_s is None else before_s, self._points_s)
         zeros = np.zeros_like(q)
         begin = (q, zeros if qd is None else qd, zeros)
         rows = [

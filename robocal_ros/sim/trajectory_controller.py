@@ -169,10 +169,13 @@ class TrajectoryController:
         if self._new is None:
             self._steps += 1
         else:
-            begin = (q, qd if self.options.velocity_states else None)
-            if self._brakes or self.options.interpolate_from_desired_state:
-                begin = (self._last, self._last_speed)
             self._begin_s, self._steps = float(time_s[0]), 0
+            begin = (q, qd if self.options.velocity_states else None, self._begin_s)
+            if self._brakes:
+                begin = (self._last, self._last_speed, self._begin_s)
+            elif self.options.interpolate_from_desired_state:
+                # What was sent a cycle ago, for now, counts as of then: it goes twice as far.
+                begin = (self._last, self._last_speed, self._begin_s - self.period_s)
             self._path = SampledPath(self._ordered(self._new), self._begin_s, *begin)
             self._new, self._brakes = None, False
         steps = self._steps + np.arange(len(time_s), dtype=np.float64)

@@ -1,0 +1,251 @@
+"""A trajectory controller on the graph, real or simulated, for six joints that start at home.
+
+Real: ros2_control's node with mock hardware; simulated: `cell_sim_node`. Both under the same names.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from builtin_interfaces.msg import Duration, Time
+from conftest import Executable, Graph
+from control_msgs.action import FollowJointTrajectory
+from control_msgs.msg import JointTrajectoryControllerState, SpeedScalingFactor
+from rclpy.action import ActionClient
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from robocal_ros.nodes import qos
+from robocal_ros.storage.robots import load_robot
+
+ARM = load_robot("ur10")
+NAMES = list(ARM.joint_names)
+HOME = np.radians([2.3, -124.4, -70.9, 107.7, -91.1, 91.8])
+PERIOD_S = 0.004
+NODE = "arm_controller"
+PACKAGES = (
+    "controller_manager",
+    "controller_manager_msgs",
+    "hardware_interface",
+    "joint_state_broadcaster",
+    "joint_trajectory_controller",
+)
+DEEP = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.RELIABLE)
+
+Point = tuple[float, Any] | tuple[float, Any, Any] | tuple[float, Any, Any, Any]
+
+
+def missing_packages() -> list[str]:
+    """What of ros2_control is not installed."""
+    missing = []
+    for package in PACKAGES:
+        try:
+            get_package_prefix(package)
+        except PackageNotFoundError:
+            missing.append(package)
+    return missing
+
+
+def trajectory(
+    points: Iterable[Point], names: Sequence[str] = NAMES, stamp_s: float = 0.0
+) -> JointTrajectory:
+    """Points of time from start, positions, velocities and accelerations as far as given."""
+    message = JointTrajectory(joint_names=list(names))
+    for time_s, *rows in points:
+        point = JointTrajectoryPoint(time_from_start=Duration(**_parts(time_s)))
+        for field, row in zip(("positions", "velocities", "accelerations"), rows, strict=False):
+            if row is not None:
+                setattr(point, field, [float(x) for x in row])
+        message.points.append(point)
+    message.header.stamp = Time(**_parts(stamp_s))
+    return message
+
+
+def _parts(time_s: float) -> dict[str, int]:
+    sec, nanosec = divmod(round(time_s * 1e9), 10**9)
+    return {"sec": sec, "nanosec": nanosec}
+
+
+def seconds(stamp: Any) -> float:
+    """Of a time or a duration."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+class Controlled:
+    """The controller, what it tells, and a client of its action."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph, node = graph, graph.probe
+        self.states: list[JointTrajectoryControllerState] = graph.collect(
+            JointTrajectoryControllerState, f"{NODE}/controller_state", DEEP
+        )
+        self.readings: list[JointState] = graph.collect(JointState, "joint_states", DEEP)
+        self.action = ActionClient(node, FollowJointTrajectory, f"{NODE}/follow_joint_trajectory")
+
+    def wait(self) -> None:
+        """Until it works and is discovered."""
+        graph = self.graph
+        graph.spin_until(lambda: self.states and self.readings, "its state", 30.0)
+        graph.spin_until(self.action.server_is_ready, "its action")
+        self.topic = graph.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
+        self.scaling = graph.publisher(
+            SpeedScalingFactor, f"{NODE}/speed_scaling_input", qos.LATCHED
+        )
+        graph.spin_for(0.3)
+
+    # ---- commands -------------------------------------------------------------------------------
+
+    def goal(self, message: JointTrajectory, **fields: Any) -> Any:
+        """Send a goal; its handle once it is accepted or rejected."""
+        future = self.action.send_goal_async(
+            FollowJointTrajectory.Goal(trajectory=message, **fields)
+        )
+        self.graph.spin_until(future.done, "the goal is answered")
+        return future.result()
+
+    def end(self, handle: Any, within_s: float = 10.0) -> tuple[int, int]:
+        """Status and error code of a goal."""
+        future = handle.get_result_async()
+        self.graph.spin_until(future.done, "the goal ends", within_s)
+        return future.result().status, future.result().result.error_code
+
+    def scale(self, factor: float) -> None:
+        """Set its speed, and wait until it says so."""
+        self.scaling.publish(SpeedScalingFactor(factor=factor))
+        self.graph.spin_until(
+            lambda: self.states[-1].speed_scaling_factor == factor, f"scaled to {factor}"
+        )
+
+    # ---- what it tells --------------------------------------------------------------------------
+
+    @property
+    def now_s(self) -> float:
+        """Its stamp."""
+        return seconds(self.states[-1].header.stamp)
+
+    @property
+    def q(self) -> np.ndarray:
+        """Where the joints are."""
+        return np.array(self.states[-1].feedback.positions)
+
+    def moved(self, away: float = 0.05, start: Any = HOME) -> None:
+        """Wait until the first joint is so far from ``start``."""
+        self.graph.spin_until(lambda: abs(self.q[0] - start[0]) > away, "it moves")
+
+    def stands(self) -> np.ndarray:
+        """Wait until the command has not changed for 0.15 s; where the joints are then."""
+
+        def quiet() -> bool:
+            time, sent = self.sent(self.now_s - 0.2)
+            return time[-1] - time[0] > 0.15 and float(np.ptp(sent, axis=0).max()) < 1e-9
+
+        self.graph.spin_for(0.05)
+        self.graph.spin_until(quiet, "it stands")
+        return self.q
+
+    def sent(self, since_s: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps (k,) and commands (k, 6)."""
+        states = [m for m in self.states if seconds(m.header.stamp) >= since_s]
+        time = np.array([seconds(m.header.stamp) for m in states])
+        return time, np.array([m.output.positions for m in states])
+
+    def speeds(self, since_s: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Stamps (k,) and speeds (k, 6) of the command, between two of its states."""
+        time, sent = self.sent(since_s)
+        return time[1:], np.diff(sent, axis=0) / np.diff(time)[:, None]
+
+
+# ---- simulated -----------------------------------------------------------------------------------
+
+
+def simulated(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
+    """The cell's robot, without a lag, as mock hardware has none."""
+    given = {"velocities": str(velocities).lower(), "lag_ms": 0.0, "rate_hz": 250.0} | parameters
+    controlled = Controlled(graph)
+    remap = {"__node": NODE, "joint_trajectory": f"{NODE}/joint_trajectory"}
+    graph.start("cell_sim_node", given, remap)
+    return controlled
+
+
+# ---- real ----------------------------------------------------------------------------------------
+
+
+def real(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
+    """joint_trajectory_controller on mock_components/GenericSystem; skipped where it is missing."""
+    if missing := missing_packages():
+        pytest.skip(f"ros2_control is not installed: no {', '.join(missing)}")
+    from controller_manager_msgs.srv import ConfigureController, LoadController, SwitchController
+
+    states = ["position", "velocity"] if velocities else ["position"]
+    controllers = {
+        "joint_state_broadcaster": "joint_state_broadcaster/JointStateBroadcaster",
+        NODE: "joint_trajectory_controller/JointTrajectoryController",
+    }
+    settings = {
+        "controller_manager": {"update_rate": round(1.0 / PERIOD_S)}
+        | {name: {"type": kind} for name, kind in controllers.items()},
+        NODE: {"joints": NAMES, "command_interfaces": ["position"], "state_interfaces": states}
+        | parameters,
+    }
+    file = folder / "controllers.yaml"
+    file.write_text(yaml.dump({name: {"ros__parameters": of} for name, of in settings.items()}))
+    controlled = Controlled(graph)
+    description = graph.probe.create_publisher(String, "robot_description", qos.own(qos.LATCHED))
+    description.publish(String(data=_urdf(velocities)))
+    node = Path(
+        get_package_prefix("controller_manager"), "lib/controller_manager/ros2_control_node"
+    )
+    command = [str(node), "--ros-args", "--params-file", str(file)]
+    graph._executables.append(Executable("ros2_control_node", command, graph._environment))
+    for name in controllers:
+        for kind, service in (
+            (LoadController, "load_controller"),
+            (ConfigureController, "configure_controller"),
+        ):
+            _ask(graph, service, kind, kind.Request(name=name))
+    request = SwitchController.Request(activate_controllers=list(controllers), strictness=2)
+    _ask(graph, "switch_controller", SwitchController, request)
+    return controlled
+
+
+def _ask(graph: Graph, service: str, kind: Any, request: Any) -> None:
+    """Call a service of the controller manager."""
+    client = graph.probe.create_client(kind, f"controller_manager/{service}")
+    graph.spin_until(client.service_is_ready, f"{service} appears", 30.0)
+    future = client.call_async(request)
+    graph.spin_until(future.done, f"{service} answers", 30.0)
+    assert future.result().ok, f"{service}: {request}"
+    graph.probe.destroy_client(client)
+
+
+def _urdf(velocities: bool) -> str:
+    """Six joints in a row on mock hardware, at home."""
+    links, hardware = ['<link name="base"/>'], []
+    for i, (name, start) in enumerate(zip(NAMES, HOME.tolist(), strict=True)):
+        parent = f"link_{i}" if i else "base"
+        links.append(
+            f'<link name="link_{i + 1}"/><joint name="{name}" type="revolute">'
+            f'<parent link="{parent}"/><child link="link_{i + 1}"/><axis xyz="0 0 1"/>'
+            '<limit lower="-6.28" upper="6.28" velocity="3.14" effort="100"/></joint>'
+        )
+        speed = '<state_interface name="velocity"/>' * velocities
+        hardware.append(
+            f'<joint name="{name}"><command_interface name="position"/>'
+            '<state_interface name="position"><param name="initial_value">'
+            f"{start}</param></state_interface>{speed}</joint>"
+        )
+    dynamics = '<param name="calculate_dynamics">true</param>' * velocities
+    return (
+        f'<robot name="arm">{"".join(links)}<ros2_control name="hardware" type="system">'
+        f"<hardware><plugin>mock_components/GenericSystem</plugin>{dynamics}</hardware>"
+        f"{''.join(hardware)}</ros2_control></robot>"
+    )
+
+
+CONTROLLERS = {"simulated": simulated, "real": real}
