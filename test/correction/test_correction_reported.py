@@ -31,7 +31,7 @@ def test_a_correction_with_what_is_in_force_is_right():
         (replace(OFF, state=CorrectionState.BLENDING), "is OFF: call ~/enable"),
         (SHADOW, "shadow mode"),
         (WITHOUT, "wire its inputs"),
-        (MISMATCH, "joint_a1 is 2 deg beside: see where the robot stands, call ~/enable"),
+        (MISMATCH, "joint_a1 is 2 deg beside: see where the robot stands, call ~/acknowledge"),
         (replace(ON, stale="model revision 4 is 90 s old, allowed 60 s"), "90 s old"),
     ],
     ids=str,
