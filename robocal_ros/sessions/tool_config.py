@@ -16,6 +16,7 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
 from robocal_ros.core.tool.run_traits import TraitLimits
+from robocal_ros.core.tool.witness import BendRule
 
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, ...], ...]
@@ -62,6 +63,12 @@ class ToolConfig:
     def T_flange_taught(self) -> Array:
         """The taught tool (4, 4)."""
         return np.array(self.taught)
+
+    @property
+    def bend(self) -> BendRule:
+        """Where the tool may bend: between the mount and the upper circle."""
+        nearest_m = self.motion.above_tip_m + self.motion.height_m
+        return BendRule(nearest_m, max(nearest_m, self.check.lever_m))
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""

@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robocal_ros.core.documents import arm_of
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL, Head
@@ -10,6 +13,8 @@ from robocal_ros.core.tool.run_traits import RunTraits
 from robocal_ros.sessions.followed import Followed
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig, made_with
+
+Array = NDArray[np.float64]
 
 
 class ToolInForce(Followed):
@@ -42,6 +47,12 @@ class ToolInForce(Followed):
         """The tool in force; without one the taught one."""
         model = self.head.model
         return self._taught if model is None else KnownTool.of_document(model)
+
+    @property
+    def anchor(self) -> Array:
+        """Tip (3,) of the last tool whose cause was known: in force, or before small changes."""
+        known = (self.head.model or {}).get("anchor")
+        return self.tool.T_flange_tool[:3, 3] if known is None else np.array(known)
 
     @property
     def measured_healthy(self) -> KnownTool | None:

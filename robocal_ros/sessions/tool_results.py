@@ -21,8 +21,10 @@ from robocal_ros.core.tool.judging import (
     judge_healthy,
     judge_tool,
     spread_between,
+    witness_of,
 )
 from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
+from robocal_ros.core.tool.witness import SMALL_M
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig, made_with
@@ -101,12 +103,18 @@ class ToolResults:
         absolute = healthy is None
         if healthy is not None:
             found = changed_tool(taught, healthy, found)
-        verdict = judge_tool(found, estimate, taught, in_force, self._config.limits)
+        anchor = self._current.anchor
+        witness = witness_of(found, in_force, self._config.bend, anchor)
+        verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         document = run_document(found, estimate, run.circles, verdict) | {
             "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
             "absolute": absolute,
+            "witness": witness.document(),
         }
-        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, found)
+        known: Document = {"cause": witness.cause}
+        if witness.cause == "tool" and witness.tip_m <= SMALL_M:  # many of them do not add up
+            known["anchor"] = anchor.tolist()
+        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, found, **known)
         return Outcome(command, verdict.code, verdict.reason, document, kept)
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:

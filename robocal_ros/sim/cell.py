@@ -62,7 +62,7 @@ class SimulatedCell:
         self.plan = plan
         self._mounted = self.next_tool = plan.tool
         self.motion = JointMotion(plan.q_start, plan.fastest)
-        self.faults = Faults()
+        self.faults = Faults(seed=plan.seed)
         self._waiting: tuple[Fault, float] | None = None
         self._draws = Draws(plan.seed)
         self.heating = Heating(plan.heat, self._draws) if plan.heat else None
