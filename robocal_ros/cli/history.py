@@ -16,6 +16,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import (
     BEFORE_ANY,
     HEALTHY_TOOL,
+    MANDREL,
     THERMAL,
     TOOL,
     Decision,
@@ -32,7 +33,7 @@ HELP = "list the calibrations of a robot; accept, reject or roll back"
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
-_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL)
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,7 +8,9 @@ from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.proposals import TOOL, State
+from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome
 from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.sessions.tool_config import rows_of
 from robocal_ros.sim.beams import BeamStation, RoundTool, bent
 from robocal_ros.sim.cell_faults import Fault, Faults, size_of
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -88,3 +90,81 @@ def test_a_bent_tool_is_proven_by_its_tilt(driver, size_m):
     found = driver.measure("full")
     assert found.done, found.message
     assert found.document["witness"]["cause"] == "tool", found.message
+
+
+MANDREL = bent(TAUGHT, [-0.02, 0.01, -0.03], [0.0, 0.0, 0.0])  # shorter, beside the tool
+
+
+@pytest.fixture
+def with_mandrel(tmp_path):
+    """Healthy tool and mandrel were measured."""
+    cell = noisy_cell()
+    config = config_of(cell, mandrel=rows_of(MANDREL))
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        session = ToolSession(cell.arm, history, config, "test")
+        made = Driver(session, cell, RoundTool.cylinder(TAUGHT, RADIUS_M))
+        assert made.measure("reference").done
+        assert of_mandrel(made, "witness reference").done
+        yield made
+
+
+def of_mandrel(driver: Driver, mode: str = "witness", mandrel: np.ndarray = MANDREL) -> Outcome:
+    """Measure what the flange carries beside the tool."""
+    tool, driver.program.tool = driver.program.tool, RoundTool.cylinder(mandrel, RADIUS_M)
+    found = driver.measure(mode)
+    driver.program.tool = tool
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", [0.3, 0.8, 2.0])
+def test_a_mandrel_tells_how_far_the_station_was_knocked(with_mandrel, size, seed):
+    driver = with_mandrel
+    before = driver.cell.station.beams[0]
+    driver.cell.station = knocked(driver.cell.station, "station_knocked_shift", size, seed)
+    moved = driver.cell.station.beams[0].start - before.start
+    found = of_mandrel(driver)
+    assert found.status is Code.STATION_MOVED, found.message
+    sigma_mm = np.array(found.document["sigma_mm"])
+    off_mm = np.array(found.document["station_shift_mm"]) - 1e3 * moved
+    assert np.all(np.abs(off_mm) < 4.0 * sigma_mm)
+    tool = driver.measure("full")  # now also a knock that looks like no bend is named
+    assert tool.status is Code.STATION_MOVED, tool.message
+    assert "without it the tool's tip is" in tool.message
+
+
+@pytest.mark.parametrize("size_m", [4e-4, 1e-3])
+def test_beside_a_mandrel_that_stands_a_tool_that_slipped_is_the_tools(with_mandrel, size_m):
+    driver = with_mandrel
+    slipped = bent(TAUGHT, [size_m, 0.0, 0.3 * size_m], [0.0, 0.0, 0.0])
+    driver.program.tool = RoundTool.cylinder(slipped, RADIUS_M)
+    assert driver.measure("full").document["witness"]["cause"] != "tool"
+    standing = of_mandrel(driver)
+    assert standing.done, standing.message
+    found = driver.measure("full")
+    assert found.done
+    assert found.document["witness"]["cause"] == "tool", found.message
+
+
+def test_a_mandrel_that_tilted_is_no_witness(with_mandrel):
+    hit = bent(MANDREL, [2e-3, 0.0, 0.0], [0.0, 0.015, 0.0])
+    found = of_mandrel(with_mandrel, mandrel=hit)
+    assert found.status is Code.WRONG_TOOL
+    assert "it is loose or was hit" in found.message
+
+
+def test_a_mandrel_must_be_known(driver):
+    found = driver.command(Command(MEASURE_TOOL, {"mode": "witness"}))
+    assert found.status is Code.CONFLICT
+    assert "there is no mandrel" in found.message
+
+
+def test_a_mandrel_is_measured_once_while_the_station_stands_right(tmp_path):
+    cell = noisy_cell()
+    config = config_of(cell, mandrel=rows_of(MANDREL))
+    with CalibrationHistory.open("K1", state_dir=tmp_path) as history:
+        made = Driver(ToolSession(cell.arm, history, config, "test"), cell, None)
+        made.rest(0.1)
+        found = made.command(Command(MEASURE_TOOL, {"mode": "witness"}))
+    assert found.status is Code.CONFLICT
+    assert "WITNESS_REFERENCE" in found.message
