@@ -23,6 +23,8 @@ RIGHT: Mapping[Fault, Code] = {
     "sensor_knocked": Code.SENSOR_OR_ROBOT_MOVED,
     "sphere_knocked": Code.SENSOR_OR_ROBOT_MOVED,
     "moved_by_hand": Code.SENSOR_OR_ROBOT_MOVED,
+    "station_knocked": Code.STATION_MOVED,
+    "station_knocked_shift": Code.STATION_MOVED,
     "beam_dirty": Code.BEAM_EDGES_WRONG,
     "beam_x_dead": Code.BEAM_EDGES_WRONG,
     "beam_y_dead": Code.BEAM_EDGES_WRONG,
@@ -42,11 +44,13 @@ RIGHT: Mapping[Fault, Code] = {
 """What a PLC must read (docs/cell.md). Exchanged motor temperatures need none: they are only used
 where the drift was learned with them. Nor does a jump of the sensor's clock: the robot stands until
 the joint readings have passed a measurement's stamp, so it is taken at the same joints; one that is
-too large for that leaves poses unmeasured."""
+too large for that leaves poses unmeasured. Nor does a station that turns about the crossing of its
+beams: neither tip nor axis of the tool change with it."""
 
 ONLY_BY: Mapping[Fault, str] = {"collision": "tool"}
 """Who must give the right code, where it means something else of others."""
 
+STATION_MM = (0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.2, 2.0)
 SWEEP: Mapping[Fault, tuple[float, ...]] = {
     "collision": (0.1, 0.2, 0.3, 0.5, 2.0),
     "wrong_tool": (0.2, 0.6, 1.0, 2.0, 10.0),
@@ -59,6 +63,9 @@ SWEEP: Mapping[Fault, tuple[float, ...]] = {
     "sensor_clock_jump": (0.01, 0.1, 1.0, 10.0),
     "frozen_encoder": (1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
     "moved_by_hand": (0.05, 0.1, 0.15, 0.2, 1.0),
+    "station_knocked": STATION_MM,
+    "station_knocked_shift": STATION_MM,
+    "station_knocked_turn": (0.05, 0.2, 0.5, 1.0),
 }
 """Sizes in the faults' own units; a fault that is not here is tried at its usual one."""
 

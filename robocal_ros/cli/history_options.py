@@ -4,12 +4,12 @@ import argparse
 from pathlib import Path
 
 from robocal_ros.cli.arguments import count, text
-from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL, hand_eye_kind
+from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, hand_eye_kind
 from robocal_ros.storage.files import quoted
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"
-_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL)
+_KINDS = (THERMAL, "reference", TOOL, HEALTHY_TOOL, MANDREL)
 
 
 def add_history(action: argparse.ArgumentParser) -> None:

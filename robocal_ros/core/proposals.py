@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the history is listed without loading NumPy
 THERMAL = "thermal"
 TOOL = "tool"
 HEALTHY_TOOL = "tool_reference"  # how the taught tool measures while it is right
+MANDREL = "mandrel_reference"  # how the mandrel measures while the beam station stands right
 HAND_EYE = "hand_eye"  # where a sensor sits; see `hand_eye_kind`
 # What is in force before anything was accepted; of other kinds nothing.
 BEFORE_ANY = {THERMAL: "the nominal model", TOOL: "the taught tool"}

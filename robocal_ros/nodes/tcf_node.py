@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.errors import ConflictError, InputError, RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.motion.loading import load_motion
 from robocal_ros.motion.silence import Silence
@@ -40,6 +40,7 @@ from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import configuration
+from robocal_ros.sessions.tool_results import WITNESS, WITNESS_REFERENCE
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.laser_files import read_laser_for
 from robocal_ros.storage.robots import load_robot, robot_file_hash
@@ -166,6 +167,9 @@ class TcfNode(HouseNode):
         session = self._session
         known = session is not None and session.answered(mode, cycle_id)
         if self._motion is not None and not known:
+            if mode in (WITNESS, WITNESS_REFERENCE):
+                words = "the way of the tool beside the mandrel is not known here"
+                raise ConflictError(f"{words}: the robot's program drives it (motion: program)")
             self._motion.require_ready()
         return self._desk.ask(Command(MEASURE_TOOL, {"mode": mode, "cycle_id": cycle_id, "by": by}))
 

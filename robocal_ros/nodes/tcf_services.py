@@ -16,13 +16,15 @@ from robocal_ros.core.proposals import TOOL
 from robocal_ros.nodes.decision_services import DecisionServices
 from robocal_ros.nodes.endpoints import EndpointNode, trigger_text
 from robocal_ros.sessions.events import Outcome
-from robocal_ros.sessions.tool_results import FULL, QUICK, REFERENCE
+from robocal_ros.sessions.tool_results import FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 MODES = {
     MeasureTool.Goal.FULL: FULL,
     MeasureTool.Goal.QUICK: QUICK,
     MeasureTool.Goal.REFERENCE: REFERENCE,
+    MeasureTool.Goal.WITNESS: WITNESS,
+    MeasureTool.Goal.WITNESS_REFERENCE: WITNESS_REFERENCE,
 }
 ANSWERS = {
     "pass": MeasureTool.Result.PASS,
@@ -103,7 +105,7 @@ class TcfServices:
             if not self._node.is_active:
                 return self._end(goal, Code.CONFLICT, f"the node is {self._node.state}")
             if request.mode not in MODES:
-                words = f"mode {request.mode} is none of FULL, QUICK, REFERENCE"
+                words = f"mode {request.mode} is none of {', '.join(MODES.values())}"
                 return self._end(goal, Code.BAD_INPUT, words)
             if request.only_in_gap and (why := self._runner.deaf()):
                 return self._end(goal, Code.CONFLICT, f"{self._node.get_name()}: {why}")

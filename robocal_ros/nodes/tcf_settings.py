@@ -34,6 +34,11 @@ SETTINGS = (
         "Taught tool in the flange frame; as the quaternion at its default: the robot file's",
         "Its orientation: z from flange to tip",
     ),
+    *pose_settings(
+        "mandrel",
+        "End of the mandrel in the flange frame; as the quaternion at its default: there is none",
+        "Its orientation: z along its axis to its end",
+    ),
     Setting("laser", "", "Laser file of the station, as 'robocal tool beams' writes it"),
     Setting("base_frame", "base", "Name of the robot's base frame"),
     Setting("flange_frame", "tool0", "Name of the flange frame; it is never modified"),
@@ -169,14 +174,14 @@ def session_config(
     InputError
         When a length or speed is out of range.
     """
-    x, y = settings["beams"]
     return ToolConfig(
         points_m=rows_of(laser.points),
         taught=rows_of(taught),
+        mandrel=None if (T := given_pose(settings, "mandrel")) is None else rows_of(T),
         laser_sigma_m=laser.sigma_m,
         reach_m=(float(laser.reach[0]), float(laser.reach[1])),
         station=station,
-        beams=(x, y),
+        beams=tuple(settings["beams"]),
         taper=settings["taper"],
         spin_rad=float(np.radians(settings["spin_deg"])),
         step_timeout_s=settings["step_timeout_s"],

@@ -21,7 +21,7 @@ from robocal_ros.sessions.history import History
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool_config import ToolConfig
 from robocal_ros.sessions.tool_in_force import ToolInForce
-from robocal_ros.sessions.tool_results import MODES, QUICK, REFERENCE, ToolResults
+from robocal_ros.sessions.tool_results import FULL, MODES, QUICK, ToolResults
 from robocal_ros.sessions.tool_run import ToolRun
 
 AHEAD_S = AHEAD_NS * 1e-9
@@ -169,13 +169,13 @@ class ToolSession(Commanded):
             raise ConflictError(f"no joint states yet: does the robot's driver publish {JOINTS}?")
         config, current = self.config, self._current
         quick = mode == QUICK
-        tool = self._results.expected().T_flange_tool if quick else config.T_flange_taught
+        tool = self._results.expected().T_flange_tool if quick else self._results.taught(mode)
         steps: Mode = "quick" if quick else "full"
         plan = MeasuringPlan(steps, self._laser, tool, config.motion, config.spin_rad)
         self._runs += 1
         begun_ns = command.stamp_ns or 0
         arm, revision = current.arm, current.thermal.revision
-        healthy = None if mode == REFERENCE else current.healthy_traits
+        healthy = current.healthy_traits if mode in (FULL, QUICK) else None
         self.run = ToolRun(
             self._runs, mode, cycle_id, plan, config, arm, revision, begun_ns, begun_ns, healthy
         )

@@ -16,6 +16,7 @@ from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion
 from robocal_ros.core.tool.quick_check import CheckRule
 from robocal_ros.core.tool.run_traits import TraitLimits
+from robocal_ros.core.tool.witness import BendRule
 
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, ...], ...]
@@ -32,6 +33,7 @@ class ToolConfig:
     taught : rows of T_flange_tool (4, 4) as taught.
     station : frame_id of the beams' edges; empty: any.
     beams : names of the x- and the y-beam in the edges.
+    mandrel : rows of T_flange_mandrel (4, 4), z along its axis to its end; None: there is none.
     taper : growth of the tool's radius per length above the tip.
     spin_rad : turn of the flange about the laser's z while it measures.
     step_timeout_s : a step without any edge for so long ends the run.
@@ -39,6 +41,7 @@ class ToolConfig:
 
     points_m: Rows
     taught: Rows
+    mandrel: Rows | None = None
     laser_sigma_m: float = 0.0
     reach_m: tuple[float, float] = (0.0, 0.0)
     station: str = ""
@@ -62,6 +65,12 @@ class ToolConfig:
     def T_flange_taught(self) -> Array:
         """The taught tool (4, 4)."""
         return np.array(self.taught)
+
+    @property
+    def bend(self) -> BendRule:
+        """Where the tool may bend: between the mount and the upper circle."""
+        nearest_m = self.motion.above_tip_m + self.motion.height_m
+        return BendRule(nearest_m, max(nearest_m, self.check.lever_m))
 
     def document(self) -> dict[str, Any]:
         """Plain values; `of_document` reads them back."""
@@ -89,6 +98,8 @@ class ToolConfig:
             rows: dict[str, Any] = {
                 key: tuple(map(tuple, values.pop(key))) for key in ("points_m", "taught")
             }
+            if values.get("mandrel") is not None:  # older ones have none
+                rows["mandrel"] = tuple(map(tuple, values.pop("mandrel")))
             pairs: dict[str, Any] = {key: tuple(values.pop(key)) for key in ("reach_m", "beams")}
             made: dict[str, Any] = {key: part(**values.pop(key)) for key, part in parts.items()}
             return cls(**rows, **pairs, **made, **values)

@@ -2,14 +2,19 @@
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from robocal_ros.core.documents import arm_of
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL, Head
+from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.run_traits import RunTraits
 from robocal_ros.sessions.followed import Followed
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig, made_with
+
+Array = NDArray[np.float64]
 
 
 class ToolInForce(Followed):
@@ -17,12 +22,13 @@ class ToolInForce(Followed):
 
     Attributes
     ----------
-    head, thermal, healthy : heads of the tools, of the thermal models and of the measurements of
-        the healthy tool.
+    head, thermal, healthy, mandrel : heads of the tools, of the thermal models and of the
+        measurements of the healthy tool and of the mandrel.
     """
 
     def __init__(self, history: History, nominal: SerialArm, config: ToolConfig) -> None:
         self._nominal = nominal
+        self._mandrel = None if config.mandrel is None else [list(row) for row in config.mandrel]
         self._taught, self._made_with = KnownTool(config.T_flange_taught), made_with(config)
         super().__init__(history, TOOL)
 
@@ -30,6 +36,7 @@ class ToolInForce(Followed):
         super()._read()
         self.thermal: Head = self._history.head(THERMAL)
         self.healthy: Head = self._history.head(HEALTHY_TOOL)
+        self.mandrel: Head = self._history.head(MANDREL)
 
     @property
     def arm(self) -> SerialArm:
@@ -44,6 +51,12 @@ class ToolInForce(Followed):
         return self._taught if model is None else KnownTool.of_document(model)
 
     @property
+    def anchor(self) -> Array:
+        """Tip (3,) of the last tool whose cause was known: in force, or before small changes."""
+        known = (self.head.model or {}).get("anchor")
+        return self.tool.T_flange_tool[:3, 3] if known is None else np.array(known)
+
+    @property
     def measured_healthy(self) -> KnownTool | None:
         """How the healthy tool was measured; None without, or with another tool or station."""
         model = self._healthy_model
@@ -55,6 +68,14 @@ class ToolInForce(Followed):
         model = self._healthy_model
         traits = None if model is None else model.get("traits")
         return None if traits is None else RunTraits.of_document(traits)
+
+    @property
+    def measured_mandrel(self) -> KnownTool | None:
+        """How the mandrel was measured; None without, or with another one or another station."""
+        model = self.mandrel.model
+        if model is None or model["made_with"] != self._made_with:
+            return None
+        return KnownTool.of_document(model) if model["mandrel"] == self._mandrel else None
 
     @property
     def _healthy_model(self) -> dict[str, Any] | None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import HEALTHY_TOOL, THERMAL, TOOL
+from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.recorded import configured_with, recorded_arguments
@@ -25,6 +25,7 @@ def configuration(session: ToolSession, topics: Mapping[str, str]) -> Command:
         "model": current.thermal.model,
         "tool": current.head.model,
         OWN: current.healthy.model,
+        "mandrel": current.mandrel.model,
     }
     return configured_with(session, topics, session.config.document(), in_force)
 
@@ -49,5 +50,6 @@ def tool_session_as_recorded(
     arguments = recorded_arguments(nominal, configured, tuple(IN_FORCE))
     config = ToolConfig.of_document(arguments["config"])
     in_force = {kind: arguments[name] for name, kind in IN_FORCE.items()}
+    in_force[MANDREL] = configured.arguments.get("mandrel")  # older recordings have none
     seeded(history, nominal, in_force, software)
     return ToolSession(nominal, history, config, software)

@@ -6,11 +6,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import Verdict
 from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import ConflictError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import HEALTHY_TOOL, TOOL, Proposal
+from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, TOOL, Proposal
 from robocal_ros.core.tool.change_documents import change_document, check_document
 from robocal_ros.core.tool.crossed_model import Held
 from robocal_ros.core.tool.documents import run_document
@@ -18,21 +20,28 @@ from robocal_ros.core.tool.judging import (
     KnownTool,
     change_between,
     changed_tool,
+    difference,
     judge_healthy,
     judge_tool,
     spread_between,
+    witness_of,
 )
+from robocal_ros.core.tool.mandrel import StationFinding, station_finding, with_mandrel
 from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
+from robocal_ros.core.tool.witness import SMALL_M
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig, made_with
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_run import ToolRun
 
+Array = NDArray[np.float64]
 Document = dict[str, Any]
 
 FULL, QUICK, REFERENCE = "full", "quick", "reference"
-MODES = (FULL, QUICK, REFERENCE)
+WITNESS, WITNESS_REFERENCE = "witness", "witness reference"  # of the mandrel
+MODES = (FULL, QUICK, REFERENCE, WITNESS, WITNESS_REFERENCE)
+WITNESS_NS = 600 * 10**9  # so long a mandrel's answer holds for measurements of the tool after it
 REMEMBERED = 200  # answers, and calibrations back to which a cycle's id is known
 CODE_OF: dict[Answer, Code] = {
     "pass": Code.ACCEPT,
@@ -61,6 +70,26 @@ class ToolResults:
         self._nominal, self._history, self._config = nominal, history, config
         self._software, self._current = software, current
         self._answers: OrderedDict[tuple[str, str], Outcome] = OrderedDict()
+        self._station: tuple[int, StationFinding] | None = None  # with its stamp, ns
+
+    def taught(self, mode: str) -> Array:
+        """What a mode measures (4, 4), as it was taught: the tool, or the mandrel.
+
+        Raises
+        ------
+        ConflictError
+            When there is no mandrel, or nobody knows how it measures.
+        """
+        if mode not in (WITNESS, WITNESS_REFERENCE):
+            return self._config.T_flange_taught
+        if self._config.mandrel is None:
+            raise ConflictError("there is no mandrel: say where it sits on the flange ('mandrel')")
+        if mode == WITNESS and self._current.measured_mandrel is None:
+            raise ConflictError(
+                "how the mandrel measures is not known: measure it in mode WITNESS_REFERENCE "
+                "while the beam station stands right"
+            )
+        return np.array(self._config.mandrel)
 
     def of_cycle(self, mode: str, cycle_id: str) -> Outcome | None:
         """The answer of a cycle that has ended, None for a new one."""
@@ -68,7 +97,7 @@ class ToolResults:
             return None
         if (mode, cycle_id) in self._answers:
             return self._answers[mode, cycle_id]
-        kind = {FULL: TOOL, REFERENCE: HEALTHY_TOOL}.get(mode)
+        kind = {FULL: TOOL, REFERENCE: HEALTHY_TOOL, WITNESS_REFERENCE: MANDREL}.get(mode)
         for entry in self._history.list(REMEMBERED):
             if entry.kind == kind and entry.cycle_id == cycle_id:
                 document = self._history.document(entry.id)
@@ -83,7 +112,13 @@ class ToolResults:
         RobocalError
             When no tool explains it, or the result cannot be kept.
         """
-        ends = {FULL: self._full, QUICK: self._quick, REFERENCE: self._reference}
+        ends = {
+            FULL: self._full,
+            QUICK: self._quick,
+            REFERENCE: self._reference,
+            WITNESS: self._witness,
+            WITNESS_REFERENCE: self._reference,
+        }
         return self._remembered(run, ends[run.mode](run, command, wall_ns))
 
     def _remembered(self, run: ToolRun, outcome: Outcome) -> Outcome:
@@ -101,33 +136,62 @@ class ToolResults:
         absolute = healthy is None
         if healthy is not None:
             found = changed_tool(taught, healthy, found)
-        verdict = judge_tool(found, estimate, taught, in_force, self._config.limits)
+        anchor = self._current.anchor
+        witness = witness_of(found, in_force, self._config.bend, anchor)
+        if (station := self._known_station(command)) is not None:
+            shift = run.path.at(run.last_edge_s)[0][0, :3, :3] @ difference(found, in_force)[:3]
+            witness = with_mandrel(witness, station, shift)
+        verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         document = run_document(found, estimate, run.circles, verdict) | {
             "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
             "absolute": absolute,
+            "witness": witness.document(),
         }
-        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, found)
+        known: Document = {"cause": witness.cause}
+        if witness.cause == "tool" and witness.tip_m <= SMALL_M:  # many of them do not add up
+            known["anchor"] = anchor.tolist()
+        kept = self._keep(TOOL, run, command, wall_ns, verdict, document, found, **known)
         return Outcome(command, verdict.code, verdict.reason, document, kept)
 
     def _reference(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
-        """Keep how the healthy tool measures; in force at once: by itself it moves nothing."""
+        """Keep how healthy tool or mandrel measure; in force at once: it moves nothing."""
         run.require_even_readings()
         estimate = run.estimate(Held())
         found = KnownTool.measured(estimate)
-        taught = self._config.T_flange_taught
+        self._station = None  # what was said of it before holds no more
+        taught, mandrel = self.taught(run.mode), run.mode == WITNESS_REFERENCE
+        kind = MANDREL if mandrel else HEALTHY_TOOL
         verdict = judge_healthy(found, estimate, taught)
         document = run_document(found, estimate, run.circles, verdict)
         document["change"] = change_document(change_between(taught, found.T_flange_tool))
-        traits = run.traits(estimate).document()
-        kept = self._keep(
-            HEALTHY_TOOL, run, command, wall_ns, verdict, document, found, traits=traits
-        )
+        own: Document = {"traits": run.traits(estimate).document()}
+        if mandrel:
+            own = {"mandrel": taught.tolist()}
+        kept = self._keep(kind, run, command, wall_ns, verdict, document, found, **own)
         if verdict.accept:
             by = str(command.arguments.get("by", ""))
             self._history.accept(
                 kept, by=by, reason=verdict.reason, expected_head=None, wall_ns=wall_ns
             )
         return Outcome(command, verdict.code, verdict.reason, document, kept)
+
+    def _witness(self, run: ToolRun, command: Command, wall_ns: int) -> Outcome:
+        """What the mandrel says of the beam station; for the tool's measurements to come."""
+        estimate, reference = run.estimate(Held()), self._current.measured_mandrel
+        if reference is None:
+            raise ConflictError("how the mandrel measures was forgotten in the run: repeat it")
+        found = KnownTool.measured(estimate)
+        both = [c for c in (found.own_covariance, reference.own_covariance) if c is not None]
+        R = run.path.at(run.last_edge_s)[0][0, :3, :3]
+        station = station_finding(found, reference, np.sum(both, axis=0), R)
+        self._station = (command.stamp_ns or 0), station
+        verdict = station.verdict
+        return Outcome(command, verdict.code, verdict.reason, station.document())
+
+    def _known_station(self, command: Command) -> StationFinding | None:
+        """The mandrel's answer, while it is fresh."""
+        stamp_ns, station = self._station or (0, None)
+        return station if 0 <= (command.stamp_ns or 0) - stamp_ns <= WITNESS_NS else None
 
     def early(self, run: ToolRun, command: Command) -> Outcome | None:
         """The answer of a quick check whose circle says enough; None: go on."""

@@ -127,6 +127,11 @@ class ToolRun:
         """The flange during the steps so far."""
         return JointPath(self.arm, np.concatenate(self._time), np.concatenate(self._q))
 
+    @property
+    def last_edge_s(self) -> Array:
+        """Time (1,) of its last edge."""
+        return np.array([max(edge.time_s for edge in self.steps[-1].edges)])
+
     def estimate(self, held: Held) -> ToolEstimate:
         """The tool as the steps so far show it."""
         return estimate_tool(

@@ -69,7 +69,7 @@ class SimulatedCell:
             limits=plan.limits,
             lag_s=plan.lag_s,
         )
-        self.faults = Faults()
+        self.faults = Faults(seed=plan.seed)
         self._waiting: tuple[AnyFault, float] | None = None
         self._draws = Draws(plan.seed)
         self.gate = CommandGate(self.motion, self.faults, self._draws, self._begin)

@@ -37,6 +37,9 @@ Fault = Literal[
     "frozen_encoder",
     "swapped_temperatures",
     "moved_by_hand",
+    "station_knocked",
+    "station_knocked_shift",
+    "station_knocked_turn",
 ]
 ControllerFault = Literal[
     "commands_lost",
@@ -70,6 +73,9 @@ SIZES: Mapping[AnyFault, tuple[float, float, str]] = {
     "commands_late": (200.0, 1e-3, "ms"),
     "protective_stop": (10.0, 1.0, "s"),
     "speed_scaling": (50.0, 1e-2, "%"),
+    "station_knocked": (2.0, 1e-3, "mm"),
+    "station_knocked_shift": (2.0, 1e-3, "mm"),
+    "station_knocked_turn": (0.5, float(np.radians(1.0)), "deg"),
 }
 """Faults that have a size: the usual one, the factor of its unit, and this unit."""
 
@@ -90,7 +96,15 @@ NEXT_MOTION: frozenset[AnyFault] = frozenset(
 """Faults that begin with the robot's next motion; the others begin at once."""
 
 LASTING: frozenset[AnyFault] = frozenset(
-    {"collision", "wrong_tool", "sensor_knocked", "sphere_knocked"}
+    {
+        "collision",
+        "wrong_tool",
+        "sensor_knocked",
+        "sphere_knocked",
+        "station_knocked",
+        "station_knocked_shift",
+        "station_knocked_turn",
+    }
 )
 """What was moved or mounted stays so while other faults come and go."""
 
@@ -103,6 +117,8 @@ TURN = np.array([0.6, -0.8, 0.0])
 TURN_RAD_PER_M = 1.0
 BALL_KNOCK = np.array([0.6, 0.0, -0.8])  # flange axes
 HAND = np.array([0.7, -0.7, 0.0])  # base
+STATION_TURN_RAD_PER_M = float(np.radians(500.0))  # of a knock that also turns: 0.5 deg for 1 mm
+STATION_KNOCKED = 31  # names the draw of a knock's directions
 CHATTER = 7  # edges that one edge becomes
 CHATTER_S = 3e-4
 AGAIN_S = 5e-3  # a double edge comes so much later
@@ -116,9 +132,16 @@ def size_of(fault: AnyFault, size: float = 0.0) -> float:
 
 @dataclass
 class Faults:
-    """What is wrong now: size, in SI, of each fault in force."""
+    """What is wrong now.
+
+    Attributes
+    ----------
+    sizes : size, in SI, of each fault in force.
+    seed : of the cell; the directions in which its station is knocked follow from it.
+    """
 
     sizes: dict[AnyFault, float] = field(default_factory=dict)
+    seed: int = 0
 
     def __contains__(self, fault: AnyFault) -> bool:
         return fault in self.sizes
@@ -157,8 +180,33 @@ class Faults:
         """How far (3,) a hand moves the flange, base, m."""
         return self.size("moved_by_hand") * HAND
 
+    def T_station_knock(self, crossing: Array) -> Array:
+        """Takes points (4, 4) of the station, base, to where they are after a knock.
+
+        The station turns about ``crossing`` (3,) and shifts. Both directions are drawn once for a
+        cell, one evenly in space each.
+        """
+        both = self.size("station_knocked")
+        shift_m = both + self.size("station_knocked_shift")
+        turn_rad = both * STATION_TURN_RAD_PER_M + self.size("station_knocked_turn")
+        ways = np.random.default_rng([self.seed, STATION_KNOCKED]).standard_normal((2, 3))
+        ways /= np.linalg.norm(ways, axis=1)[:, None]
+        R = frames.exp_rotation(turn_rad * ways[1])
+        return frames.transform(R, crossing - R @ crossing + shift_m * ways[0])
+
     def station(self, clean: BeamStation) -> BeamStation:
-        """The station with dirt before the x-beam's receiver: it goes dark earlier, or for good."""
+        """The station where a knock has put it, with dirt before the x-beam's receiver.
+
+        With dirt that beam goes dark earlier, or for good.
+        """
+        if any(name.startswith("station_knocked") for name in self.sizes):
+            crossing = np.mean([[beam.start, beam.end] for beam in clean.beams], axis=(0, 1))
+            T = self.T_station_knock(crossing)
+            x, y = (
+                replace(beam, start=(T @ [*beam.start, 1.0])[:3], end=(T @ [*beam.end, 1.0])[:3])
+                for beam in clean.beams
+            )
+            clean = replace(clean, beams=(x, y))
         left = 1.0 - self.size("beam_dirty")
         if left == 1.0:
             return clean

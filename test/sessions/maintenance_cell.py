@@ -404,6 +404,7 @@ def proposed(
     history: Any,
     shift_m: Sequence[float] = (1e-3, 0.0, 0.0),
     thermal_revision: int | None = None,
+    cause: str = "tool",
     **made_otherwise: Any,
 ) -> int:
     """A tool candidate beside the taught one, as the tool node keeps it."""
@@ -412,7 +413,7 @@ def proposed(
     if thermal_revision is None:
         thermal_revision = history.head(THERMAL).revision
     made = made_with(tool_config(CELL, **made_otherwise))
-    model = {"thermal_revision": thermal_revision, "made_with": made}
+    model = {"thermal_revision": thermal_revision, "made_with": made, "cause": cause}
     return _kept(history, TOOL, tool.document() | model)
 
 

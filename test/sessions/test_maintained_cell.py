@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from maintained_cell import POSES, TOLERANCE_M, MaintainedCell
-from tool_driver import TAUGHT, TRUTH, Driver
+from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
@@ -23,12 +23,14 @@ from robocal_ros.sessions.maintenance import AcceptBounds
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sim import kr150_cell
+from robocal_ros.sim.beams import RoundTool, bent
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 
 GAP_S = 240.0
 EVERY_S, HALF_S = 300.0, 29.0
 KELVIN, HOT_KELVIN = 10.0, 40.0
+HEALTHY = RoundTool.cylinder(TAUGHT, 0.0025)
 BEYOND = 16.3  # chi-square of 3 unknowns, one in a thousand
 
 
@@ -53,9 +55,12 @@ class Kept:
 
 @pytest.fixture(scope="module")
 def captured(tmp_path_factory) -> Kept:
-    """A cell whose cold reference is captured."""
+    """A cell whose cold reference is captured, and whose healthy tool was measured."""
     folder = tmp_path_factory.mktemp("captured")
     with CalibrationHistory.open("K1", state_dir=folder) as opened:
+        station = noisy_cell()
+        session = ToolSession(station.arm, opened, config_of(station), "test")
+        assert Driver(session, station, HEALTHY).measure("reference").done
         cell = MaintainedCell(opened)
         cell.capture_reference()
     return Kept(folder, cell.now_s)
@@ -181,10 +186,10 @@ def test_without_leave_everything_is_proposed_and_nothing_changed(waiting):
 
 @pytest.mark.parametrize(
     ("bounds", "words"),
-    [({"tool_m": 3.9e-3}, "mm from where"), ({"thermal_m": 5e-5, "tool_m": 0.01}, "commissioning")],
+    [({"tool_m": 3.5e-3}, "mm from where"), ({"thermal_m": 5e-5, "tool_m": 0.01}, "commissioning")],
 )
 def test_what_is_beyond_the_bounds_waits(warm, bounds, words):
-    """The true tool is 4.1 mm and 3.7 deg away, the true drift some hundredths of a millimetre."""
+    """The true tool is 3.7 mm and 2.6 deg away, the true drift some hundredths of a millimetre."""
     cell = warm(automatic=True, **({"tool_rad": 0.1} | bounds))
     result = cell.maintain("c1", GAP_S)
     if "thermal_m" in bounds:
@@ -246,9 +251,9 @@ def test_small_steps_do_not_creep_past_the_bounds(history):
     cell.maintain("c0", GAP_S)
     accepted = []
     for number in range(1, 5):
-        shifted = TAUGHT.copy()
-        shifted[0, 3] += 0.8e-3 * number
-        cell.tool = replace(cell.tool, T_flange_tool=shifted)
+        shift_m = 0.8e-3 * number
+        tool = bent(TAUGHT, [shift_m, 0.0, 0.0], [0.0, shift_m / 0.1, 0.0])
+        cell.tool = replace(cell.tool, T_flange_tool=tool)
         cell.production(0.5, KELVIN)
         result = cell.maintain(f"c{number}", GAP_S)
         accepted.append(result.tool_id in result.accepted and result.tool_id > 0)

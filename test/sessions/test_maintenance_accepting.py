@@ -229,3 +229,14 @@ def test_a_tool_of_another_thermal_revision_is_not_accepted_without_a_person(his
     result = cell.finish()
     assert f"tool candidate {number} waits for a decision: tool {number} was" in result.message
     assert result.accepted == ()
+
+
+@pytest.mark.parametrize("cause", ["doubt", "station"])
+def test_a_tool_that_may_be_the_stations_waits_for_a_person(history, cause):
+    cell = automatic(history)
+    number = measured_in_full(cell, cause=cause)
+    result = cell.finish()
+    assert f"tool candidate {number} waits" in result.message
+    assert "nothing proves that the tool has changed and not the beam station" in result.message
+    assert result.accepted == ()
+    assert cell.session.decide(ACCEPT, number, "a person", "", cell.wall_ns).done

@@ -260,3 +260,21 @@ def test_a_tool_of_another_thermal_model_that_comes_back_is_due(checked):
     checked.finish()
     assert modes(checked) == ["quick"]
     assert level(checked) is AccuracyLevel.OK
+
+
+def test_a_station_that_moved_degrades_until_a_check_passes(cell):
+    words = "the beam station was knocked, or the tool slipped in its mount"
+    cell.check = bent()
+    cell.full = lambda _: Answer(Code.STATION_MOVED, words, 7, (), True, "", 0.8, 0.03)
+    cell.run("c1", LONG_S)
+    result = cell.finish()
+    assert (result.tool_found_code, result.tool_code) == (Code.STATION_MOVED, Code.STATION_MOVED)
+    assert result.accepted == ()
+    assert level(cell) is AccuracyLevel.DEGRADED
+    assert words in cell.session.accuracy(cell.now_s, cell.wall_ns).reason
+    cell.check = passed()
+    cell.log.clear()
+    cell.run("c2", LONG_S)
+    cell.finish()
+    assert modes(cell) == ["quick"]
+    assert level(cell) is AccuracyLevel.OK

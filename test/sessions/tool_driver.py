@@ -19,7 +19,7 @@ from robocal_ros.sim.robot_program import RobotProgram, Sample
 from robocal_ros.sim.tool_cell import ToolCell
 from robocal_ros.sim.ur10_station import TAUGHT
 
-TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
+TRUTH = bent(TAUGHT, [0.003, -0.002, 0.001], [0.025, 0.0375, 0.0])  # 80 mm above its tip
 NOISE = TrueNoise(3e-5, 1e-5)
 START_NS = 1_700_000_000_000_000_000
 

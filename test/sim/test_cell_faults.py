@@ -71,6 +71,9 @@ TOUCHED = {
     "frozen_encoder": {"joints", "speeds"},
     "swapped_temperatures": {"temperatures"},
     "moved_by_hand": {"edges", "error", "ball", "cloud"},
+    "station_knocked": {"edges"},
+    "station_knocked_shift": {"edges"},
+    "station_knocked_turn": {"edges"},
 }  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.descent import chi2_quantile
 from robocal_ros.core.tool.crossed_run import ToolEstimate
 from robocal_ros.core.tool.tool_axis import minimal_rotation
+from robocal_ros.core.tool.witness import BendRule, Witness, bend_or_station
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -147,12 +148,17 @@ def judge_run(estimate: ToolEstimate, limits: ToolLimits) -> Verdict:
 
 
 def judge_tool(
-    found: KnownTool, estimate: ToolEstimate, taught: Array, in_force: KnownTool, limits: ToolLimits
+    found: KnownTool,
+    estimate: ToolEstimate,
+    taught: Array,
+    in_force: KnownTool,
+    limits: ToolLimits,
+    witness: Witness,
 ) -> Verdict:
     """Decide whether a measured tool may replace the one in force.
 
-    Refused: what `judge_run` refuses, a change from the taught tool beyond what may be, and a tool
-    that is the one in force as far as its noise tells.
+    Refused: what `judge_run` refuses, a change from the taught tool beyond what may be, a tool
+    that is the one in force as far as its noise tells, and a change that is the beam station's.
     """
     run = judge_run(estimate, limits)
     moved = change_between(in_force.T_flange_tool, found.T_flange_tool)
@@ -172,7 +178,9 @@ def judge_tool(
         )
     if unchanged(found, in_force):
         return Verdict(Code.NO_SIGNIFICANT_GAIN, f"{what}; the tool has not moved")
-    return Verdict(Code.ACCEPT, what)
+    if witness.cause == "station":
+        return Verdict(Code.STATION_MOVED, f"{what}; {witness.reason}")
+    return Verdict(Code.ACCEPT, f"{what}; {witness.reason}")
 
 
 def unchanged(found: KnownTool, in_force: KnownTool) -> bool:
@@ -180,10 +188,31 @@ def unchanged(found: KnownTool, in_force: KnownTool) -> bool:
     spread = spread_between(found, in_force)
     if spread is None:
         return False
+    d = difference(found, in_force)
+    return float(d @ np.linalg.solve(spread, d)) <= chi2_quantile(UNCHANGED, len(d))
+
+
+def difference(found: KnownTool, in_force: KnownTool) -> Array:
+    """(5,) of the tip along the flange's x, y, z, and of the axis along the tool's x and y."""
     R = in_force.T_flange_tool[:3, :3]
     tilt = R[:, :2].T @ (found.T_flange_tool[:3, 2] - in_force.T_flange_tool[:3, 2])
-    d = np.append(found.T_flange_tool[:3, 3] - in_force.T_flange_tool[:3, 3], tilt)
-    return float(d @ np.linalg.solve(spread, d)) <= chi2_quantile(UNCHANGED, len(d))
+    return np.append(found.T_flange_tool[:3, 3] - in_force.T_flange_tool[:3, 3], tilt)
+
+
+def witness_of(found: KnownTool, in_force: KnownTool, rule: BendRule, anchor: Array) -> Witness:
+    """What the change from the tool in force says of its cause, see `bend_or_station`.
+
+    ``anchor`` (3,): tip of the tool in force, or of the last one whose cause was known.
+    """
+    d, spread = difference(found, in_force), spread_between(found, in_force)
+    if spread is None:
+        tip, tilt = float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:]))
+        words = "without a run of the healthy tool nothing tells a bent tool from a knocked station"
+        return Witness("doubt", f"{words}: measure it in mode REFERENCE", tip, tilt)
+    turn = np.eye(5)
+    turn[:3, :3] = in_force.T_flange_tool[:3, :3].T  # flange axes to the tool's
+    small_m = float(np.linalg.norm(found.T_flange_tool[:3, 3] - anchor))
+    return bend_or_station(turn @ d, turn @ spread @ turn.T, rule, small_m)
 
 
 def spread_between(found: KnownTool, in_force: KnownTool) -> Array | None:

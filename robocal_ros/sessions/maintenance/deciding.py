@@ -248,6 +248,11 @@ class Decider:
                 f"deg from the taught one (allowed without a person {bounds.tool_m * 1e3:.2f} mm, "
                 f"{np.degrees(bounds.tool_rad):.2f} deg)"
             )
+        if model.get("cause") != "tool":
+            return (
+                "nothing proves that the tool has changed and not the beam station: look at both, "
+                "then accept or reject it"
+            )
         return ""
 
     def _other_reference(self, made_with: Mapping[str, Any]) -> str:

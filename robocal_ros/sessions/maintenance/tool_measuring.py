@@ -57,6 +57,8 @@ class ToolOutcome:
     @property
     def found_code(self) -> Code:
         """What was found of the tool as the gap began, also where that is mended since."""
+        if self.last and self.last.code is Code.STATION_MOVED:
+            return self.last.code
         if self.bent:
             return Code.LIMIT_EXCEEDED
         return self.first.code if self.first else Code.NONE
@@ -135,7 +137,9 @@ class ToolMeasuring:
         """Remember it at once: the run may be broken off on the way home."""
         outcome = self.outcome
         outcome.came(answer)
-        if answer.has_result and mode == FULL:
+        if answer.code is Code.STATION_MOVED:
+            self._failed(answer)
+        elif answer.has_result and mode == FULL:
             same = answer.code is Code.NO_SIGNIFICANT_GAIN
             candidate = answer.candidate_id if answer.done else 0
             self._note(answer, "pass" if same else "recalibrate", candidate)
@@ -147,14 +151,18 @@ class ToolMeasuring:
             if outcome.accepted and answer.answer == "recalibrate":
                 failed = f"tool {outcome.candidate_id} failed its check and is still in force"
                 outcome.fault = f"{failed}: take it back"
-        elif answer.code in FAILED:  # what an older check found of the tool holds no more
-            self._memory.note_tool(
-                answer="failed",
-                words=answer.message,
-                revision=self.revision,
-                thermal_id=self._through,
-                candidate=0,
-            )
+        elif answer.code in FAILED:
+            self._failed(answer)
+
+    def _failed(self, answer: Answer) -> None:
+        """What an older check found of the tool holds no more."""
+        self._memory.note_tool(
+            answer="failed",
+            words=answer.message,
+            revision=self.revision,
+            thermal_id=self._through,
+            candidate=0,
+        )
 
     def _note(self, answer: Answer, verdict: str, candidate: int = 0) -> None:
         self._memory.note_tool(
