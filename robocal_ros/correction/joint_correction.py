@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 LARGEST_SHIFT = 1.0
 # Of the shift per unit of a singular value: at 60 deg/s of the joints a drift's correction moves
 # by less than 2 deg/s; a tool's, which is larger, keeps the map from taught joints one to one.
-DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 30.0, 1.0 / 2.0
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 20.0, 1.0 / 2.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 RATE_STEP_S = 1e-3
 
@@ -103,7 +103,7 @@ class JointCorrection:
     largest : largest shift of a joint, rad (prismatic: m), for all or (n,) for each; the turning
         joints' least one is b of equation 3.
     free_axis : the tool may turn about its z; the turn is used to move the joints least.
-    slope : of equation 3.
+    slope : of equation 3; infinite: the bound alone damps.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class JointCorrection:
         models: Array,
         largest: ArrayLike = LARGEST_SHIFT,
         free_axis: bool = False,
-        slope: float = DRIFT_SLOPE,
+        slope: float = np.inf,
     ) -> None:
         self.models = plain(models)
         self.free_axis, self.slope = free_axis, slope
@@ -135,7 +135,7 @@ class JointCorrection:
         actual: SerialArm,
         largest: ArrayLike = LARGEST_SHIFT,
         free_axis: bool = False,
-        slope: float = DRIFT_SLOPE,
+        slope: float = np.inf,
     ) -> "JointCorrection":
         """Correction from one arm to another, each with its base and its ``T_flange_tool``."""
         if reference.n != actual.n or np.any(reference.prismatic != actual.prismatic):

@@ -1,7 +1,7 @@
 """Compiled algebra of the joint correction: goals, residuals, and the damping of weak directions.
 
-Twists [v; w] in base axes at the tool, m and rad: 1 m and 1 rad weigh the same (a singular value
-of the Jacobian of 0.1 means a joint speed of 10 rad/s for 1 m/s or 1 rad/s at the tool).
+Twists [v; w] in base axes at the tool, m and rad. Where they are weighed against each other, and in
+the Jacobian, lengths are in units of `LENGTH`.
 
 A free axis is the tool's z: a turn about it is left out of the residual and of the Jacobian.
 """
@@ -14,6 +14,9 @@ from robocal_ros.core.kinematics import newton
 
 Array = NDArray[np.float64]
 
+# The length (m) that weighs as 1 rad: what a tool's flank or a sensor's range makes of a turn.
+LENGTH = 0.3
+WEIGHT = 1.0 / LENGTH
 # Errors at the tool (m, rad) below this are damped as this: what no robot repeats to.
 LEAST_ERROR = 1e-6
 # Squared singular values from so many lambda^2 on are not damped; at 3 the damping of the first

@@ -47,6 +47,9 @@ def _residual_at(q: Array, free: bool, room: Room) -> None:
 def _jacobian(free: bool, room: Room, J: Array) -> None:
     """Columns of the Jacobian ``here``, without what is about a free axis."""
     newton.columns(room.links, room.frames, room.here, J)
+    for i in range(J.shape[0]):
+        for r in range(3):
+            J[i, r] *= k.WEIGHT
     if free:
         z0, z1, z2 = k.tool_axis(room.here, room.tool)
         for i in range(J.shape[0]):
@@ -62,7 +65,8 @@ def _damp(free: bool, room: Room) -> bool:
     n, M, D = room.x.shape[0], room.M, room.D
     square = 0.0
     for r in range(6):
-        square += room.e[r] * room.e[r]
+        weighed = room.e[r] * k.WEIGHT if r < 3 else room.e[r]
+        square += weighed * weighed
     square = k.lambda_square(square, room.settings[STEEPNESS], room.settings[PER_ERROR])
     k.product(room.J, room.J, M)
     absent = max(6 - n, 1 if free else 0)  # directions in which no joint moves the tool
@@ -88,7 +92,7 @@ def _add_step(q: Array, free: bool, room: Room) -> float:
     """One step with the factored matrix; returns its largest component in the joints."""
     step, size = room.step, 0.0
     for r in range(6):
-        step[r] = room.e[r]
+        step[r] = room.e[r] * k.WEIGHT if r < 3 else room.e[r]
         for c in range(6):
             step[r] -= room.D[r, c] * room.y[c]
     k.substitute(room.B, room.order, step)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel, lean
 from robocal_ros.core.kinematics.sines import LARGEST_ANGLE
-from robocal_ros.correction.kernels import WINDOW, lambda_square
+from robocal_ros.correction.kernels import WEIGHT, WINDOW, lambda_square
 from robocal_ros.correction.straight_kinematics import (
     ACTUAL,
     DAMPING,
@@ -69,9 +69,10 @@ def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
     By the modified Gram-Schmidt process; False where singular.
     """
     s, e = ACTUAL + 7, f[6]
-    a0, a1, a2 = column(c[s], f[0], e), column(c[s + 9], f[1], e), column(c[s + 18], f[2], e)
-    a3, a4 = column(c[s + 27], f[3], e), column(c[s + 36], f[4], e)
-    a5 = column(c[s + 45], f[5], e)
+    a0 = _weighed(column(c[s], f[0], e))
+    a1, a2 = _weighed(column(c[s + 9], f[1], e)), _weighed(column(c[s + 18], f[2], e))
+    a3, a4 = _weighed(column(c[s + 27], f[3], e)), _weighed(column(c[s + 36], f[4], e))
+    a5 = _weighed(column(c[s + 45], f[5], e))
     n0 = _dot(a0, a0)
     i0 = 1.0 / n0
     r01, r02, r03 = _dot(a0, a1) * i0, _dot(a0, a2) * i0, _dot(a0, a3) * i0
@@ -106,6 +107,12 @@ def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
 
 
 @lean
+def _weighed(e: Six) -> Six:
+    """A twist with lengths in units of `kernels.LENGTH`."""
+    return WEIGHT * e[0], WEIGHT * e[1], WEIGHT * e[2], e[3], e[4], e[5]
+
+
+@lean
 def _inverse_norm(factor: Factor) -> float:
     """Square of the inverse Jacobian's Frobenius norm: no singular value is below 1 / its root."""
     _, _, _, _, _, _, i, r, t, u = factor
@@ -135,6 +142,7 @@ def _inverse_norm(factor: Factor) -> float:
 def _step(factor: Factor, e: Six) -> Six:
     """Joint step for a twist."""
     a0, a1, a2, a3, a4, a5, i, r, t, u = factor
+    e = _weighed(e)
     y0 = _dot(a0, e) * i[0]
     y1 = _dot(a1, e) * i[1]
     y2 = _dot(a2, e) * i[2]
@@ -200,7 +208,8 @@ def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool]:
     fine &= _dot(first, first) > AT_GOAL * AT_GOAL * N
     factor, regular = _factor(c, frames)
     x = _step(factor, first)
-    square = lambda_square(_dot(first, first), c[DAMPING], c[DAMPING + 1])
+    weighed = _weighed(first)
+    square = lambda_square(_dot(weighed, weighed), c[DAMPING], c[DAMPING + 1])
     fine &= regular & (WINDOW * square * _inverse_norm(factor) <= 1.0)
     e, near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
     step = _step(factor, e)

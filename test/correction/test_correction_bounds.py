@@ -40,7 +40,7 @@ def bent(arm: SerialArm) -> SerialArm:
 
 def clamped(arm: SerialArm) -> ClampedCorrection:
     reference, actual = pack_model(NOMINAL), pack_model(arm)
-    stage = correction_between(reference, actual, actual, NOMINAL, CONFIG)
+    stage = correction_between(reference, actual, NOMINAL, CONFIG)
     assert isinstance(stage, ClampedCorrection)
     return stage
 
@@ -87,7 +87,7 @@ def arm(request: pytest.FixtureRequest) -> SerialArm:
 
 
 def test_no_bound_is_exceeded(q: np.ndarray, arm: SerialArm) -> None:
-    result = clamped(arm).correct(q, np.ones(len(q)))
+    result = clamped(arm).correct(q)
     shift = np.abs(result.q - q)
     assert np.all(shift <= CONFIG.thermal.joint_rad + CONFIG.tool.joint_rad)
     # beyond a limit by rounding only, and at the limit not at all
@@ -108,26 +108,25 @@ def test_it_is_continuous(q: np.ndarray, arm: SerialArm) -> None:
     fine = np.linspace(q[:-1], q[1:], 10, endpoint=False).swapaxes(0, 1).reshape(-1, 6)
     largest = []
     for points in (q, fine):
-        shift = stage.correct(points, np.ones(len(points))).q - points
+        shift = stage.correct(points).q - points
         largest.append(np.abs(np.diff(shift, axis=0)).max())
     assert largest[1] < 0.2 * largest[0]
 
 
 def test_taught_joints_follow_from_corrected_ones(q: np.ndarray, arm: SerialArm) -> None:
-    stage, ones = clamped(arm), np.ones(len(q[::20]))
-    result = stage.correct(q[::20], ones)
-    taught = stage.uncorrect(result.q, ones)
-    again = stage.correct(taught, ones).q
+    stage = clamped(arm)
+    result = stage.correct(q[::20])
+    taught = stage.uncorrect(result.q)
+    again = stage.correct(taught).q
     assert np.abs(again - result.q).max() < 1e-9
 
 
 def test_what_bounds_it_is_named() -> None:
-    one = np.ones(1)
-    assert clamped(drifted(1.0)).correct(HOME[None], one).reason is None
-    assert clamped(drifted(15.0, seed=3)).correct(HOME[None], one).reason is Reason.TCP_BOUND
+    assert clamped(drifted(1.0)).correct(HOME[None]).reason is None
+    assert clamped(drifted(15.0, seed=3)).correct(HOME[None]).reason is Reason.TCP_BOUND
     at_limit = HOME.copy()
     at_limit[1] = NOMINAL.upper[1]
-    result = clamped(drifted(1.0)).correct(at_limit[None], one)
+    result = clamped(drifted(1.0)).correct(at_limit[None])
     assert result.reason is Reason.JOINT_LIMIT
     assert np.array_equal(result.q[0], at_limit)
     assert not result.whole[0]
@@ -135,21 +134,21 @@ def test_what_bounds_it_is_named() -> None:
 
 
 def test_where_no_bound_is_near_it_is_the_whole_correction() -> None:
-    q, ones = path_through(HOME, m=50), np.ones(50)
+    q = path_through(HOME, m=50)
     arm = bent(drifted(1.0))
     config = replace(CONFIG, policy=Policy.REFUSE)
     packed = pack_model(arm)
-    plain = correction_between(pack_model(NOMINAL), packed, packed, NOMINAL, config)
+    plain = correction_between(pack_model(NOMINAL), packed, NOMINAL, config)
     assert type(plain) is StagedCorrection
-    result = clamped(arm).correct(q, ones)
-    assert np.array_equal(result.q, plain.correct(q, ones).q)
+    result = clamped(arm).correct(q)
+    assert np.array_equal(result.q, plain.correct(q).q)
     assert np.all(result.whole)
 
 
 def test_towards_a_limit_it_fades_within_a_few_times_its_size() -> None:
     stage, q = clamped(drifted(1.0)), np.tile(HOME, (2, 1))
-    size = np.abs(stage.correct(HOME[None], np.ones(1)).q - HOME).max()
+    size = np.abs(stage.correct(HOME[None]).q - HOME).max()
     q[:, 1] = NOMINAL.upper[1] - np.array([1.5, 0.5]) * FADES_WITHIN * size
-    kept = stage.correct(q, np.ones(2)).kept
+    kept = stage.correct(q).kept
     assert kept[0] == 1.0
     assert kept[1] == pytest.approx(0.5, abs=0.2)

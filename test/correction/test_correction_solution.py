@@ -1,5 +1,6 @@
 """The correction reaches the taught pose, can be undone, and never leaves its bounds."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,14 +12,15 @@ from hypothesis import strategies as st
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import solution
-from robocal_ros.correction.joint_correction import JointCorrection, blend_models, pack_model
+from robocal_ros.correction.joint_correction import JointCorrection, pack_model
 from robocal_ros.correction.rates import rates_batch
-from robocal_ros.correction.solution import MOST_OVER
+from robocal_ros.correction.solution import MOST_OVER, REPORT
 from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
 NM = 1e-9
+BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])
 HOME = np.array([0.0, -1.2, 1.2, 0.0, 1.2, 0.0])  # of the KR 150, far from singular
 
 
@@ -86,7 +88,7 @@ def test_reaches_the_taught_pose(
     actual = bent(drifted(reference, rng, drift_m), rng, shift_m, turn_deg)
     q = well_conditioned(actual, rng, 2000)
     result = JointCorrection.between(reference, actual).correct(q)
-    whole = result.share == 1.0
+    whole = ~result.weak & result.converged
     goal = reference.fk(q) @ TOOL
     position, rotation = pose_error(actual, result.q[whole], goal[whole])
     assert position < NM
@@ -131,7 +133,7 @@ def test_there_and_back_is_exact(seed: int) -> None:
     correction = JointCorrection.between(reference, actual)
     there = correction.correct(well_conditioned(reference, rng, 20))
     back = correction.inverse().correct(there.q)
-    whole = (there.share == 1.0) & (back.share == 1.0)
+    whole = (~there.weak) & (~back.weak)
     assert np.sum(whole) > 10
     taught = there.q - there.joint_shift
     sides = [np.sign(np.linalg.det(tool_jacobian(reference, q))) for q in (taught, back.q)]
@@ -156,13 +158,6 @@ def test_bounds_hold_at_and_around_singularities(seed: int, size: float, largest
     assert np.abs(result.joint_shift).max() <= MOST_OVER * largest
     assert np.all(result.position_error_m <= result.tcp_shift_m + 1e-9)
     assert np.all(result.rotation_error_rad <= result.tcp_rotation_rad + 1e-9)
-    expected = 1.0 - result.share[result.converged]
-    assert np.allclose(
-        result.position_error_m[result.converged],
-        expected * result.tcp_shift_m[result.converged],
-        rtol=1e-6,
-        atol=1e-9,
-    )
 
 
 def test_the_shift_is_continuous_through_a_wrist_singularity() -> None:
@@ -174,7 +169,7 @@ def test_the_shift_is_continuous_through_a_wrist_singularity() -> None:
     q[:, 4] = np.linspace(-0.1, 0.1, len(q))
     result = JointCorrection.between(reference, actual, bound).correct(q)
     assert np.all(result.converged)
-    assert result.share.min() < 0.1
+    assert result.weak.any()
     shift = result.joint_shift
     assert np.abs(shift).max() < 1.25 * bound
     # The steps are 5 µrad of joint 5; a jump would be of the order of the bound.
@@ -183,16 +178,15 @@ def test_the_shift_is_continuous_through_a_wrist_singularity() -> None:
 
 def settled(reference: SerialArm, actual: SerialArm) -> StagedCorrection:
     start, end = pack_model(reference), pack_model(actual)
-    return StagedCorrection(start, end, end, *np.ones((2, reference.n)))
+    return StagedCorrection(start, end, *np.ones((2, reference.n)))
 
 
 def shift(stage: StagedCorrection, q: np.ndarray) -> np.ndarray:
-    return stage.correct(q, np.ones(len(q))).q - q
+    return stage.correct(q).q - q
 
 
 def rates(stage: StagedCorrection, q: np.ndarray, qd: np.ndarray, qdd: np.ndarray) -> Any:
-    ones = np.ones(len(q))
-    return stage.rates(q, qd, qdd, ones, np.zeros(len(q)), stage.correct(q, ones))
+    return stage.rates(q, qd, qdd, stage.correct(q))
 
 
 def test_rates_follow_the_path() -> None:
@@ -221,7 +215,7 @@ def test_rates_are_those_of_the_tool() -> None:
     stage = settled(reference, actual)
     q = well_conditioned(reference, rng, 200)
     qd = rng.uniform(-1.0, 1.0, q.shape)
-    result = stage.correct(q, np.ones(len(q)))
+    result = stage.correct(q)
     v, _ = rates(stage, q, qd, np.zeros_like(q))
     wanted = (tool_jacobian(reference, q) @ qd[..., None])[..., 0]
     found = (tool_jacobian(actual, result.q) @ v[..., None])[..., 0]
@@ -291,23 +285,36 @@ def test_a_redundant_arm_reaches_the_pose_with_a_small_shift() -> None:
     assert np.abs(result.joint_shift).max() < 0.02
 
 
-def test_models_blend_from_one_to_the_other() -> None:
-    rng = np.random.default_rng(11)
-    reference = robot("kr150_r3100")
-    actual = bent(drifted(reference, rng, 1e-3), rng, 5e-3, 2.0)
-    start, end = pack_model(reference), pack_model(actual)
-    assert np.array_equal(blend_models(start, end, 0.0), start)
-    assert np.array_equal(blend_models(start, end, 1.0), end)
-    q = np.array([0.3, -1.2, 1.1, 0.4, 0.8, 0.5])
-    correction = JointCorrection(np.stack([start, start, start, end]))
-    s = np.linspace(0.0, 1.0, 101)
-    shift = correction.correct(np.tile(q, (101, 1)), s).joint_shift
-    assert np.all(shift[0] == 0.0)
-    half = JointCorrection(np.stack([start, start, *[blend_models(start, end, 0.5)] * 2]))
-    assert np.allclose(half.correct(q).joint_shift, shift[50], rtol=0.0, atol=1e-14)
-    # nearly linear: no step is more than a few per cent beside the mean one
-    steps = np.diff(shift, axis=0)
-    assert np.abs(steps - steps.mean(axis=0)).max() < 0.05 * np.abs(steps).max()
+def crossings(name: str, count: int) -> Iterator[tuple[StagedCorrection, SerialArm, Any, Any]]:
+    """Wrist singularities crossed at 60 deg/s, 500 Hz, with drifts of 0.004 to 0.12 mm."""
+    reference, rng, t = robot(name), np.random.default_rng(0), np.arange(-150, 151) * 0.002
+    for _ in range(count):
+        actual = drifted(reference, rng, 10.0 ** rng.uniform(np.log10(4e-6), np.log10(1.2e-4)))
+        stage = StagedCorrection(pack_model(reference), pack_model(actual), *BOUNDS)
+        way, middle = rng.uniform(-1.0, 1.0, 6), HOME + rng.uniform(-0.5, 0.5, 6)
+        way[4], middle[4] = rng.choice([-1.0, 1.0]), 0.0
+        yield stage, actual, reference, middle + np.radians(60.0) * t[:, None] * way
+
+
+@pytest.mark.parametrize("name", ["kr150_r3100", "ur10"])
+def test_crossing_a_wrist_singularity_gives_up_one_rotation_alone(name: str) -> None:
+    rate, left = 0.0, 0.0
+    for stage, actual, reference, q in crossings(name, 200):
+        result = stage.correct(q)
+        assert result.whole.all() or result.weak.any()
+        shift = result.q - q
+        rate = max(rate, float(np.abs(np.diff(shift, axis=0)).max()) / 0.002)
+        left = max(left, pose_error(actual, result.q, reference.fk(q) @ TOOL)[0])
+    assert np.degrees(rate) <= 2.0
+    assert left <= 0.04e-3
+
+
+def test_one_point_of_a_stream_has_the_bits_of_a_batch() -> None:
+    for stage, _, _, q in crossings("kr150_r3100", 3):
+        batch, out = stage.correct(q).q, np.empty((stage.stages, 6 + REPORT))
+        for row, expected in zip(q, batch, strict=True):
+            stage.correct_one(row, out)
+            assert np.array_equal(out[-1, :6], expected)
 
 
 def test_stages_together_are_the_whole_correction_and_undo_it() -> None:
@@ -315,14 +322,13 @@ def test_stages_together_are_the_whole_correction_and_undo_it() -> None:
     reference = robot("kr150_r3100")
     actual = bent(drifted(reference, rng, 0.5e-3), rng, 5e-3, 1.0)
     start, end = pack_model(reference), pack_model(actual)
-    stage = StagedCorrection(start, start, end, np.full(6, 0.1), np.full(6, 0.5))
+    stage = StagedCorrection(start, end, np.full(6, 0.1), np.full(6, 0.5))
     q = HOME + rng.uniform(-0.5, 0.5, (100, 6))
-    ones = np.ones(100)
-    result = stage.correct(q, ones)
+    result = stage.correct(q)
     assert np.all(result.whole)
     direct = JointCorrection.between(reference, actual).correct(q)
     assert np.abs(result.q - direct.q).max() < 1e-12
-    assert np.abs(stage.uncorrect(result.q, ones) - q).max() < 1e-12
+    assert np.abs(stage.uncorrect(result.q) - q).max() < 1e-12
     assert result.tool is not None
     assert result.tool.tcp_shift_m == pytest.approx(np.full(100, 5e-3), rel=1e-6)
 
@@ -333,31 +339,27 @@ def test_undoing_is_exact_where_only_a_share_was_corrected() -> None:
     actual = drifted(reference, rng, 0.1e-3)
     start, end = pack_model(reference), pack_model(actual)
     bound = np.full(6, np.radians(0.3))
-    stage = StagedCorrection(start, start, end, bound, bound)
+    stage = StagedCorrection(start, end, bound, bound)
     q = np.tile([0.3, -1.2, 1.1, 0.4, 0.0, 0.5], (201, 1))
     q[:, 4] = np.linspace(-0.05, 0.05, 201)
-    ones = np.ones(201)
-    result = stage.correct(q, ones)
+    result = stage.correct(q)
     assert not np.all(result.whole)
-    assert np.abs(stage.uncorrect(result.q, ones) - q).max() < 1e-9
+    assert np.abs(stage.uncorrect(result.q) - q).max() < 1e-9
 
 
 def test_kernels_are_compiled_for_one_type_of_array_only() -> None:
     """Another type would be compiled while the robot moves, and hold it up for seconds."""
     reference = robot("kr150_r3100")
-    models = np.stack([pack_model(reference)] * 4)
+    models = np.stack([pack_model(reference)] * 2)
     q = np.tile(HOME, (6, 2))[::2, ::2]
     for array in (models, q):
         array.flags.writeable = False
     correction = JointCorrection(models, np.broadcast_to(0.1, (6,)))
     correction.correct(q)
-    correction.correct(q[0].tolist(), 0.5)
-    ones = np.ones(len(q))
-    ones.flags.writeable = False
+    correction.correct(q[0].tolist())
     stage = settled(reference, reference)
-    stage.rates(q, q, q, ones, ones, stage.correct(q, ones))
-    stage.rates(q, q, q, ones, 0.0 * ones, stage.correct(q, ones))
-    correction.inverse().correct(q[:1], np.ones(1))
+    stage.rates(q, q, q, stage.correct(q))
+    correction.inverse().correct(q[:1])
     assert len(solution.correct_batch.signatures) == 1
     assert len(rates_batch.signatures) == 1
 
@@ -369,4 +371,4 @@ def test_wrong_shapes_are_a_callers_mistake() -> None:
     with pytest.raises(ValueError, match="positive"):
         JointCorrection.between(arm, arm, 0.0)
     with pytest.raises(ValueError, match="models have shape"):
-        JointCorrection(np.zeros((2, 8, 9)))
+        JointCorrection(np.zeros((4, 8, 9)))

@@ -72,7 +72,7 @@ def both(
 def staged(reference: SerialArm, actual: SerialArm) -> StagedCorrection:
     start, end = pack_model(reference), pack_model(actual)
     bounds = np.full((2, reference.n), [[ARM_BOUND], [TOOL_BOUND]])
-    return StagedCorrection(start, end, end, *bounds, free_axis=True)
+    return StagedCorrection(start, end, *bounds, free_axis=True)
 
 
 @pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
@@ -83,14 +83,14 @@ def test_position_and_axis_are_reached(name: str, shift_m: float, turn_deg: floa
     actual = changed(reference, rng, shift_m, turn_deg)
     q = rng.uniform(-2.0, 2.0, (2000, 6))
     free, six = both(reference, actual, q, 1.0)
-    whole = free.share == 1.0
+    whole = ~free.weak
     position, axis = miss(reference, actual, q[whole], free.q[whole])
     assert position.max() < NM
     assert axis.max() < NM
     assert free.position_error_m[whole].max() < NM
     assert free.rotation_error_rad[whole].max() < NM
     # Five equations are singular in fewer poses than six.
-    assert np.mean(whole) > np.mean(six.share == 1.0)
+    assert np.mean(whole) > np.mean(~six.weak)
     # What is reported without the correction is the axis' angle.
     before, angle = miss(reference, actual, q, q)
     assert np.allclose(free.tcp_shift_m, before, rtol=0.0, atol=1e-14)
@@ -105,7 +105,7 @@ def test_joints_move_no_further_than_with_six_equations(seed: int, name: str) ->
     actual = changed(reference, rng)
     q = rng.uniform(-2.0, 2.0, (300, 6))
     free, six = both(reference, actual, q, ARM_BOUND)
-    whole = (free.share == 1.0) & (six.share == 1.0)
+    whole = (~free.weak) & (~six.weak)
     moved, most = (np.linalg.norm(r.joint_shift[whole], axis=1) for r in (free, six))
     assert np.sum(whole) > 100
     # The least shift is found to the second order of a shift of some mrad.
@@ -160,10 +160,9 @@ def test_there_and_back_is_exact(seed: int, bend: tuple[float, float]) -> None:
     reference = robot("kr150_r3100")
     stage = staged(reference, changed(reference, rng, *bend))
     q = HOME + rng.uniform(-0.7, 0.7, (30, 6))
-    ones = np.ones(len(q))
-    there = stage.correct(q, ones)
+    there = stage.correct(q)
     assert np.mean(there.whole) > 0.5
-    back = stage.uncorrect(there.q, ones)
+    back = stage.uncorrect(there.q)
     assert np.abs(back - q)[there.whole].max() < 1e-12
 
 
@@ -173,9 +172,9 @@ def test_rates_keep_the_tool_and_its_axis_moving_as_taught() -> None:
     actual = changed(reference, rng, 2e-3, 0.5)
     stage = staged(reference, actual)
     q = HOME + rng.uniform(-0.5, 0.5, (50, 6))
-    qd, zero, ones = rng.uniform(-1.0, 1.0, q.shape), np.zeros(q.shape), np.ones(len(q))
-    result = stage.correct(q, ones)
-    v, a = stage.rates(q, qd, zero, ones, 0.0 * ones, result)
+    qd, zero = rng.uniform(-1.0, 1.0, q.shape), np.zeros(q.shape)
+    result = stage.correct(q)
+    v, a = stage.rates(q, qd, zero, result)
     assert np.abs(v - qd).max() > 1e-3
     for wanted, found in zip(
         origin_and_axis_rates(reference, q, qd),
@@ -185,10 +184,8 @@ def test_rates_keep_the_tool_and_its_axis_moving_as_taught() -> None:
         # central differences over 1 ms of a shift of 0.1 rad
         assert np.abs(found - wanted).max() < 1e-6
     h = 3e-3
-    before, after = (stage.correct(q + t * qd, ones).q for t in (-h, h))
+    before, after = (stage.correct(q + t * qd).q for t in (-h, h))
     assert np.allclose(a, (after - 2.0 * result.q + before) / h**2, rtol=0.0, atol=1e-5)
-    # and back: the derivative of a function by central differences, of the inverse too
-    assert np.abs(stage.taught(result.q, v)[1] - qd).max() < 1e-6
 
 
 def test_an_arm_of_five_joints_reaches_position_and_axis() -> None:

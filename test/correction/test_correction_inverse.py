@@ -25,24 +25,24 @@ def bent(shift_m: float, turn_deg: float, free_axis: bool) -> StagedCorrection:
     tool = ARM.T_flange_tool @ frames.transform(turn, [shift_m, 0.0, 0.0])
     actual = replace(ARM.with_mdh(chosen.add(ARM.mdh, size)), T_flange_tool=tool)
     end = pack_model(actual)
-    return StagedCorrection(pack_model(ARM), end, end, FADES_FROM * DRIFT, TOOL, free_axis)
+    return StagedCorrection(pack_model(ARM), end, FADES_FROM * DRIFT, TOOL, free_axis)
 
 
 def acceptable(stage: StagedCorrection, q: np.ndarray) -> np.ndarray:
     """Those of the postures in which a command is corrected, and not refused."""
-    found = stage.correct(q, np.ones(len(q)))
+    found = stage.correct(q)
     tool = found.tool
     assert tool is not None
-    fine = found.arm.converged & tool.converged & (tool.share == 1.0)
+    fine = found.arm.converged & tool.converged
     fine &= np.all(np.abs(found.arm.joint_shift) <= DRIFT, axis=1)
     return q[fine & np.all(np.abs(tool.joint_shift) <= TOOL, axis=1)]
 
 
 def turning(stage: StagedCorrection, q: np.ndarray) -> np.ndarray:
     """How fast the shift of a joint changes, per motion of the joints (m,)."""
-    fast, ones = np.zeros((len(q), 6)), np.ones(len(q))
+    fast = np.zeros((len(q), 6))
     for nudge in STEP * np.eye(6):
-        there, back = (stage.correct(q + way * nudge, ones).q for way in (1.0, -1.0))
+        there, back = (stage.correct(q + way * nudge).q for way in (1.0, -1.0))
         fast += np.abs((there - back - 2.0 * nudge) / (2.0 * STEP))
     return np.asarray(fast.max(axis=1))
 
@@ -61,8 +61,7 @@ def test_taught_joints_come_back_where_the_shift_turns_slower_than_the_joints(
     q = acceptable(stage, postures(6000))
     q = q[turning(stage, q) < 1.0]
     assert len(q) > 3000
-    ones = np.ones(len(q))
-    found = stage.uncorrect(stage.correct(q, ones).q, ones)
+    found = stage.uncorrect(stage.correct(q).q)
     lost = np.abs(found - q).max(axis=1) > 1e-8
     assert np.mean(lost) <= share
 
@@ -73,5 +72,5 @@ def test_readings_anywhere_give_numbers_within_bounds(free_axis: bool) -> None:
     stage, q = bent(9e-3, 2.9, free_axis), postures(1000)
     q[:200, 4] = 0.0
     q[200:400, 4] *= 1e-4
-    found = stage.uncorrect(q, np.ones(len(q)))
+    found = stage.uncorrect(q)
     assert np.all(np.abs(found - q) <= 2.0 * (DRIFT + TOOL))
