@@ -1,5 +1,6 @@
 """The maintenance node: one call from the PLC keeps a cell accurate (docs/maintenance_node.md)."""
 
+import math
 import time
 from dataclasses import replace
 from typing import Any
@@ -12,11 +13,14 @@ from std_msgs.msg import Bool
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.samples import joint_sample, stamp_ns
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.motion.driver import LeaseHolder, MotionDriver
 from robocal_ros.motion.gap_sources import GapSources
+from robocal_ros.motion.graph import CommandPath
 from robocal_ros.motion.loading import load_motion
+from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.diagnostics import ERROR, Health
+from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
@@ -38,6 +42,7 @@ from robocal_ros.storage.state_files import StateFile
 
 TICK_S = 0.02
 SHOW_S = 0.2
+LOOK_S = 0.5
 ACCURACY_S = 1.0
 HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks after the robot
 NS = 1_000_000_000
@@ -78,8 +83,19 @@ class MaintenanceNode(HouseNode):
         self._outputs = MaintenanceOutputs(
             self.add_output, self._nominal.name, self._serial_in_use, settings["base_frame"]
         )
-        names = self._nominal.joint_names
-        self._driver = MaintenanceDriver(self, names, self._answered, self._moves)
+        motion = MotionDriver(
+            self,
+            self._nominal.joint_names,
+            settings["follow_joint_trajectory"],
+            settings["hard_stop_service"],
+            self._reported,
+            lambda: None if self._session is None else self._session.robot.watch,
+            self._steady.now_s,
+        )
+        self._motion = motion
+        self._driver = MaintenanceDriver(self, motion, self._answered, self._moves)
+        self._lease = LeaseHolder(self, self._nominal.name, self._serial_in_use)
+        self._others = CommandPath(self, motion.topic.topic_name, motion.action, CORRECTION)
         self._calls = MaintenanceServices(
             self, self._running, self._clocks, self._outputs, settings["default_gap_s"]
         )
@@ -103,6 +119,7 @@ class MaintenanceNode(HouseNode):
             self._nominal, self._history, self._config, self._keeper, self._record
         )
         self._shown: Status | None = None
+        self._look_s = -math.inf
         for step, worst_s in self._session.worst_cases().items():
             self.get_logger().info(f"{step}: {worst_s:.1f} s at the most, way home included")
         self._show()
@@ -111,6 +128,7 @@ class MaintenanceNode(HouseNode):
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
             self._carry_out(self._session.give_up(ENDS, self._steady.now_s()))
+            self._lease.hold("")
             self._session.close()
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
@@ -164,6 +182,11 @@ class MaintenanceNode(HouseNode):
             require_robot(CORRECTION, message, self._nominal.name, self._serial_in_use)
             self._session.correction(told_correction(message), self._steady.now_s())
 
+    def _reported(self, report: MotionReport) -> None:
+        if self._session is not None:
+            self._session.robot.reported(report)
+            self._tick()  # a motion that was rejected, or a stop, is seen to now
+
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:
             self._session.answered(number, answer)
@@ -180,6 +203,14 @@ class MaintenanceNode(HouseNode):
     def _tick(self) -> None:
         if self._session is not None:
             self._carry_out(self._session.tick(*self._clocks()))
+            self._hold_lease()
+
+    def _hold_lease(self) -> None:
+        session = self._session
+        running = None if session is None else session.running
+        cycle = "" if running is None else f"cycle '{running.cycle_id}'"
+        stops = session is not None and session.robot.stopping.under_way
+        self._lease.hold(cycle or "a stop" * stops)
 
     def _carry_out(self, requests: list[Request]) -> None:
         if self._driver is not None:
@@ -208,12 +239,22 @@ class MaintenanceNode(HouseNode):
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
+        self._look_at_graph(session)
         status = session.status(self._steady.now_s())
         shown = replace(status, left_s=round(status.left_s))
         if shown != self._shown:
             self._shown = shown
             self._outputs.status(status, self.now_ns())
         self._calls.look(status)
+
+    def _look_at_graph(self, session: MaintenanceSession) -> None:
+        """Twice a second: a second maintenance node, and who else commands the robot."""
+        now_s = self._steady.now_s()
+        if now_s < self._look_s:
+            return
+        self._look_s = now_s + LOOK_S
+        self._others.look(self._outputs.accuracy_topic)
+        session.second(self._others.second, now_s)
 
     def _show_accuracy(self) -> None:
         if self._session is None:
@@ -235,13 +276,18 @@ class MaintenanceNode(HouseNode):
             "doing": status.doing or "nothing",
             "last cycle": "none" if status.last is None else status.last.message,
             "tool node": "disarmed" if status.disarmed else "may be armed",
+            "motions": self._motion.way or "none yet",
         }
         for step, worst_s in session.worst_cases().items():
             values[f"worst case of {step}"] = f"{worst_s:.1f} s"
         health.values = values
         if status.state is State.FAULT:
             health.worsen(ERROR, status.fault)
-        for words in (self._guard.fault, self._sources.doubt(), status.trouble):
+        for words in (session.robot.trouble(self._steady.now_s()), self._others.strangers):
+            if words:
+                health.worsen(WARN, words)
+        faults = self._guard.fault, self._others.second, self._sources.doubt(), status.trouble
+        for words in faults:
             if words:
                 health.worsen(ERROR, words)
         if self._history is not None:

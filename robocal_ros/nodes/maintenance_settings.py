@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.motion.driver import CONTROLLER
 from robocal_ros.motion.settings import MOTION, driving_config, require_limits
 from robocal_ros.nodes.history_settings import STATE_DIR
 from robocal_ros.nodes.joint_poses import MM, joint_poses, joints_of
@@ -73,6 +74,7 @@ SETTINGS = (
         high=5.0,
     ),
     *MOTION,
+    *CONTROLLER,
     _time("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 86400.0),
     _time("gap_stale_s", 0.5, "gap_open may pause for so long", 0.5, 0.05),
     _time("rest_s", 1.0, "After a motion's end, until the robot rests where it ends", 10.0, 0.1),
