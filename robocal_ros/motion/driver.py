@@ -171,7 +171,8 @@ class MotionDriver:
             self._index = {names: [names.index(name) for name in self._names]}
         index, count = self._index[names], len(names)
         speeds = np.array(message.feedback.velocities, dtype=np.float64)
-        self._velocities = len(speeds) == count and bool(np.isfinite(speeds).all())
+        known = len(speeds) == count and bool(np.isfinite(speeds).all())
+        self._velocities = known and bool(speeds.any())
         self._stated_s = now_s
         if robot is None:
             return
@@ -181,6 +182,16 @@ class MotionDriver:
             return  # a controller that holds may leave them out
         q, qd = np.array(reference.positions), np.array(reference.velocities)
         robot.controller(q[index], qd[index], now_s)
+
+    def hear(self, message: Any) -> None:
+        """Take a JointState: where the controller does not, it tells whether there are velocities.
+
+        Some hardware says 0 in motion; a stop of a robot that stands may be of either kind.
+        """
+        if self._now() - self._stated_s > 1.0:
+            speeds = np.array(message.velocity, dtype=np.float64)
+            known = len(speeds) == len(message.name) and bool(np.isfinite(speeds).all())
+            self._velocities = known and bool(speeds.any())
 
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()

@@ -41,8 +41,7 @@ from robocal_ros.storage.robots import load_robot
 from robocal_ros.storage.state_files import StateFile
 
 TICK_S = 0.02
-SHOW_S = 0.2
-LOOK_S = 0.5
+SHOW_S, LOOK_S = 0.2, 0.5
 ACCURACY_S = 1.0
 HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks after the robot
 NS = 1_000_000_000
@@ -158,6 +157,7 @@ class MaintenanceNode(HouseNode):
             return
         if fault := self._guard.fault_at(self.inputs[JOINTS].received - 1):
             raise InputError(fault)
+        self._motion.hear(message)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
         session.reading(sample.stamp_ns / NS, q, self._steady.now_s())

@@ -119,6 +119,7 @@ class TcfMotion:
         """Take a JointState before the session does: what is odd stops the robot first."""
         if self.driver is None:
             return
+        self._motion.hear(message)
         try:
             sample = joint_sample(message)
             q = sample.position[sample.order(self._names)]
