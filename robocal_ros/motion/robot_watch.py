@@ -30,6 +30,7 @@ ALIKE = 0.01  # of the allowed deviation: two places that differ by less are as 
 JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
 UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
 PAUSED_S = 15.0  # a robot that stands on its path is waited for so long where no scaling is known
+NEARLY_S = 0.5  # before its end a plan may bend back to where it has been
 NEAR_REFERENCE_RAD = 1e-3  # a reference so near to the plan tells the plan's clock
 
 
@@ -198,7 +199,7 @@ class RobotWatch:
             return True
         self.away()
         there = np.all(np.abs(plan.q[-1] - self._readings[-1][1]) < start_near(self._arm))
-        came = self._reached_s >= plan.duration_s - self._driving.late_s - UNSAID_S
+        came = plan.duration_s - self._reached_s <= min(NEARLY_S, 0.5 * plan.duration_s)
         ended = bool(self.driven_s(now_s) >= plan.duration_s and there and came)
         self._ended_s = min(self._ended_s, now_s) if ended else np.inf
         return ended
