@@ -25,6 +25,8 @@ NODES = (
     "recorder_node",
 )
 CONTROLLER = "joint_trajectory_controller/joint_trajectory"
+ACTION = "joint_trajectory_controller/follow_joint_trajectory"
+MOTIONS = {"follow_joint_trajectory": LaunchConfiguration("action")}
 
 
 def in_share(*path):
@@ -40,7 +42,11 @@ def cell_node(name, condition=None):
         executable=name,
         name=name,
         namespace=LaunchConfiguration("namespace"),
-        parameters=[in_share("config", f"{name}.yaml"), LaunchConfiguration("params")],
+        parameters=[
+            in_share("config", f"{name}.yaml"),
+            LaunchConfiguration("params"),
+            *([MOTIONS] if name in ("tcf_node", "maintenance_node") else []),
+        ],
         remappings=[
             (trajectories, LaunchConfiguration("controller")),
             (CONTROLLER, LaunchConfiguration("controller")),  # as recorder_node knows it
@@ -60,6 +66,7 @@ def generate_launch_description():
             DeclareLaunchArgument("params", default_value=in_share("config", "cell.yaml")),
             DeclareLaunchArgument("namespace", default_value=""),
             DeclareLaunchArgument("controller", default_value=CONTROLLER),
+            DeclareLaunchArgument("action", default_value=ACTION),
             DeclareLaunchArgument("simulated", default_value="false"),
             *(cell_node(name) for name in NODES),
             cell_node("cell_sim_node", simulated),

@@ -10,6 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+LEAD_S = 0.05
+"""First point of what is sent, ahead of its arrival.
+
+joint_trajectory_controller 4.42.1 commands a first point at time 0 at once, wherever the robot is;
+one ahead of now begins where it measures the robot, without a jump. 0.05 s are five cycles of a
+slow controller (100 Hz), and more than the 10 ms from a message to what becomes of it.
+"""
+
 
 @dataclass(frozen=True, eq=False)
 class JointPlan:
@@ -61,6 +69,28 @@ class JointPlan:
         vertex = before + 0.5 * h * first**2 / np.where(turns, first - last, np.inf)
         speed = np.maximum(np.max(np.abs(self.qd), axis=0), np.max(np.abs(vertex), axis=0))
         return speed, np.max(np.maximum(np.abs(first), np.abs(last)), axis=0)
+
+    def after(self, lead_s: float) -> "JointPlan":
+        """The same way, from rest, after a time in which nothing moves."""
+        return JointPlan(
+            np.concatenate([[0.0], self.time_s + lead_s]),
+            *(np.concatenate([part[:1], part]) for part in (self.q, self.qd, self.qdd)),
+        )
+
+    def points(self, spacing_s: float = 0.0) -> tuple[Array, Array, Array]:
+        """Times (k,), joints and velocities (k, n) that a controller is sent.
+
+        The first is `LEAD_S` ahead. ``spacing_s``: so close together, for a controller that makes
+        lines of positions; 0: those of the plan.
+        """
+        if spacing_s > 0.0:
+            count = max(int(np.ceil((self.duration_s - LEAD_S) / spacing_s)), 1)
+            time = np.linspace(LEAD_S, max(self.duration_s, 2.0 * LEAD_S), count + 1)
+        else:
+            time = np.concatenate([[LEAD_S], self.time_s[self.time_s > LEAD_S + 1e-4]])
+        q, qd = self.at(time)
+        qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest
+        return time, q, qd
 
     def slower(self, factor: float) -> "JointPlan":
         """The same way in ``factor`` times the time."""

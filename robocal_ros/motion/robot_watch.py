@@ -2,11 +2,13 @@
 
 from bisect import bisect_right
 from collections import deque
+from dataclasses import dataclass
 from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.core.errors import LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
@@ -22,28 +24,69 @@ REST_RAD = 1e-4  # a robot that rests moves less
 BACK_S = 1.0  # stamps that go back by more began anew
 FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 APART_S = 0.00375  # instants of the plan that a reading is compared with
+TOLD_S = 1.0  # a speed scaling that was not said again for so long is not known
+REFERENCE_S = 0.1  # a controller's place that is older is none
+ALIKE = 0.01  # of the allowed deviation: two places that differ by less are as near
+JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
+UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
+PAUSED_S = 15.0  # a robot that stands on its path is waited for so long where no scaling is known
+NEARLY_S = 0.5  # before its end a plan may bend back to where it has been
+NEAR_REFERENCE_RAD = 1e-3  # a reference so near to the plan tells the plan's clock
+
+
+class LeftPlanError(LimitError):
+    """The robot is not where its plan has it: it may be held, or have hit something."""
+
+
+@dataclass(frozen=True)
+class MotionReport:
+    """What a controller says of the motion that it was sent last.
+
+    ``ended``: it is through with it; ``failed``: it rejected it, or ended it otherwise than as
+    planned; ``words``: its own. That a motion ended well proves nothing: another one may have
+    taken its place.
+    """
+
+    ended: bool = False
+    failed: bool = False
+    words: str = ""
 
 
 class RobotWatch:
     """Readings of the joints as they arrive, and the plan in force; times of a steady clock.
 
+    A controller that scales its speed stretches the plan's clock, which stands while it pauses.
+    Where nobody tells the scaling, a robot that is on its path is late, not lost.
+
     Parameters
     ----------
-    driving : how far the robot may lag behind its plan, and how fast its joints are.
+    driving : how far the robot may be beside its plan, and how fast its joints are.
 
     Attributes
     ----------
     silence : how long no new reading came.
+    scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
-        self._arm, self._late_s = arm, driving.late_s
+        self._arm, self._driving = arm, driving
         self._fastest = driving.limits.of_joints(arm)[0]
         self.silence = Silence()
-        self._heard_s = self._sent_s = 0.0
+        self.scaling = 1.0
+        self._scaled_s = -np.inf  # when that was told
+        self._heard_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
+        self._reference: tuple[Array, Array] | None = None
+        self._reference_s = -np.inf
         self._plan: JointPlan | None = None
         self._cell: MotionCell | None = None
+        self._at_s = self._driven_s = 0.0  # the plan's clock at a time
+        self._reached_s = self._looked_s = 0.0  # how far the robot has come, seen when
+        self._moved_to_s = self._moved_s = 0.0  # the plan's clock when it last came further
+        self._ended_s = np.inf  # since when the plan is over, with the robot at its end
+        self._over = False
+
+    # ---- what comes in --------------------------------------------------------------------------
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,); ``stamp_s`` on their own clock."""
@@ -55,22 +98,52 @@ class RobotWatch:
         self._heard_s = now_s
         self.silence.heard(now_s)
 
+    def scaled(self, factor: float, now_s: float) -> None:
+        """The controller's clock runs so fast, 1 as planned; what is no such number is none."""
+        if not 0.0 <= factor < np.inf:
+            return
+        self._driven_s, self._at_s = self.driven_s(now_s), now_s
+        self.scaling, self._scaled_s = factor, now_s
+
+    def controller(self, q: Array, qd: Array, now_s: float) -> None:
+        """Where the controller is on its trajectory: joints and unscaled velocities (n,)."""
+        if not (np.all(np.isfinite(q)) and np.all(np.isfinite(qd))):
+            return
+        self._reference, self._reference_s = (q, qd), now_s
+        if self._plan is None or np.max(np.abs(qd)) < 1e-2:
+            return
+        here_s = self.driven_s(now_s)
+        times = here_s + np.linspace(-UNSAID_S, UNSAID_S, 41)
+        away = np.max(np.abs(self._plan.at(times)[0] - q), axis=1)
+        if away[nearest := int(np.argmin(away))] < NEAR_REFERENCE_RAD:
+            self._driven_s, self._at_s = float(times[nearest]), now_s
+
     def follow(self, plan: JointPlan, cell: MotionCell, now_s: float) -> None:
         """A plan was sent."""
-        self._plan, self._cell, self._sent_s = plan, cell, now_s
+        self._plan, self._cell = plan, cell
+        self._driven_s = self._reached_s = self._moved_s = self._moved_to_s = 0.0
+        self._at_s = self._looked_s = now_s
+        self._ended_s, self._over = np.inf, False
 
     def sent(self, now_s: float) -> None:
         """When the plan really was sent."""
-        self._sent_s = now_s
+        self._at_s = self._looked_s = now_s
+
+    def ended(self) -> None:
+        """The controller says that it is through with the plan."""
+        self._over = True
 
     def slept(self, for_s: float) -> None:
         """The host was suspended for so long, and the plan with it: its controller is there too."""
-        self._sent_s += for_s
+        self._at_s += for_s
         self._heard_s += for_s
+        self._looked_s += for_s
 
     def forget(self) -> None:
         """No plan is in force any more."""
         self._plan = None
+
+    # ---- where it is ----------------------------------------------------------------------------
 
     @property
     def heard(self) -> bool:
@@ -87,20 +160,53 @@ class RobotWatch:
         """How long the joint states have been silent."""
         return self.silence.lasts_s if self._readings else np.inf
 
-    def driven_s(self, now_s: float) -> float:
-        """How long the plan has been driven."""
-        return now_s - self._sent_s
+    def scaling_known(self, now_s: float) -> bool:
+        """Whether the controller's speed scaling was told lately."""
+        return now_s - self._scaled_s <= TOLD_S
 
-    def overdue_s(self, now_s: float) -> float:
-        """How long ago the plan ended; negative before."""
-        return -np.inf if self._plan is None else self.driven_s(now_s) - self._plan.duration_s
+    def reference(self, now_s: float) -> tuple[Array, Array] | None:
+        """Joints and unscaled velocities (n,) where the controller is now; None: not known."""
+        if self._reference is None or now_s - self._reference_s > REFERENCE_S:
+            return None
+        q, qd = self._reference
+        return q + qd * self.scaling * (now_s - self._reference_s), qd
+
+    def driven_s(self, now_s: float) -> float:
+        """How far the plan's clock is."""
+        return self._driven_s + (now_s - self._at_s) * self.scaling
+
+    def late_s(self, now_s: float) -> float:
+        """How far the newest reading of a robot on its path was late; 0 without a plan."""
+        if self._plan is None:
+            return 0.0
+        driven_s = self.driven_s(min(self._heard_s, now_s))
+        return min(driven_s, self._plan.duration_s) - self._reached_s
+
+    def late(self, now_s: float) -> str:
+        """That the robot is late while nobody tells its speed scaling, in words; else empty."""
+        late_s = self.late_s(now_s)
+        if late_s <= self._driving.late_s or self.scaling_known(now_s):
+            return ""
+        return (
+            f"the robot is {late_s:.1f} s behind its plan, on its path: is its speed scaled, or "
+            "does it pause? connect controller_state or speed_scaling, which tell it"
+        )
 
     def at_end(self, now_s: float) -> bool:
         """Whether the plan has ended, with the robot where it ends."""
-        if self._plan is None or not self._readings:
+        plan = self._plan
+        if plan is None or not self._readings:
             return True
-        there = np.all(np.abs(self._plan.q[-1] - self._readings[-1][1]) < start_near(self._arm))
-        return self.overdue_s(now_s) >= 0.0 and bool(there)
+        self.away()
+        there = np.all(np.abs(plan.q[-1] - self._readings[-1][1]) < start_near(self._arm))
+        came = plan.duration_s - self._reached_s <= min(NEARLY_S, 0.5 * plan.duration_s)
+        ended = bool(self.driven_s(now_s) >= plan.duration_s and there and came)
+        self._ended_s = min(self._ended_s, now_s) if ended else np.inf
+        return ended
+
+    def ended_for_s(self, now_s: float) -> float:
+        """How long ago the robot reached the plan's end; negative before."""
+        return now_s - self._ended_s if self.at_end(now_s) else -np.inf
 
     def resting(self, span_s: float) -> Array | None:
         """The joints where the robot has rested for so long; None while it moves."""
@@ -111,37 +217,113 @@ class RobotWatch:
         return recent[-1][1] if np.max(spread) < REST_RAD else None
 
     def away(self) -> tuple[float, float]:
-        """How far tip (m) and turning joints (rad) are from the plan, where it is nearest."""
-        if self._plan is None or self._cell is None or not self._readings:
+        """How far tip (m) and turning joints (rad) are from the plan's path.
+
+        The path goes on from where the robot was, and no further than the plan's clock is.
+        """
+        plan, cell = self._plan, self._cell
+        if plan is None or cell is None or not self._readings:
             return 0.0, 0.0
-        at_s, q = self._heard_s - self._sent_s, self._readings[-1][1]
-        count = round(self._late_s / APART_S) + 1
-        times = np.linspace(at_s - self._late_s, at_s, count)
-        times = np.clip(times, 0.0, self._plan.duration_s)
-        planned, _ = self._plan.at(times)
+        q, heard_s = self._readings[-1][1], self._heard_s
+        first_s = max(self._reached_s - JITTER_S, 0.0)
+        last_s = self._reached_s + max(heard_s - self._looked_s, 0.0) + UNSAID_S
+        last_s = min(last_s, self.driven_s(heard_s) + UNSAID_S * self.scaling_known(heard_s))
+        last_s = max(min(last_s, plan.duration_s), first_s)
+        times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / APART_S)) + 1)
+        planned, _ = plan.at(times)
         joints = np.max(np.abs(planned - q) * ~self._arm.prismatic, axis=1)
-        T = self._cell.arm.fk(np.vstack([planned, q]))
-        tips = T[:, :3, :3] @ self._cell.tool.p_tip + T[:, :3, 3]
-        nearest = int(np.argmin(np.linalg.norm(tips[:-1] - tips[-1], axis=1)))
-        return float(np.linalg.norm(tips[nearest] - tips[-1])), float(joints[nearest])
+        T = cell.arm.fk(np.vstack([planned, q]))
+        tips = T[:, :3, :3] @ cell.tool.p_tip + T[:, :3, 3]
+        tip = np.linalg.norm(tips[:-1] - tips[-1], axis=1)
+        driving = self._driving
+        nearest = int(
+            np.argmin(np.hypot(tip / driving.deviation_m, joints / driving.deviation_rad))
+        )
+        found = float(tip[nearest]), float(joints[nearest])
+        if self.keeps(*found) and times[nearest] > self._reached_s:
+            self._reached_s = float(times[nearest])
+            if self._reached_s > self._moved_to_s + JITTER_S:
+                self._moved_to_s, self._moved_s = self._reached_s, self.driven_s(heard_s)
+        self._looked_s = max(heard_s, self._looked_s)
+        return found
+
+    def keeps(self, tip_m: float, joint_rad: float) -> bool:
+        """Whether a robot so far from its path is on it."""
+        return tip_m <= self._driving.deviation_m and joint_rad <= self._driving.deviation_rad
+
+    def require_on_plan(self, now_s: float, rest_s: float) -> None:
+        """Look after a motion; ``rest_s``: the robot may come to its end so late.
+
+        Raises
+        ------
+        LeftPlanError
+            When the robot is beside its path, behind what its controller sends it, or stands.
+        """
+        driving, plan = self._driving, self._plan
+        tip_m, joint_rad = self.away()
+        if not self.keeps(tip_m, joint_rad):
+            raise LeftPlanError(
+                f"the robot is {tip_m * 1e3:.1f} mm and {np.degrees(joint_rad):.2f} deg away from "
+                f"its plan (allowed {driving.deviation_m * 1e3:.1f} mm, "
+                f"{np.degrees(driving.deviation_rad):.2f} deg)"
+            )
+        if plan is None or self.at_end(now_s):
+            return
+        late_s, known = self.late_s(now_s), self.reference(now_s) is not None
+        if known and not self._over and late_s > driving.late_s + UNSAID_S:
+            raise LeftPlanError(
+                f"the robot is {late_s:.2f} s behind its controller (allowed "
+                f"{driving.late_s + UNSAID_S:.2f} s)"
+            )
+        nearly = self._reached_s >= plan.duration_s - driving.late_s - UNSAID_S
+        told = nearly or self._over or self.scaling_known(now_s)
+        waits_s = rest_s if told else PAUSED_S
+        since_s = max(self._moved_s, min(plan.duration_s, self.driven_s(now_s)) * nearly)
+        if self.driven_s(now_s) - since_s > waits_s:
+            raise LeftPlanError(
+                f"the robot has not come further on its path for {waits_s:g} s, and is not where "
+                "its motion ends"
+            )
+
+    # ---- where it is stopped from ---------------------------------------------------------------
 
     def state(self, now_s: float, *, keeps: bool) -> tuple[Array, Array]:
-        """Joints and velocities (n,) to stop from: the plan's, where the robot keeps to it.
+        """Joints and unscaled velocities (n,) to stop from.
 
-        Readings lag behind what the controller commands; a stop from there would throw it back.
+        The controller's, where it tells them; the plan's, where the robot keeps to it in time:
+        readings lag behind what the controller commands; a stop from there would throw it back.
         One that does not keep to its plan is where most of its last readings have it (Theil-Sen:
         the medians of the slopes of all pairs, and of where each reading puts it): a stop from a
-        single wild reading would be a motion of its own.
+        single wild reading would be a motion of its own. A robot that pauses is held where it is.
         """
-        if self._plan is not None and keeps:
+        paused = self.scaling == 0.0
+        if not paused and keeps and (reference := self.reference(now_s)) is not None:
+            return reference
+        in_time = self.late_s(now_s) <= self._driving.late_s
+        if self._plan is not None and keeps and in_time and not paused:
             return self._plan.at(self.driven_s(now_s))
         times, q = self._latest()
         velocity = np.zeros(q.shape[1])
-        if times[0] <= times[-1] - VELOCITY_S:
-            i, j = np.triu_indices(len(times), 1)
-            slopes = (q[j] - q[i]) / (times[j] - times[i])[:, None]
-            velocity = np.clip(np.median(slopes, axis=0), -self._fastest, self._fastest)
-        return np.median(q + (times[-1] - times)[:, None] * velocity, axis=0), velocity
+        if times[0] <= times[-1] - VELOCITY_S and not paused:
+            velocity = self._slope(times, q)
+        here = np.median(q + (times[-1] - times)[:, None] * velocity, axis=0)
+        return here, np.clip(velocity / max(self.scaling, 0.1), -self._fastest, self._fastest)
+
+    def speed(self, now_s: float) -> float:
+        """Largest unscaled speed of a joint, rad/s (m/s); NaN where nothing tells it."""
+        if (reference := self.reference(now_s)) is not None:
+            return float(np.max(np.abs(reference[1])))
+        if not self._readings:
+            return float("nan")
+        times, q = self._latest()
+        if len(times) < 2:
+            return float("nan")
+        return float(np.max(np.abs(self._slope(times, q)))) / max(self.scaling, 0.1)
+
+    def _slope(self, times: Array, q: Array) -> Array:
+        i, j = np.triu_indices(len(times), 1)
+        slopes = (q[j] - q[i]) / (times[j] - times[i])[:, None]
+        return np.clip(np.median(slopes, axis=0), -self._fastest, self._fastest)
 
     def _latest(self) -> tuple[Array, Array]:
         """Stamps (m,) and joints (m, n) of the readings that tell where it is and how fast."""

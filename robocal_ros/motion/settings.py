@@ -119,15 +119,20 @@ def require_limits(arm: SerialArm, config: DrivingConfig) -> None:
         raise InputError(f"{arm.name} has joints without limits: add them to the robot file")
 
 
-def trajectory_message(plan: JointPlan, names: Sequence[str]) -> JointTrajectory:
-    """A plan for a trajectory controller, which begins when it arrives."""
+def trajectory_message(
+    plan: JointPlan, names: Sequence[str], *, spacing_s: float = 0.0
+) -> JointTrajectory:
+    """A plan for a trajectory controller, which begins when it arrives.
+
+    ``spacing_s``: as `JointPlan.points`; then positions alone.
+    """
     message = JointTrajectory(joint_names=list(names))
-    for t, q, qd in zip(plan.time_s.tolist(), plan.q.tolist(), plan.qd.tolist(), strict=True):
+    for t, q, qd in zip(*(part.tolist() for part in plan.points(spacing_s)), strict=True):
         ns = round(t * NS)
         message.points.append(
             JointTrajectoryPoint(
                 positions=q,
-                velocities=qd,
+                velocities=[] if spacing_s else qd,
                 time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
             )
         )

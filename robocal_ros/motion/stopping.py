@@ -20,13 +20,19 @@ def stop_time(arm: SerialArm, limits: MotionLimits, qd: Array) -> Array:
     return np.asarray(np.maximum(np.max(np.abs(qd) / deceleration, axis=-1), SHORTEST_STOP_S))
 
 
-def stop(arm: SerialArm, limits: MotionLimits, q: ArrayLike, qd: ArrayLike) -> JointPlan:
+def stop(
+    arm: SerialArm,
+    limits: MotionLimits,
+    q: ArrayLike,
+    qd: ArrayLike,
+    shortest_s: float = SHORTEST_STOP_S,
+) -> JointPlan:
     """From measured joints and velocities (n,) to rest.
 
     All joints slow down evenly and come to rest together, so that the way goes on in its
     direction: q(t) = q + qd (t - t^2 / 2 T). T is `stop_time`: the joint that needs longest slows
     down by ``stop_deceleration``. Where a joint would pass its limit on that way, T is what the
-    limit leaves, and all slow down harder; but never in less than `SHORTEST_STOP_S`.
+    limit leaves, and all slow down harder; but never in less than ``shortest_s``.
 
     Raises
     ------
@@ -39,11 +45,10 @@ def stop(arm: SerialArm, limits: MotionLimits, q: ArrayLike, qd: ArrayLike) -> J
     if not (np.all(np.isfinite(here)) and np.all(np.isfinite(velocity))):
         raise InputError("joints or velocities are not finite: let the controller stop by itself")
     room = np.where(velocity > 0.0, arm.upper - here, here - arm.lower)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         left = np.where(velocity != 0.0, 2.0 * room / np.abs(velocity), np.inf)
-    duration = max(
-        min(float(stop_time(arm, limits, velocity)), float(np.min(left))), SHORTEST_STOP_S
-    )
+    needed = float(np.max(np.abs(velocity) / limits.of_joints(arm)[2]))
+    duration = max(min(max(needed, shortest_s), float(np.min(left))), shortest_s)
     slowing = -velocity / duration
     return JointPlan(
         np.array([0.0, duration]),

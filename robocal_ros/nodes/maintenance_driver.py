@@ -9,11 +9,9 @@ from rclpy.task import Future
 from robocal_msgs.action import MeasureTool
 from robocal_msgs.srv import BeginCycle, EndCycle
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
-from robocal_ros.motion.settings import trajectory_message
-from robocal_ros.nodes import qos
+from robocal_ros.motion.driver import MotionDriver, guarded
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.tcf_services import ANSWERS, MODES
 from robocal_ros.sessions.maintenance import requests as asked
@@ -25,24 +23,23 @@ Answered = Callable[[int, Answer], None]
 
 
 class MaintenanceDriver:
-    """Clients of ``thermal_node`` and ``tcf_node``, and ``~/joint_trajectory``.
+    """Clients of ``thermal_node`` and ``tcf_node``, and of the robot's controller.
 
     Parameters
     ----------
+    motion : sends motions to the controller.
     answered : takes the number of a request and what came of it.
     moves : told just before a motion goes out: later, the robot would be ahead of its plan.
-    names : of the joints.
     """
 
     def __init__(
         self,
         node: EndpointNode,
-        names: tuple[str, ...],
+        motion: MotionDriver,
         answered: Answered,
         moves: Callable[[], None],
     ) -> None:
-        self._answered, self._moves, self._names = answered, moves, names
-        self._output = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
+        self._node, self._motion, self._answered, self._moves = node, motion, answered, moves
         self._begin = node.add_client(BeginCycle, "thermal_node/begin_cycle")
         self._end = node.add_client(EndCycle, "thermal_node/end_cycle")
         self._arm = node.add_client(SetBool, "tcf_node/arm")
@@ -51,18 +48,21 @@ class MaintenanceDriver:
         self._cancelled: set[int] = set()
 
     def close(self) -> None:
-        """Take the action's client down."""
+        """Take the actions' clients down."""
         self._measure.destroy()
+        self._motion.close()
 
     def carry_out(self, request: asked.Request) -> None:
         """Do it; the answer comes later."""
         number = request.number
         match request:
-            case asked.Move(plan=plan) | asked.Stop(plan=plan):
-                message = trajectory_message(plan, self._names)
-                if isinstance(request, asked.Move):
-                    self._moves()
-                self._output.publish(message)
+            case asked.Move(plan=plan):
+                self._moves()
+                self._motion.send(plan, stop=False)
+            case asked.Stop(plan=plan):
+                self._motion.send(plan, stop=True)
+            case asked.HardStop(why=why):
+                self._motion.hard_stop(why)
             case asked.BeginCycle(cycle_id=name):
                 self._call(self._begin, BeginCycle.Request(cycle_id=name), number, _status)
             case asked.EndCycle(cycle_id=name):
@@ -82,7 +82,7 @@ class MaintenanceDriver:
             self._answered(number, Answer(Code.CONFLICT, words, absent=True))
             return
         client.call_async(request).add_done_callback(
-            lambda future: self._answered(number, read(future.result()))
+            guarded(self._node, lambda future: self._answered(number, read(future.result())))
         )
 
     def _begin_measure(self, number: int, mode: str, cycle_id: str) -> None:
@@ -93,7 +93,7 @@ class MaintenanceDriver:
         self._goals[number] = None
         goal = MeasureTool.Goal(mode=MODE_OF[mode], cycle_id=cycle_id, only_in_gap=True)
         self._measure.send_goal_async(goal).add_done_callback(
-            lambda future: self._accepted(number, future)
+            guarded(self._node, lambda future: self._accepted(number, future))
         )
 
     def _accepted(self, number: int, future: Future) -> None:
@@ -105,7 +105,9 @@ class MaintenanceDriver:
         self._goals[number] = handle
         if number in self._cancelled:
             handle.cancel_goal_async()
-        handle.get_result_async().add_done_callback(lambda ended: self._measured(number, ended))
+        handle.get_result_async().add_done_callback(
+            guarded(self._node, lambda ended: self._measured(number, ended))
+        )
 
     def _measured(self, number: int, ended: Future) -> None:
         self._goals.pop(number, None)

@@ -1,5 +1,6 @@
 """The maintenance node: one call from the PLC keeps a cell accurate (docs/maintenance_node.md)."""
 
+import math
 import time
 from dataclasses import replace
 from typing import Any
@@ -11,11 +12,14 @@ from sensor_msgs.msg import JointState, PointCloud2
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.samples import joint_sample, stamp_ns
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.motion.driver import LeaseHolder, MotionDriver
 from robocal_ros.motion.gap_sources import GapSources
+from robocal_ros.motion.graph import CommandPath
 from robocal_ros.motion.loading import load_motion
+from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.diagnostics import ERROR, Health
+from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import NotActiveError
 from robocal_ros.nodes.history_settings import open_history, warn_of_history
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
@@ -36,7 +40,7 @@ from robocal_ros.storage.robots import load_robot
 from robocal_ros.storage.state_files import StateFile
 
 TICK_S = 0.02
-SHOW_S = 0.2
+SHOW_S, LOOK_S = 0.2, 0.5
 ACCURACY_S = 1.0
 HISTORY_S = 0.05  # longest wait for another process: meanwhile nobody looks after the robot
 NS = 1_000_000_000
@@ -76,8 +80,19 @@ class MaintenanceNode(HouseNode):
         self._outputs = MaintenanceOutputs(
             self.add_output, self._nominal.name, self._serial_in_use, settings["base_frame"]
         )
-        names = self._nominal.joint_names
-        self._driver = MaintenanceDriver(self, names, self._answered, self._moves)
+        motion = MotionDriver(
+            self,
+            self._nominal.joint_names,
+            settings["follow_joint_trajectory"],
+            settings["hard_stop_service"],
+            self._reported,
+            lambda: None if self._session is None else self._session.robot.watch,
+            self._steady.now_s,
+        )
+        self._motion = motion
+        self._driver = MaintenanceDriver(self, motion, self._answered, self._moves)
+        self._lease = LeaseHolder(self, self._nominal.name, self._serial_in_use)
+        self._others = CommandPath(self, motion.topic.topic_name, motion.action, CORRECTION)
         self._calls = MaintenanceServices(
             self, self._running, self._clocks, self._outputs, settings["default_gap_s"]
         )
@@ -99,6 +114,7 @@ class MaintenanceNode(HouseNode):
         self._session = MaintenanceSession(
             self._nominal, self._history, self._config, self._keeper, self._record
         )
+        self._look_s = -math.inf
         for step, worst_s in self._session.worst_cases().items():
             self.get_logger().info(f"{step}: {worst_s:.1f} s at the most, way home included")
         self._show()
@@ -107,6 +123,7 @@ class MaintenanceNode(HouseNode):
         """Stop what moves, disarm, and end the session; the line and the PLC are told."""
         if self._session is not None:
             self._carry_out(self._session.give_up(ENDS, self._steady.now_s()))
+            self._lease.hold("")
             self._session.close()
             self._show()
             gone = Accuracy(AccuracyLevel.FAULT, f"maintenance: {ENDS}")
@@ -136,6 +153,7 @@ class MaintenanceNode(HouseNode):
             return
         if fault := self._guard.fault_at(self.inputs[JOINTS].received - 1):
             raise InputError(fault)
+        self._motion.hear(message)
         sample = joint_sample(message)
         q = sample.position[sample.order(self._nominal.joint_names)]
         session.reading(sample.stamp_ns / NS, q, self._steady.now_s())
@@ -160,6 +178,11 @@ class MaintenanceNode(HouseNode):
             require_robot(CORRECTION, message, self._nominal.name, self._serial_in_use)
             self._session.correction(told_correction(message), self._steady.now_s())
 
+    def _reported(self, report: MotionReport) -> None:
+        if self._session is not None:
+            self._session.robot.reported(report)
+            self._tick()  # a motion that was rejected, or a stop, is seen to now
+
     def _answered(self, number: int, answer: Answer) -> None:
         if self._session is not None:
             self._session.answered(number, answer)
@@ -176,6 +199,14 @@ class MaintenanceNode(HouseNode):
     def _tick(self) -> None:
         if self._session is not None:
             self._carry_out(self._session.tick(*self._clocks()))
+            self._hold_lease()
+
+    def _hold_lease(self) -> None:
+        session = self._session
+        running = None if session is None else session.running
+        cycle = "" if running is None else f"cycle '{running.cycle_id}'"
+        stops = session is not None and session.robot.stopping.under_way
+        self._lease.hold(cycle or "a stop" * stops)
 
     def _carry_out(self, requests: list[Request]) -> None:
         if self._driver is not None:
@@ -204,11 +235,21 @@ class MaintenanceNode(HouseNode):
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
+        self._look_at_graph(session)
         now_s = self._steady.now_s()
         status = session.status(now_s)  # which may take its time: the history is read
         status = replace(status, beat=session.beat(self._steady.now_s()))
         self._outputs.status(status, self.now_ns())
         self._calls.look(status)
+
+    def _look_at_graph(self, session: MaintenanceSession) -> None:
+        """Twice a second: a second maintenance node, and who else commands the robot."""
+        now_s = self._steady.now_s()
+        if now_s < self._look_s:
+            return
+        self._look_s = now_s + LOOK_S
+        self._others.look(self._outputs.accuracy_topic)
+        session.second(self._others.second, now_s)
 
     def _show_accuracy(self) -> None:
         if self._session is None:
@@ -230,13 +271,18 @@ class MaintenanceNode(HouseNode):
             "doing": status.doing or "nothing",
             "last cycle": "none" if status.last is None else status.last.message,
             "tool node": "disarmed" if status.disarmed else "may be armed",
+            "motions": self._motion.way or "none yet",
         }
         for step, worst_s in session.worst_cases().items():
             values[f"worst case of {step}"] = f"{worst_s:.1f} s"
         health.values = values
         if status.state is State.FAULT:
             health.worsen(ERROR, status.fault)
-        for words in (self._guard.fault, self._sources.doubt(), status.trouble):
+        for words in (session.robot.trouble(self._steady.now_s()), self._others.strangers):
+            if words:
+                health.worsen(WARN, words)
+        faults = self._guard.fault, self._others.second, self._sources.doubt(), status.trouble
+        for words in faults:
             if words:
                 health.worsen(ERROR, words)
         if self._history is not None:

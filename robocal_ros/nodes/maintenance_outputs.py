@@ -44,6 +44,7 @@ class MaintenanceOutputs:
         self._robot, self._serial, self._base = robot, serial, base_frame
         self._status = add(MaintenanceStatus, "~/status", qos.LATCHED)
         self._accuracy = add(AccuracyState, "accuracy_state", qos.LATCHED)
+        self.accuracy_topic: str = self._accuracy.topic_name
         self.events = SessionEvents(add)
 
     def status_message(self, status: Status, now_ns: int) -> MaintenanceStatus:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.motion.driver import CONTROLLER
 from robocal_ros.motion.gap_sources import GAP_BOOL, SHORTEST_STALE_S
 from robocal_ros.motion.settings import MOTION, driving_config, require_limits
 from robocal_ros.nodes.history_settings import STATE_DIR
@@ -74,6 +75,7 @@ SETTINGS = (
         high=5.0,
     ),
     *MOTION,
+    *CONTROLLER,
     _time("default_gap_s", 60.0, "Length of the gap of ~/run_trigger", 86400.0),
     _time(
         "gap_stale_s",

@@ -5,21 +5,17 @@ from typing import Any
 
 from robocal_msgs.msg import MaintenanceStatus
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
+from robocal_ros.motion.driver import CONTROLLER, LeaseHolder, MotionDriver
 from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.gap_sources import GAP_BOOL, SHORTEST_STALE_S, STATUS, GapSources
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.settings import (
-    MOTION,
-    NS,
-    driving_config,
-    require_limits,
-    trajectory_message,
-)
+from robocal_ros.motion.robot_watch import MotionReport
+from robocal_ros.motion.settings import MOTION, NS, driving_config, require_limits
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
 from robocal_ros.nodes.parameters import Setting, length
@@ -33,6 +29,7 @@ TICK_S = 0.01
 
 SETTINGS = (
     *MOTION,
+    *CONTROLLER,
     length("plunge_limit_mm", 20.0, "No plunge is deeper", 1.0, 100.0),
     Setting(
         "gap_stale_s",
@@ -52,15 +49,21 @@ UNHEARD = "gap_open is not listened to: gap_stale_s is 0"
 
 
 class TcfMotion:
-    """``~/arm`` and ``~/joint_trajectory``, and ``gap_open`` where it is listened to.
+    """``~/arm``, the robot's controller, and ``gap_open`` where it is listened to.
 
     Parameters
     ----------
+    arm, serial : the robot.
     ask : gives a command to the session.
     """
 
     def __init__(
-        self, node: EndpointNode, settings: Mapping[str, Any], ask: Callable[[Command], object]
+        self,
+        node: EndpointNode,
+        settings: Mapping[str, Any],
+        ask: Callable[[Command], object],
+        arm: SerialArm,
+        serial: str,
     ) -> None:
         self._node, self._ask = node, ask
         self._config = driving_config(
@@ -68,10 +71,19 @@ class TcfMotion:
             plunge_speed_m_s=settings["plunge_speed_mm_s"] * 1e-3,
             plunge_depth_m=settings["plunge_limit_mm"] * 1e-3,
         )
-        self._names: tuple[str, ...] = ()
+        self._names = arm.joint_names
         self.driver: ToolDriver | None = None
         self._steady = SteadyClock(self._slept)
-        self._output = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
+        self._motion = MotionDriver(
+            node,
+            arm.joint_names,
+            settings["follow_joint_trajectory"],
+            settings["hard_stop_service"],
+            self._reported,
+            lambda: None if self.driver is None else self.driver.robot,
+            self._steady.now_s,
+        )
+        self._lease = LeaseHolder(node, arm.name, serial)
         stale_s = settings["gap_stale_s"]
         self._gap = Gap(stale_s) if stale_s > 0.0 else None
         if self._gap is not None:
@@ -94,19 +106,26 @@ class TcfMotion:
             When a limit is given for another number of joints, or the robot has none.
         """
         require_limits(session.nominal, self._config)
-        self._names = session.nominal.joint_names
-        self.driver = ToolDriver(session, self._config, self._send, self._ask, self._closed)
+        self.driver = ToolDriver(
+            session, self._config, self._send, self._ask, self._closed, self._motion.hard_stop
+        )
 
     def deactivate(self) -> None:
         """Stop what moves."""
         if self.driver is not None:
             self.driver.disarm("the node was deactivated", self._steady.now_s())
+            self._lease.hold("")
         self.driver = None
+
+    def close(self) -> None:
+        """Take the controller's client down."""
+        self._motion.close()
 
     def take(self, message: Any) -> None:
         """Take a JointState before the session does: what is odd stops the robot first."""
         if self.driver is None:
             return
+        self._motion.hear(message)
         try:
             sample = joint_sample(message)
             q = sample.position[sample.order(self._names)]
@@ -133,7 +152,18 @@ class TcfMotion:
 
     def words(self) -> str:
         """What the diagnostics say."""
-        return "inactive" if self.driver is None else self.driver.words()
+        if self.driver is None:
+            return "inactive"
+        way = f"; motions go on {self._motion.way}" if self._motion.way else ""
+        return self.driver.words() + way
+
+    def trouble(self) -> str:
+        """What is to be warned of; empty: nothing."""
+        return "" if self.driver is None else self.driver.trouble(self._steady.now_s())
+
+    def on_its_way(self) -> bool:
+        """Whether a step is being driven: a robot that rests then only pauses."""
+        return self.driver is not None and self.driver.on_its_way(self._steady.now_s())
 
     def run_ended(self, outcome: Outcome) -> None:
         """A run without a result stops the robot."""
@@ -167,6 +197,11 @@ class TcfMotion:
             self._gap.look(now_s)
         if self.driver is not None:
             self.driver.tick(now_s)
+            self._lease.hold(f"tool: {self.driver.words()}" if self.driver.moves else "")
+
+    def _reported(self, report: MotionReport) -> None:
+        if self.driver is not None:
+            self.driver.reported(report, self._steady.now_s())
 
     def _arm(self, request: Any, response: Any) -> Any:
         if self.driver is None:
@@ -185,10 +220,9 @@ class TcfMotion:
         self._node.get_logger().warning(f"arm {request.data}: {response.message}")
         return response
 
-    def _send(self, plan: JointPlan) -> float:
-        message = trajectory_message(plan, self._names)
+    def _send(self, plan: JointPlan, stop: bool) -> float:
         sent_s = self._steady.now_s()  # not after it: a robot ahead of its plan is off it
-        self._output.publish(message)
+        self._motion.send(plan, stop=stop)
         return sent_s
 
     def _armed(self) -> str:

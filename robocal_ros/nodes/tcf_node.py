@@ -100,7 +100,8 @@ class TcfNode(HouseNode):
         )
         self._calls = TcfServices(self, runner, self._desk.ask, self._history)
         if settings["motion"] == TRAJECTORY:
-            self._motion = TcfMotion(self, settings, self._desk.ask)
+            robot = self._nominal, self._serial_in_use
+            self._motion = TcfMotion(self, settings, self._desk.ask, *robot)
         self.add_timer(POLL_S, self._poll, steady=True)
         self.add_timer(WATCH_S, self._watch, steady=True)
 
@@ -130,6 +131,8 @@ class TcfNode(HouseNode):
 
     def cleanup(self) -> None:
         """Take the action down and close the history."""
+        if self._motion is not None:
+            self._motion.close()
         self._session = self._motion = None
         if self._calls is not None:
             self._calls.close()
@@ -156,7 +159,9 @@ class TcfNode(HouseNode):
                 self._motion.beam(message)
             take_tool_message(session, kind, message)
             self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
-            if (command := session.recognised()) is not None:
+            command = session.recognised()
+            drives = self._motion is not None and self._motion.on_its_way()
+            if command is not None and not (drives and command.name == TOOL_STEP):
                 self._desk.ask(command)
             elif session.waiting:
                 self._desk.step()
@@ -278,6 +283,8 @@ class TcfNode(HouseNode):
         values["run"] = "none" if run is None else f"{run.number}, {run.awaited.name} is awaited"
         if self._motion is not None:
             values["motion"] = self._motion.words()
+            if trouble := self._motion.trouble():
+                health.worsen(WARN, trouble)
         values["last run"] = "none" if self._last is None else self._last.message
         values |= session.ignored.listed() | self._stamps.judge(health)
         for fault in (self._guard.fault, session.current.fault):

@@ -1,10 +1,12 @@
 """What the maintenance session asks is carried out in the right order."""
 
+import time
 from typing import Any
 
 import numpy as np
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.motion.driver import MotionDriver
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
@@ -21,10 +23,11 @@ def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
         out_by_then.append(len(inbox))
 
     node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
-    driver = MaintenanceDriver(node, ("a",), lambda number, answer: None, moves)
+    motion = MotionDriver(node, ("a",), "", "", lambda report: None, lambda: None, time.monotonic)
+    driver = MaintenanceDriver(node, motion, lambda number, answer: None, moves)
     node.trigger_configure()
     node.trigger_activate()
-    graph.spin_until(lambda: driver._output.get_subscription_count() > 0, "the probe listens")
+    graph.spin_until(lambda: motion.topic.get_subscription_count() > 0, "the probe listens")
     rest = np.zeros((2, 1))
     driver.carry_out(Move(1, JointPlan(np.array([0.0, 1.0]), rest, rest, rest), 1.0))
     assert out_by_then == [0]

@@ -1,5 +1,7 @@
 """A simulated robot that follows what it is sent, under a tool session's driver."""
 
+from dataclasses import replace
+
 import numpy as np
 from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
 
@@ -9,7 +11,7 @@ from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.sessions.events import MEASURE_TOOL, Command
+from robocal_ros.sessions.events import MEASURE_TOOL, TOOL_STEP, Command
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import Phase, ToolDriver
 from robocal_ros.sim.beams import RoundTool
@@ -50,21 +52,26 @@ class Robot:
         self.silent = False
         self.deaf = False  # no edge comes
         self.offset = np.zeros(arm.n)
+        self.speed, self.shift_s = 1.0, 0.0  # of the controller's clock, and what it is ahead
+        self.tells = False  # the controller tells its speed
+        self.lost, self.stops = 0, 0  # stops that do not arrive; that were sent
 
     def closed(self, now_s: float) -> str:
         self.gap.look(now_s)
         return self.gap.closed(now_s)
 
-    def send(self, plan: JointPlan) -> None:
-        """The controller gets it with a lag, and goes on from where it is and moves by then.
-
-        The point at 0 is not sent: a controller would jump there.
-        """
+    def send(self, plan: JointPlan, stop: bool = False) -> None:
+        """The controller gets it with a lag, and goes on from where it is and moves by then."""
         self.sent.append((self.now_s, plan))
+        self.stops += stop
+        if stop and self.stops <= self.lost:
+            return
         self.coming.append((self.now_s + LAG_S, plan))
 
     def receive(self, at_s: float, plan: JointPlan) -> None:
-        self.motion.follow(at_s, plan.time_s[1:] + at_s, plan.q[1:], plan.qd[1:])
+        time_s, q, qd = plan.points()
+        at_s += self.shift_s
+        self.motion.follow(at_s, time_s + at_s, q, qd)
         motion, end_s = self.motion, at_s + plan.duration_s
         moved = self.cell.station.edges(
             self.tool, lambda t: self.true.fk(motion.joints(t)), (at_s, end_s), self.rng
@@ -99,22 +106,31 @@ class Robot:
 
     def step(self) -> None:
         self.now_s += PERIOD_S
+        self.shift_s += (self.speed - 1.0) * PERIOD_S
+        if self.tells:
+            self.driver.robot.scaled(self.speed, self.now_s)
         if self.beating:
             self.gap.heard(True, self.gap.count(self.now_s), self.now_s)
         while self.coming and self.coming[0][0] <= self.now_s:
             self.receive(*self.coming.pop(0))
-        self.q = self.motion.joints(np.array([self.now_s]))[0]
+        here_s = self.now_s + self.shift_s
+        self.q = self.motion.joints(np.array([here_s]))[0]
         self.path.append(self.q.copy())
-        while self.edges and self.edges[0].stamp_ns <= self.ns(self.now_s):
-            self.driver.beam(self.edges[0].blocked)
-            self.session.add(self.edges.pop(0))
+        while self.edges and self.edges[0].stamp_ns <= self.ns(here_s):
+            edge = self.edges.pop(0)
+            ago_ns = round((self.ns(here_s) - edge.stamp_ns) / self.speed)
+            self.driver.beam(edge.blocked)
+            self.session.add(replace(edge, stamp_ns=self.ns(self.now_s) - ago_ns))
         if self.silent:
             self.driver.tick(self.now_s)
             return
         q = self.q + self.offset
         self.driver.reading(self.now_s, q, self.now_s)
         self.session.add(JointSample(self.ns(self.now_s), self.cell.arm.joint_names, q))
-        if (command := self.session.recognised()) is not None:
+        command = self.session.recognised()
+        if command is not None and (
+            command.name != TOOL_STEP or not self.driver.on_its_way(self.now_s)
+        ):
             self.ask(command)
 
     def at_rest(self) -> bool:

@@ -240,7 +240,8 @@ class Cell:
     def _controller_goes_on(self) -> None:
         while self.coming and self.coming[0][0] <= self.now_s:
             at_s, plan = self.coming.pop(0)
-            self.motion.follow(self.now_s, plan.time_s + at_s, plan.q, plan.qd)
+            time_s, q, qd = plan.points()
+            self.motion.follow(self.now_s, time_s + at_s, q, qd)
         q = self.motion.joints(np.array([self.now_s]))[0]
         if np.max(np.abs(q - self.q)) > 1e-7:
             self.moved_s = self.now_s

@@ -150,7 +150,7 @@ def test_a_stop_after_a_suspend_begins_where_the_robot_stands(robot, phase):
 
 
 def test_a_break_on_the_way_stops_it(robot):
-    driving(robot, Phase.APPROACH)
+    driving(robot, Phase.APPROACH, 0.6)
     robot.edges.insert(0, EdgeSample(robot.ns(robot.now_s), "", "x", True, 1e-4))
     robot.run(0.5)
     stopped(robot, "a beam was broken on the way")
@@ -186,7 +186,7 @@ def test_a_cancel_stops_it(robot):
 
 
 def test_disarming_stops_it(robot):
-    driving(robot, Phase.APPROACH)
+    driving(robot, Phase.APPROACH, 0.6)
     robot.driver.disarm("disarmed by the operator", robot.now_s)
     robot.run(0.5)
     stopped(robot, "disarmed by the operator")
@@ -211,10 +211,14 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
 def test_a_robot_that_is_held_has_left_its_plan(robot, phase):
     driving(robot, phase)
     robot.motion = JointMotion(robot.q)
-    robot.run(5.0, until=lambda: not robot.driver.armed)
+    robot.edges.clear()
+    robot.run(10.0)
+    assert robot.driver.armed  # it may pause, and nobody tells
+    assert "behind its plan, on its path" in robot.driver.trouble(robot.now_s)
+    robot.run(10.0, until=lambda: not robot.driver.armed)
     last = robot.outcomes[-1]
     assert (last.status, last.left_plan) == (Code.LIMIT_EXCEEDED, True)
-    assert "away from its plan" in last.message
+    assert "has not come further on its path" in last.message
 
 
 @pytest.mark.parametrize("dead", ["tool", "beams"])

@@ -13,7 +13,7 @@ from robocal_ros.sessions.maintenance.disarming import SENT, Disarming
 from robocal_ros.sessions.maintenance.mover import FaultError, Mover
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Route, Ways
-from robocal_ros.sessions.tool_driving import SETTLED_S, STANDS_S
+from robocal_ros.sessions.tool_phases import SETTLED_S, STANDS_S
 from robocal_ros.sessions.tool_results import QUICK
 
 DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot
@@ -45,13 +45,15 @@ class Hands(Asking):
         self.tool_home_s = config.times.tool_home_s
         self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
         self._told_s = -np.inf  # newest reading at the last confirmation, or stop in its place
+        self._failed = ""  # of the last stop, as it was acted upon
         self._measuring = 0  # number of the measurement that the driver has not answered
 
     # ---- time -----------------------------------------------------------------------------------
 
     def fits(self, worst_s: float) -> bool:
         """Whether something that lasts so long at the most, way home included, fits the gap."""
-        return worst_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
+        lasts_s = self.robot.lasts_s(worst_s)
+        return lasts_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
 
     def tool_worst_s(self, mode: str) -> float:
         """A tool measurement from home and back, with everything that may go wrong."""
@@ -113,6 +115,7 @@ class Hands(Asking):
         a corner of what was sent before, where plans rest for a while, and is held.
         """
         tool, robot = self.tool, self.robot
+        self._look_after_stop()
         rests = robot.resting(STANDS_S) is not None
         self._told_s = min(self._told_s, robot.newest_s)  # their clock may have begun anew
         since_s = robot.newest_s - self._told_s  # readings that are late do not count against it
@@ -126,6 +129,16 @@ class Hands(Asking):
                 self._stop_measured()
         if tool.gone(self.now_s) and not robot.beside_home():
             tool.engaged &= not rests
+
+    def _look_after_stop(self) -> None:
+        """Send it again where the robot does not obey; then stop it by other means."""
+        stopping = self.robot.stopping
+        if (plan := stopping.look(self.robot.watch, self.now_s)) is not None:
+            self.request(asked.Stop, plan)
+        if stopping.failed != self._failed:
+            self._failed = stopping.failed
+            if self._failed:
+                self.request(asked.HardStop, self._failed)
 
     @property
     def stopping(self) -> bool:
@@ -199,6 +212,8 @@ class Hands(Asking):
         ------
         FaultError
             When the robot does not rest where the route begins, on a taught way.
+        LimitError
+            When the robot is so slow or so late that the step does not fit the gap any more.
         """
         self.robot.require_heard("where the way of the robot begins")
         q = self.robot.resting(SETTLED_S)
@@ -210,6 +225,8 @@ class Hands(Asking):
         self.left_home = True
         self.request(asked.Move, route.plan, worst_s)
         while not self.robot.arrived(self.now_s):
+            if self.robot.worst_left_s(worst_s, self.now_s) > self.gap.left_s(self.now_s):
+                raise LimitError("the robot is slower than planned: this step does not fit the gap")
             yield
 
     def halt(self, at_once: bool = False) -> None:
@@ -252,16 +269,16 @@ class Hands(Asking):
             route = self.ways.home(robot.place, q)
         except LimitError as error:
             raise FaultError(error.code, f"no way home: {error}") from error
-        duration_s, left_s = route.plan.duration_s, self.gap.left_s(self.now_s)
+        duration_s, left_s = self.robot.lasts_s(route.plan.duration_s), self.gap.left_s(self.now_s)
         if robot.place == STATION:
-            self.tool_home_s = max(self.tool_home_s, duration_s)
+            self.tool_home_s = max(self.tool_home_s, route.plan.duration_s)
         if duration_s >= left_s and near:
             return  # the next run begins from here
         if duration_s >= left_s:
             words = f"the way home takes {duration_s:.1f} s, {max(left_s, 0.0):.1f} s are left"
             words = "; ".join(filter(None, (words, self.home_told())))
             raise FaultError(Code.LIMIT_EXCEEDED, words)
-        yield from self.drive(route, duration_s)
+        yield from self.drive(route, route.plan.duration_s)
 
     def home_told(self) -> str:
         """That the way home from the beams took longer than was set, and what to set; or empty."""

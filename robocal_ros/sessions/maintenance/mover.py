@@ -4,11 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.errors import LimitError, RobocalError, TooFewSamplesError
 from robocal_ros.motion.measuring import start_near
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.robot_watch import VELOCITY_S, RobotWatch
+from robocal_ros.motion.robot_watch import VELOCITY_S, LeftPlanError, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import stop, stop_time
+from robocal_ros.motion.watched_stop import WatchedStop
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 from robocal_ros.sessions.maintenance.ways import HOME, STATION, Line, Route, Ways
 
@@ -28,6 +29,8 @@ class Mover:
 
     Attributes
     ----------
+    watch : the readings, and how fast the controller's clock runs.
+    stopping : the stop that was sent last.
     place : point, line or station at which it was last known to be.
     stops_within_s : a stop that was sent is over in the readings by then, from any speed.
     """
@@ -36,7 +39,9 @@ class Mover:
         self._config, self._ways = config, ways
         self._arm = ways.cell.arm
         driving = config.driving
-        self._watch = RobotWatch(self._arm, driving)
+        self.watch = RobotWatch(self._arm, driving)
+        self.stopping = WatchedStop(self._arm, driving.limits)
+        self._lost = ""  # why the controller does not drive the route any more
         fastest = driving.limits.of_joints(self._arm)[0]
         self.stops_within_s = driving.late_s + float(stop_time(self._arm, driving.limits, fastest))
         self._q: Array | None = None
@@ -46,17 +51,17 @@ class Mover:
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,); ``stamp_s`` on their own clock."""
-        self._watch.reading(stamp_s, q, now_s)
-        if (newest := self._watch.newest) is not None:
+        self.watch.reading(stamp_s, q, now_s)
+        if (newest := self.watch.newest) is not None:
             self.newest_s, self._q = newest  # an older stamp does not count
 
     def look(self, now_s: float) -> None:
         """Count silence; call it often."""
-        self._watch.silence.look(now_s)
+        self.watch.silence.look(now_s)
 
     def slept(self, for_s: float) -> None:
         """The host was suspended for so long."""
-        self._watch.slept(for_s)
+        self.watch.slept(for_s)
 
     @property
     def moving(self) -> bool:
@@ -66,7 +71,7 @@ class Mover:
     @property
     def silent(self) -> bool:
         """Whether joint states are missing."""
-        return self._watch.silent_s > self._config.driving.silence_s
+        return self.watch.silent_s > self._config.driving.silence_s
 
     def beside_home(self) -> str:
         """Which joint is how far from home, in words; empty when the robot is there."""
@@ -75,12 +80,19 @@ class Mover:
         away = np.abs(self._q - self._config.home)
         return self._off(away, np.broadcast_to(self._config.home_near, away.shape))
 
+    def require_home(self) -> None:
+        """Refuse what begins at home where the robot is not, or is not heard."""
+        if self.unheard:
+            raise TooFewSamplesError(f"{self.unheard}: nobody knows whether the robot is at home")
+        if away := self.beside_home():
+            raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
+
     @property
     def unheard(self) -> str:
         """Why nobody knows where the robot is, in words; empty where it is known."""
         if self._q is not None and not self.silent:
             return ""
-        silent_s = self._watch.silent_s
+        silent_s = self.watch.silent_s
         return "joint states are " + (
             "missing" if np.isinf(silent_s) else f"silent for {silent_s:.2f} s"
         )
@@ -108,7 +120,7 @@ class Mover:
 
     def resting(self, span_s: float) -> Array | None:
         """The joints where the robot has rested for so long; None while it moves, or is silent."""
-        return None if self.silent else self._watch.resting(span_s)
+        return None if self.silent else self.watch.resting(span_s)
 
     def require_at(self, q: Array) -> None:
         """Look after a robot that is to stand at joints (n,).
@@ -143,19 +155,43 @@ class Mover:
 
     def start(self, route: Route, now_s: float) -> None:
         """A route was sent."""
-        self._route = route
-        self._watch.follow(route.plan, self._ways.cell, now_s)
+        self._route, self._lost = route, ""
+        self.stopping.forget()
+        self.watch.follow(route.plan, self._ways.cell, now_s)
+
+    def reported(self, report: MotionReport) -> None:
+        """What the controller says of what it was sent last."""
+        if self.stopping.under_way:
+            if report.failed:
+                self.stopping.rejected(report.words)
+        elif self._route is not None and report.failed:
+            self._lost = report.words
+        elif report.ended:
+            self.watch.ended()
+
+    def trouble(self, now_s: float) -> str:
+        """That the robot does not stop, or is late on its way, in words; else empty."""
+        return self.stopping.failed or self.watch.late(now_s)
+
+    def worst_left_s(self, worst_s: float, now_s: float) -> float:
+        """What is left of a time from the route's start on, as fast as the robot goes now."""
+        driven_s = self.watch.driven_s(now_s) - max(self.watch.late_s(now_s), 0.0)
+        return self.lasts_s(worst_s - driven_s)
+
+    def lasts_s(self, planned_s: float) -> float:
+        """How long the robot takes for what is planned, at the present speed scaling."""
+        return planned_s / max(self.watch.scaling, 1e-3)
 
     def sent(self, now_s: float) -> None:
         """When the route really was sent: it may have taken a while to plan."""
-        self._watch.sent(now_s)
+        self.watch.sent(now_s)
 
     def arrived(self, now_s: float) -> bool:
         """Whether the route is over, with the robot at its end."""
-        if self._route is None or not self._watch.at_end(now_s):
+        if self._route is None or not self.watch.at_end(now_s):
             return False
         self.place, self._route = self._route.goal, None
-        self._watch.forget()
+        self.watch.forget()
         return True
 
     def require_sane(self, now_s: float) -> None:
@@ -169,42 +205,36 @@ class Mover:
         if self._route is None:
             return
         self.require_heard("while the robot moves")
-        tip_m, joint_rad = self._watch.away()
-        if not self._kept(tip_m, joint_rad):
-            driving = self._config.driving
-            raise FaultError(
-                Code.LIMIT_EXCEEDED,
-                f"the robot is {tip_m * 1e3:.1f} mm and {np.degrees(joint_rad):.2f} deg away from "
-                f"its plan (allowed {driving.deviation_m * 1e3:.1f} mm, "
-                f"{np.degrees(driving.deviation_rad):.2f} deg)",
-            )
-        rest_s = self._config.times.rest_s
-        if self._watch.overdue_s(now_s) > rest_s:
-            words = f"the motion ended {rest_s:g} s ago, but the robot is not where it ends"
-            raise FaultError(Code.LIMIT_EXCEEDED, words)
+        if self._lost:
+            raise FaultError(Code.CONFLICT, self._lost)
+        try:
+            self.watch.require_on_plan(now_s, self._config.times.rest_s)
+        except LeftPlanError as error:
+            raise FaultError(error.code, str(error)) from error
 
     def stop(self, now_s: float) -> JointPlan | None:
         """The stop of what moves, None where nothing does."""
-        if self._route is None or not self._watch.heard:
+        if self._route is None or not self.watch.heard:
             return None
-        state = self._watch.state(now_s, keeps=self._kept(*self._watch.away()))
-        self.place = self._route.line_at(self._watch.driven_s(now_s))
+        keeps = not self._lost and self.watch.keeps(*self.watch.away())
+        state = self.watch.state(now_s, keeps=keeps)
+        self.place = self._route.line_at(self.watch.driven_s(now_s))
         if self.place == (STATION[0], HOME):
             self.place = STATION
         self._route = None
-        self._watch.forget()
-        return stop(self._arm, self._config.driving.limits, *state)
+        self.watch.forget()
+        return self._planned(state, now_s)
 
     def stop_measured(self, now_s: float) -> JointPlan | None:
         """The stop of whatever moves the robot, from its readings alone; None while these fail.
 
         Just after a silence too: its mean speed would drive on a robot that has stopped meanwhile.
         """
-        if self.silent or not self._watch.tells_speed(VELOCITY_S + self._config.driving.silence_s):
+        if self.silent or not self.watch.tells_speed(VELOCITY_S + self._config.driving.silence_s):
             return None
-        state = self._watch.state(now_s, keeps=False)
-        return stop(self._arm, self._config.driving.limits, *state)
+        return self._planned(self.watch.state(now_s, keeps=False), now_s)
 
-    def _kept(self, tip_m: float, joint_rad: float) -> bool:
-        driving = self._config.driving
-        return tip_m <= driving.deviation_m and joint_rad <= driving.deviation_rad
+    def _planned(self, state: tuple[Array, Array], now_s: float) -> JointPlan:
+        plan = stop(self._arm, self._config.driving.limits, *state)
+        self.stopping.begin(plan, now_s)
+        return plan

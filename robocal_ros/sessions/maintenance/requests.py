@@ -52,7 +52,7 @@ class CancelMeasure(Request):
 
 @dataclass(frozen=True)
 class Move(Request):
-    """Send a plan to the controller; not answered, the joint readings tell.
+    """Send a plan to the controller; reported by `MaintenanceSession.reported`.
 
     ``worst_s``: until the robot is back at home at the latest, counted from now.
     """
@@ -66,6 +66,13 @@ class Stop(Request):
     """Send a stop to the controller."""
 
     plan: JointPlan
+
+
+@dataclass(frozen=True)
+class HardStop(Request):
+    """Stop a robot that does not obey its controller by other means, where there are any."""
+
+    why: str
 
 
 @dataclass(frozen=True)

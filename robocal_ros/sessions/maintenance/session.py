@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, LimitError, TooFewSamplesError
+from robocal_ros.core.errors import ConflictError, InputError, LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.correction.reported import ToldCorrection
@@ -50,6 +50,7 @@ class MaintenanceSession:
     ----------
     ways : the ways that the robot may take.
     memory : what outlives a restart; read it only.
+    robot : where it is, and what its controller says (`Mover.reported`, `Mover.watch`).
     """
 
     def __init__(
@@ -64,11 +65,13 @@ class MaintenanceSession:
         self.memory = Memory.load(keeper)
         self._decider = Decider(nominal, history, config)
         self._hands = Hands(config, self.ways)
+        self.robot = self._hands.robot
         self._hands.doubt()  # whoever ran before may have left the tool's driver armed
         self._book = CycleBook()
         self._record = record
         self._conductor = Conductor(self._hands, self.memory, self._tell)
         self._heard = Heard(config)
+        self._second = ""
 
     # ---- what happens ---------------------------------------------------------------------------
 
@@ -86,15 +89,20 @@ class MaintenanceSession:
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,), in the arm's order; ``stamp_s`` on their own clock."""
-        self._hands.robot.reading(stamp_s, q, now_s)
+        self.robot.reading(stamp_s, q, now_s)
 
     def slept(self, for_s: float) -> None:
         """The host was suspended; call it before anything else with a time of afterwards."""
-        self._hands.robot.slept(for_s)
+        self.robot.slept(for_s)
 
     def sent(self, now_s: float) -> None:
         """The motion that `tick` gave goes out now: its time begins then, not when planned."""
-        self._hands.robot.sent(now_s)
+        self.robot.sent(now_s)
+
+    def second(self, why: str, now_s: float) -> None:
+        """Another maintenance node drives this robot too; empty: none does."""
+        self._second, self._hands.now_s = why, now_s
+        self._conductor.give_up(why) if why else None
 
     def measured(self, stamp_s: float) -> None:
         """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
@@ -136,11 +144,11 @@ class MaintenanceSession:
         if (open_run := self._conductor.run) is not None:
             raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
         hands.tool.require_disarmed()
-        if why := hands.gap.closed(now_s):
+        if why := self._second or hands.gap.closed(now_s):
             raise ConflictError(f"{why}: the robot is not moved")
         hands.begin(gap_s)
         try:
-            self._require_home()
+            self.robot.require_home()
         except LimitError as error:
             self._conductor.fault(error.code, str(error))
             raise
@@ -212,7 +220,7 @@ class MaintenanceSession:
         if not self.memory.fault:
             return "there is no fault"
         self._hands.tool.require_disarmed()
-        self._require_home()
+        self.robot.require_home()
         words = f"acknowledged: {self.memory.fault}"
         self.memory.clear_fault()
         self._hands.doing = ""
@@ -221,8 +229,7 @@ class MaintenanceSession:
 
     def tick(self, now_s: float, wall_ns: int) -> list[Request]:
         """Look at everything, and go on; what is to be carried out now, in this order."""
-        hands = self._hands
-        hands.now_s = now_s
+        hands, self._hands.now_s = self._hands, now_s
         hands.gap.look(now_s)
         hands.robot.look(now_s)
         self._conductor.tick(wall_ns)
@@ -283,13 +290,6 @@ class MaintenanceSession:
         told = heard.drift(now_s), heard.uncorrected(thermal, tool, now_s)
         number = thermal.calibration_id or 0
         return accuracy_of(self.config, *told, self.memory, tool, number, wall_ns)
-
-    def _require_home(self) -> None:
-        robot = self._hands.robot
-        if robot.unheard:
-            raise TooFewSamplesError(f"{robot.unheard}: nobody knows whether the robot is at home")
-        if away := robot.beside_home():
-            raise LimitError(f"robot is not at home: {away}: bring it home, then acknowledge")
 
     def _decided(self, outcome: Outcome) -> None:
         if not outcome.repeated:

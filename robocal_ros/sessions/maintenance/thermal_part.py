@@ -11,7 +11,7 @@ from robocal_ros.sessions.maintenance.asking import Script, SilentError
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.requests import Answer, BeginCycle, EndCycle
 from robocal_ros.sessions.maintenance.ways import HOME
-from robocal_ros.sessions.tool_driving import STANDS_S
+from robocal_ros.sessions.tool_phases import STANDS_S
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.memory import Memory, ToolRecord
 from robocal_ros.sessions.maintenance.mover import FaultError
 from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.tool_driving import STANDS_S
+from robocal_ros.sessions.tool_phases import STANDS_S
 from robocal_ros.sessions.tool_results import FULL, QUICK
 
 FAILED = (  # without a result they say that something is wrong with the tool, or its measurement
