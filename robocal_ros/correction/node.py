@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
-from robocal_ros.correction import serialized_path
+from robocal_ros.correction import limiter, serialized_path
 from robocal_ros.correction.action import TrajectoryProxy
 from robocal_ros.correction.graph import (
     CommandSources,
@@ -105,6 +105,7 @@ class JointCorrectionNode(HouseNode):
         self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
+        limiter.load_kernels(reference.n)
         serialized_path.load_kernels()
         if self.settings["enable_on_start"]:
             self._session.enable(True)
