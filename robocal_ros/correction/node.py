@@ -162,7 +162,7 @@ class JointCorrectionNode(HouseNode):
                 partial(self._on_target, COMMANDS),
                 qos.HEARTBEAT,
             ),
-            TRAJECTORY: (PathMessage, self._on_path, qos.RELIABLE),
+            TRAJECTORY: (self._read_path, self._on_path, qos.RELIABLE),
         }
         for topic, (read, act, profile) in acts.items():
             receive = self._guarded(topic, read, act)
@@ -318,6 +318,9 @@ class JointCorrectionNode(HouseNode):
         taught = self._session.reading(command, now, age)
         self._track.read(command, now)
         self._put_out(STATES, message, command, taught)
+
+    def _read_path(self, came: bytes) -> PathMessage:
+        return self._session.counted(lambda: PathMessage(came))
 
     def _on_path(self, message: PathMessage) -> None:
         if not message.points:
