@@ -16,7 +16,7 @@ from robocal_ros.correction.refusals import Reason, RefusedError
 
 Array = NDArray[np.float64]
 
-MOST_POINTS = 100_000  # of a trajectory; tens of thousands are corrected in well under a second
+MOST_POINTS = 10_000  # of a trajectory: within 50 ms, so that nothing else waits longer
 TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
 
 

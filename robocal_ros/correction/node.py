@@ -15,7 +15,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
-from robocal_ros.correction import serialized_path
+from robocal_ros.correction import limiter, serialized_path
 from robocal_ros.correction.action import TrajectoryProxy
 from robocal_ros.correction.graph import (
     CommandSources,
@@ -105,6 +105,7 @@ class JointCorrectionNode(HouseNode):
         self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
+        limiter.load_kernels(reference.n)
         serialized_path.load_kernels()
         if self.settings["enable_on_start"]:
             self._session.enable(True)
@@ -161,7 +162,7 @@ class JointCorrectionNode(HouseNode):
                 partial(self._on_target, COMMANDS),
                 qos.HEARTBEAT,
             ),
-            TRAJECTORY: (PathMessage, self._on_path, qos.RELIABLE),
+            TRAJECTORY: (self._read_path, self._on_path, qos.RELIABLE),
         }
         for topic, (read, act, profile) in acts.items():
             receive = self._guarded(topic, read, act)
@@ -317,6 +318,9 @@ class JointCorrectionNode(HouseNode):
         taught = self._session.reading(command, now, age)
         self._track.read(command, now)
         self._put_out(STATES, message, command, taught)
+
+    def _read_path(self, came: bytes) -> PathMessage:
+        return self._session.counted(lambda: PathMessage(came))
 
     def _on_path(self, message: PathMessage) -> None:
         if not message.points:

@@ -186,7 +186,7 @@ class CorrectionReport:
         """
         now = time.monotonic()
         status = self._session.status(now)
-        message = self._messages.status(status, commanders, lease, self._log.fault, self._now_ns())
+        message = self._messages.status(status, commanders, lease, self._log.damage, self._now_ns())
         names = message.get_fields_and_field_types()
         told = [str(getattr(message, name)) for name in names if name not in FIGURES]
         if only_news and told == self._told and now - self._told_s < TELL_S - 0.5 * LOOK_S:

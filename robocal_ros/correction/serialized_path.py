@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel
+from robocal_ros.correction.inputs import require_few
 
 Array = NDArray[np.float64]
 
@@ -124,18 +125,22 @@ def _string_size(text: str) -> int:
 
 
 def read_path(data: bytes) -> SerializedPath | None:
-    """Read a serialized trajectory; None for one that is not regular, or no such message at all."""
+    """Read a serialized trajectory; None for one that is not regular, or no such message at all.
+
+    Raises `RefusedError` for one of too many points, before it is read.
+    """
     size = len(data) - len(ENCAPSULATION)
     if size < STAMP or data[:2] != ENCAPSULATION[:2]:
         return None
-    doubles = np.zeros(-(-size // 8))
-    doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(ENCAPSULATION))
     try:
         frame_id, names, count, begin = _head(data)
     except (struct.error, UnicodeDecodeError):
         return None
     if not 0 < count <= size // LEAST_POINT:
         return None
+    require_few(count)
+    doubles = np.zeros(-(-size // 8))
+    doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(ENCAPSULATION))
     places, times = np.empty((count, FIELDS, 2), dtype=np.int64), np.empty(count)
     whole = _places(doubles.view(np.uint32), begin, size, places, times)
     if not whole or np.any(places[:, :, 1] != places[0, :, 1]):

@@ -298,6 +298,10 @@ def test_a_burst_of_ten_thousand_points(graph: Any) -> None:
     line.to_path.publish(trajectory(q, np.arange(1, 10_001) * 1e-3))
     out = line.wait(line.paths)
     assert len(out.points) == 10_000
+    q = HOME + np.linspace(0.0, 0.1, 10_001)[:, None]
+    line.refused(
+        line.to_path, trajectory(q, np.arange(1, 10_002) * 1e-3), "joint_trajectory"
+    )  # it would hold everything else up
     assert distance(actual, out.points[0].positions) < 1e-9
 
 

@@ -19,6 +19,7 @@ from joint_correction_live import (
     trajectory,
 )
 from robocal_msgs.msg import CorrectionStatus
+from robocal_ros.correction.periods import LONGEST_GAP_S
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import SetBool
@@ -26,7 +27,6 @@ from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.correction.periods import LONGEST_GAP_S
 from robocal_ros.nodes import conversions
 
 

@@ -13,7 +13,7 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.correction.inputs import trajectory_command
-from robocal_ros.correction.path_messages import PathMessage
+from robocal_ros.correction.messages import PathMessage
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.serialized_path import read_path
 

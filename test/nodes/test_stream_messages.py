@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
-from robocal_ros.correction.path_messages import PathMessage
-from robocal_ros.correction.stream_messages import ArrayMessage, JointMessage
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import CORRECTED
+from robocal_ros.correction.messages import ArrayMessage, JointMessage, PathMessage
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.wire import JointWire
 
