@@ -26,6 +26,7 @@ from robocal_ros.correction.inputs import (
     TrajectoryCommand,
     finite_command,
     joint_command,
+    require_few,
     require_finite,
     trajectory_command,
 )
@@ -183,7 +184,9 @@ class PathMessage:
 
     def __init__(self, came: bytes | JointTrajectory) -> None:
         self._came = came
-        self._path: SerializedPath | None = read_path(came) if isinstance(came, bytes) else None
+        self._path: SerializedPath | None = None
+        if isinstance(came, bytes):
+            self._path = read_path(came, require_few)
         self._read: Any = None
         self.points = len(self._message().points) if self._path is None else len(self._path)
 
