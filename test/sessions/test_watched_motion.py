@@ -76,14 +76,14 @@ def test_every_motion_begins_ahead_of_now_with_velocities(robot, phase):
         assert time_s[0] == pytest.approx(LEAD_S)
         assert np.all(qd[-1] == 0.0)
         # what a controller makes of it from rest is the plan
-        driven = JointPlan(
+        begin = JointPlan(
             np.array([0.0, LEAD_S]),
             np.array([plan.q[0], q[0]]),
             np.array([0.0 * qd[0], qd[0]]),
             np.zeros((2, 6)),
         )
         between = np.linspace(0.0, LEAD_S, 20)
-        assert np.max(np.abs(driven.at(between)[0] - plan.at(between)[0])) < REST_RAD
+        assert np.max(np.abs(begin.at(between)[0] - plan.at(between)[0])) < REST_RAD
 
 
 # ---- speed scaling and pauses -------------------------------------------------------------------
