@@ -312,13 +312,16 @@ class RobotWatch:
         return here, np.clip(velocity / max(self.scaling, 0.1), -self._fastest, self._fastest)
 
     def speed(self, now_s: float) -> float:
-        """Largest unscaled speed of a joint, rad/s (m/s); NaN where nothing tells it."""
+        """Largest unscaled speed of a joint, rad/s (m/s); NaN where nothing tells it.
+
+        Readings from before a silence do not: the robot may have stopped meanwhile.
+        """
         if (reference := self.reference(now_s)) is not None:
             return float(np.max(np.abs(reference[1])))
         if not self._readings:
             return float("nan")
         times, q = self._latest()
-        if len(times) < 2:
+        if len(times) < 2 or np.max(np.diff(times)) > self._driving.silence_s:
             return float("nan")
         return float(np.max(np.abs(self._slope(times, q)))) / max(self.scaling, 0.1)
 
