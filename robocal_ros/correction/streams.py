@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
+HELD_PERIODS = 2.5  # without an output the controller has held the last one, and the robot stands
 RESUME_S = 1.0  # after a longer silence a stream is over
 INTERVALS = 7  # whose median is the period
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
@@ -66,8 +67,9 @@ class TargetStream:
         self._index = np.zeros(0, dtype=np.int64)
         self._step_s = 0.0  # of the last output
         self._before = np.full(arm.n, np.nan)  # what was put out before it
-        self._end_s, self._end_out, self._end_speed = 0.0, np.empty(0), np.empty(0)
-        self._lasts_s = 0.0
+        # of the slow-down: from where, how fast, how long, and how much of that has gone out
+        self._end_out, self._end_speed = np.empty(0), np.empty(0)
+        self._lasts_s, self._slowed_s = 0.0, 0.0
 
     # ---- time -----------------------------------------------------------------------------------
 
@@ -220,20 +222,25 @@ class TargetStream:
     # ---- without a message ----------------------------------------------------------------------
 
     def end(self, why: RefusedError, now_s: float) -> None:
-        """End it: the robot is slowed down from where and as fast as it was sent last."""
+        """End it: the robot is slowed down from where and as fast as it was sent last.
+
+        After a silence of more than `HELD_PERIODS` the controller has held the last target since:
+        the robot stands, and nothing more goes out, which would set it in motion again.
+        """
         if self.phase is not Phase.RUNNING:
             return
         output, index, self._why = self._output, self._index, why
-        held = now_s - output.out_s > self._gap_s()  # the controller holds since: it stands
-        speed = np.zeros(len(index))
-        if not held and self._step_s > 0.0:
-            speed = (output.out - self._before)[index] / self._step_s
+        period, speed = self.period_s, np.zeros(len(index))
+        if self._step_s > 0.0 and now_s - output.out_s <= HELD_PERIODS * period:
+            # a message that came early is no faster motion
+            speed = (output.out - self._before)[index] / max(self._step_s, period)
         lasts = np.max(np.abs(speed) / self._slowdown[index]) if len(index) else 0.0
+        self.lag_s = 0.0
         if not lasts > 0.0 or not np.isfinite(lasts):
             self.phase = Phase.IDLE
             return
-        self.phase, self.lag_s, self._lasts_s = Phase.ENDING, 0.0, float(lasts)
-        self._end_s, self._end_out, self._end_speed = output.out_s, output.out[index].copy(), speed
+        self.phase, self._lasts_s, self._slowed_s = Phase.ENDING, float(lasts), 0.0
+        self._end_out, self._end_speed = output.out[index].copy(), speed
 
     def tail(self, now_s: float) -> JointCommand | None:
         """What must go out now without a message; None when nothing must."""
@@ -247,9 +254,15 @@ class TargetStream:
             return self._message(command, self._advance(now_s))
         return None
 
-    def _slowed(self, command: JointCommand, now_s: float) -> JointCommand:
+    def _slowed(self, command: JointCommand, now_s: float) -> JointCommand | None:
+        """The slow-down, as far as it is by the time since the last output; at most two periods."""
         output, index = self._output, self._index
-        t = min(now_s - self._end_s, self._lasts_s)
+        elapsed = max(now_s - output.out_s, 0.0)
+        if elapsed > self._gap_s():  # it was held up itself: the robot stands
+            self.phase = Phase.IDLE
+            return None
+        self._slowed_s = min(self._slowed_s + min(elapsed, self._longest_s()), self._lasts_s)
+        t = self._slowed_s
         place = self._end_out + self._end_speed * (t - 0.5 * t * t / self._lasts_s)
         place = np.clip(place, self._arm.lower[index], self._arm.upper[index])
         output.taught[index] += place - output.out[index]
