@@ -431,8 +431,9 @@ class JointCorrectionNode(HouseNode):
                 self._proxy.end("stopped")
 
     def _arm_tail(self) -> None:
-        """Look after a period of the stream whether something goes out without a message."""
+        """Put out what must go out without a message, now and after each period of the stream."""
         if not self._shadow:
+            self._emit_tail()
             self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
             self._tail_timer.reset()
 

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
-HELD_PERIODS = 2.5  # without an output the controller has held the last one, and the robot stands
+HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
 RESUME_S = 1.0  # after a longer silence a stream is over
 INTERVALS = 7  # whose median is the period
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
@@ -66,7 +66,7 @@ class TargetStream:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
-        self._step_s = 0.0  # of the last output
+        self._step_s = 0.0  # time that the last output used
         self._before = np.full(arm.n, np.nan)  # what was put out before it
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
@@ -90,10 +90,14 @@ class TargetStream:
         period = self.period_s
         return max(self._config.stream_gap_s, 2.0 * period if period > 0.0 else 0.0)
 
-    def _longest_s(self) -> float:
-        """Time that a step may use of what has passed: no more goes out at once after a silence."""
+    def _step_period_s(self) -> float:
+        """The period, or what stands for it before two messages have come."""
         period = self.period_s
-        return 2.0 * period if period > 0.0 else LONGEST_STEP_S
+        return period if period > 0.0 else LONGEST_STEP_S
+
+    def _holds(self, elapsed_s: float) -> bool:
+        """Whether the robot stands, as nothing went out for so long: the controller holds."""
+        return elapsed_s > HELD_PERIODS * self._step_period_s()
 
     # ---- targets --------------------------------------------------------------------------------
 
@@ -171,7 +175,8 @@ class TargetStream:
         """Put out what came in last, or as much of the way there as the speeds allow."""
         output = self._output
         elapsed = max(now_s - output.out_s, 0.0)
-        longest = min(elapsed, self._longest_s())
+        # one that stands makes no longer step than one that moves
+        longest = min(elapsed, self._step_period_s()) if self._holds(elapsed) else elapsed
         self._before[:] = output.out
         q, fraction = self._goal, 1.0
         for _ in range(TRIES):
@@ -194,7 +199,7 @@ class TargetStream:
             q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
         else:
             output.limiter.state[OFFSET_RATE] = 0.0
-        self._step_s, output.out_s = elapsed, now_s
+        self._step_s, output.out_s = longest, now_s
         output.stage = self._desired.stage if self._desired.made else None
         self.lag_s = 0.0
         if fraction < 1.0:
@@ -241,19 +246,19 @@ class TargetStream:
     def end(self, why: RefusedError, now_s: float) -> None:
         """End it: the robot is slowed down from where and as fast as it was sent last.
 
-        After a silence of more than `HELD_PERIODS` the controller has held the last target since:
-        the robot stands, and nothing more goes out, which would set it in motion again.
+        After a silence the controller has held the last target since: the robot stands, and
+        nothing more goes out, which would set it in motion again.
         """
         if self.phase is not Phase.RUNNING:
             return
         output, index, self._why = self._output, self._index, why
-        period, speed = self.period_s, np.zeros(len(index))
-        if self._step_s > 0.0 and now_s - output.out_s <= HELD_PERIODS * period:
+        speed = np.zeros(len(index))
+        if self._step_s > 0.0 and not self._holds(now_s - output.out_s):
             # a message that came early is no faster motion
-            speed = (output.out - self._before)[index] / max(self._step_s, period)
-        lasts = np.max(np.abs(speed) / self._slowdown[index]) if len(index) else 0.0
+            speed = (output.out - self._before)[index] / max(self._step_s, self._step_period_s())
+        lasts = np.max(np.abs(speed) / self._slowdown[index], initial=0.0)
         self.lag_s = 0.0
-        if not lasts > 0.0 or not np.isfinite(lasts):
+        if not 0.0 < lasts < np.inf:
             self.phase = Phase.IDLE
             return
         self.phase, self._lasts_s, self._slowed_s = Phase.ENDING, float(lasts), 0.0
@@ -265,7 +270,7 @@ class TargetStream:
             return None
         if self.phase is Phase.ENDING:
             return self._slowed(self._command, now_s)
-        late = now_s - self._came_s > 1.5 * self._longest_s() / 2.0
+        late = now_s - self._came_s > 1.5 * self._step_period_s()
         if self.phase is Phase.RUNNING and self.lag_s > 0.0 and late:
             command = replace(self._command, position=self._goal[self._index], velocity=None)
             self._advance(now_s)
@@ -273,13 +278,13 @@ class TargetStream:
         return None
 
     def _slowed(self, command: JointCommand, now_s: float) -> JointCommand | None:
-        """The slow-down, as far as it is by the time since the last output; at most two periods."""
+        """The slow-down, as far as it is by the time since the last output."""
         output, index = self._output, self._index
         elapsed = max(now_s - output.out_s, 0.0)
-        if elapsed > self._gap_s():  # it was held up itself: the robot stands
+        if self._holds(elapsed):  # it was held up itself
             self.phase = Phase.IDLE
             return None
-        self._slowed_s = min(self._slowed_s + min(elapsed, self._longest_s()), self._lasts_s)
+        self._slowed_s = min(self._slowed_s + elapsed, self._lasts_s)
         t = self._slowed_s
         place = self._end_out + self._end_speed * (t - 0.5 * t * t / self._lasts_s)
         place = np.clip(place, self._arm.lower[index], self._arm.upper[index])
