@@ -72,6 +72,7 @@ def test_it_tells_what_it_would_do(shadow: Line) -> None:
     assert distance(actual, HOME) > 1e-4
     # the offset holds where the robot is, which it did not move: second order
     assert distance(actual, HOME + offset) < 1e-7
+    shadow.graph.spin_until(lambda: shadow.statuses[-1].tool_shift_mm > 0.0, "a status of it")
     told = shadow.told(state=CorrectionStatus.ON)
     assert told.shadow
     assert told.reason.startswith("shadow, nothing is changed")
@@ -135,7 +136,9 @@ def test_its_own_output_is_not_passed_round(graph: Any) -> None:
 
 def test_as_a_process_it_passes_a_stream_on(graph: Any) -> None:
     process = graph.start("joint_correction_node", {"shadow": "true", "enable_on_start": "true"})
-    assert graph.call(SetBool, f"{NODE}/enable", data=True).success
+    answer = graph.call(SetBool, f"{NODE}/enable", data=True)
+    assert not answer.success  # nothing is corrected
+    assert answer.message.startswith("shadow, nothing is changed")
     outputs = graph.collect(JointState, f"{NODE}/joint_targets")
     target = graph.publisher(JointState, "joint_targets")
     sent: list[JointState] = []
