@@ -1,7 +1,6 @@
 """What is known of the robot: its joints by name, where it was read, where its controller is."""
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,10 +177,3 @@ def _require_single(names: tuple[str, ...]) -> None:
     if len(set(names)) != len(names):
         doubled = next(name for name in names if names.count(name) > 1)
         raise RefusedError(Reason.DOUBLED_JOINT, doubled)
-
-
-def finite_velocity(state: JointCommand) -> JointCommand:
-    """Readings without velocities of which one is not finite: drivers that have none say NaN."""
-    if state.velocity is None or np.isfinite(state.velocity).all():
-        return state
-    return replace(state, velocity=None)

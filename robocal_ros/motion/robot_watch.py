@@ -26,7 +26,6 @@ FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 APART_S = 0.00375  # instants of the plan that a reading is compared with
 TOLD_S = 1.0  # a speed scaling that was not said again for so long is not known
 REFERENCE_S = 0.1  # a controller's place that is older is none
-ALIKE = 0.01  # of the allowed deviation: two places that differ by less are as near
 JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
 UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
 PAUSED_S = 15.0  # a robot that stands on its path is waited for so long where no scaling is known
