@@ -67,7 +67,7 @@ class TargetStream:
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
         self._step_s = 0.0  # time that the last output used
-        self._before = np.full(arm.n, np.nan)  # what was put out before it
+        self._before, self._spare = np.full((2, arm.n), np.nan)  # what was put out before it
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
         self._lasts_s, self._slowed_s = 0.0, 0.0
@@ -99,6 +99,11 @@ class TargetStream:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
         return elapsed_s > HELD_PERIODS * self._step_period_s()
 
+    def _usable_s(self, now_s: float) -> float:
+        """Time that the next output may use: a robot that stands makes no longer step."""
+        elapsed = max(now_s - self._output.out_s, 0.0)
+        return min(elapsed, self._step_period_s()) if self._holds(elapsed) else elapsed
+
     # ---- targets --------------------------------------------------------------------------------
 
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
@@ -125,18 +130,24 @@ class TargetStream:
             self._intervals.append(interval)
         if index is not self._index or self.phase is Phase.IDLE:
             self._choose(index, q, now_s)
+        self._require_near(q, now_s)
         self._last[:], self._interval_s = self._goal, interval
         self._goal[:] = q
         self._output.path = None
         self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
         self._advance(now_s)
-        if self.lag_s > CATCH_UP_S:
+        return self._message(command)
+
+    def _require_near(self, q: Array, now_s: float) -> None:
+        """Refuse a target that the joints do not come near: none of the way there goes out."""
+        ahead_s = np.max(np.abs(q - self._output.taught) * self._active / self._fastest)
+        ahead_s -= self._usable_s(now_s)
+        if ahead_s > CATCH_UP_S:
             raise RefusedError(
                 Reason.VELOCITY_LIMIT,
-                f"the stream is {self.lag_s:.3f} s ahead at the joints' speeds, allowed "
+                f"the stream is {ahead_s:.3f} s ahead at the joints' speeds, allowed "
                 f"{CATCH_UP_S:g} s",
             )
-        return self._message(command)
 
     def _choose(self, index: Index, q: Array, now_s: float) -> None:
         """Other joints than before go out from now on; those that are new begin."""
@@ -174,10 +185,8 @@ class TargetStream:
     def _advance(self, now_s: float) -> None:
         """Put out what came in last, or as much of the way there as the speeds allow."""
         output = self._output
-        elapsed = max(now_s - output.out_s, 0.0)
-        # one that stands makes no longer step than one that moves
-        longest = min(elapsed, self._step_period_s()) if self._holds(elapsed) else elapsed
-        self._before[:] = output.out
+        elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
+        self._spare[:] = output.out
         q, fraction = self._goal, 1.0
         for _ in range(TRIES):
             desired = self._desired.at_one(q)
@@ -199,6 +208,7 @@ class TargetStream:
             q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
         else:
             output.limiter.state[OFFSET_RATE] = 0.0
+        self._before, self._spare = self._spare, self._before
         self._step_s, output.out_s = longest, now_s
         output.stage = self._desired.stage if self._desired.made else None
         self.lag_s = 0.0

@@ -264,9 +264,21 @@ def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
     assert robot.session.tail(robot.now + DT) is None  # it stands already
 
 
+BEGIN = np.where(np.arange(6) == 3, NOMINAL.upper - 1e-4, HOME)
+SLOWEST = LIMITS["acceleration_limits"][0]
+BAD = {
+    Reason.NOT_FINITE: np.full(6, np.nan),
+    Reason.JOINT_LIMIT: np.where(np.arange(6) == 3, NOMINAL.upper + 1e-4, HOME + 0.1 * np.eye(6)[0]),
+    Reason.VELOCITY_LIMIT: HOME - 1.0,
+    Reason.DEGREES: np.degrees(HOME),
+}
+
+
 def under_way(speed: float = np.radians(60.0)) -> tuple[Robot, np.ndarray]:
     """A stream at a constant speed of joint 1, and its last target."""
-    robot, q = Robot(), HOME.copy()
+    robot, q = Robot(rested=False), BEGIN.copy()
+    robot.at = q.copy()
+    robot.rest()
     robot.stream(q)
     for _ in range(50):
         q[0] += speed * DT
@@ -274,13 +286,10 @@ def under_way(speed: float = np.radians(60.0)) -> tuple[Robot, np.ndarray]:
     return robot, q
 
 
-SLOWEST = LIMITS["acceleration_limits"][0]
-
-
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 1000), st.floats(0.05, 0.95), st.booleans())
+@given(st.integers(0, 1000), st.floats(0.05, 0.95), st.booleans(), st.sampled_from([*BAD]))
 def test_a_refusal_in_motion_slows_the_robot_down(
-    seed: int, jitter: float, repeated: bool
+    seed: int, jitter: float, repeated: bool, why: Reason
 ) -> None:
     """Over the time that really passes, as evenly as the joint may, from its last speed to rest.
 
@@ -290,7 +299,7 @@ def test_a_refusal_in_motion_slows_the_robot_down(
     speed = np.radians(60.0)
     robot, q = under_way(speed)
     sent_s, begin = robot.now, robot.at[0]
-    refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan), dt=periods[0] * DT)
+    refused(why, robot.stream, BAD[why], dt=periods[0] * DT)
     for dt in periods[1:].tolist():
         if (command := robot.session.tail(robot.now)) is None:
             break
@@ -299,7 +308,8 @@ def test_a_refusal_in_motion_slows_the_robot_down(
         way = speed * t - 0.5 * SLOWEST * t * t
         assert np.isclose(robot.at[0] - begin, way, rtol=0.0, atol=1e-9)
         if repeated:
-            refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan), dt=dt * DT)
+            with np.testing.assert_raises(RefusedError):
+                robot.stream(BAD[why], dt=dt * DT)
         else:
             robot.now += dt * DT
     else:
@@ -307,6 +317,15 @@ def test_a_refusal_in_motion_slows_the_robot_down(
     assert np.isclose(robot.at[0] - begin, speed**2 / (2.0 * SLOWEST), rtol=0.0, atol=1e-9)
     q[0] += speed * DT
     refused(Reason.START_MISMATCH, robot.stream, q, dt=0.5)
+
+
+def test_a_target_that_is_refused_moves_nothing_that_stands() -> None:
+    for why, q in BAD.items():
+        robot, _ = under_way(speed=0.0)
+        refused(why, robot.stream, q)
+        for _ in range(10):
+            assert robot.session.tail(robot.now) is None
+            robot.now += DT
 
 
 @settings(max_examples=30, deadline=None)
