@@ -268,7 +268,9 @@ BEGIN = np.where(np.arange(6) == 3, NOMINAL.upper - 1e-4, HOME)
 SLOWEST = LIMITS["acceleration_limits"][0]
 BAD = {
     Reason.NOT_FINITE: np.full(6, np.nan),
-    Reason.JOINT_LIMIT: np.where(np.arange(6) == 3, NOMINAL.upper + 1e-4, HOME + 0.1 * np.eye(6)[0]),
+    Reason.JOINT_LIMIT: np.where(
+        np.arange(6) == 3, NOMINAL.upper + 1e-4, HOME + 0.1 * np.eye(6)[0]
+    ),
     Reason.VELOCITY_LIMIT: HOME - 1.0,
     Reason.DEGREES: np.degrees(HOME),
 }
