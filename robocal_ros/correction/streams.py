@@ -130,24 +130,12 @@ class TargetStream:
             self._intervals.append(interval)
         if index is not self._index or self.phase is Phase.IDLE:
             self._choose(index, q, now_s)
-        self._require_near(q, now_s)
         self._last[:], self._interval_s = self._goal, interval
         self._goal[:] = q
         self._output.path = None
         self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
         self._advance(now_s)
         return self._message(command)
-
-    def _require_near(self, q: Array, now_s: float) -> None:
-        """Refuse a target that the joints do not come near: none of the way there goes out."""
-        ahead_s = np.max(np.abs(q - self._output.taught) * self._active / self._fastest)
-        ahead_s -= self._usable_s(now_s)
-        if ahead_s > CATCH_UP_S:
-            raise RefusedError(
-                Reason.VELOCITY_LIMIT,
-                f"the stream is {ahead_s:.3f} s ahead at the joints' speeds, allowed "
-                f"{CATCH_UP_S:g} s",
-            )
 
     def _choose(self, index: Index, q: Array, now_s: float) -> None:
         """Other joints than before go out from now on; those that are new begin."""
@@ -203,6 +191,8 @@ class TargetStream:
                 require_limits(tried[None], self._arm)
             if share <= 1.0 + ROUNDING:
                 break
+            if fraction == 1.0:
+                self._require_near(longest)
             fraction *= 0.999 / share
             way = (self._goal - output.taught) * self._active
             q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
@@ -215,6 +205,17 @@ class TargetStream:
         if fraction < 1.0:
             ahead = np.abs(self._goal - output.taught) * self._active / self._fastest
             self.lag_s = float(np.max(ahead))
+
+    def _require_near(self, longest_s: float) -> None:
+        """Refuse a target that the joints do not come near: none of the way there goes out."""
+        ahead = np.abs(self._goal - self._output.taught) * self._active / self._fastest
+        ahead_s = float(np.max(ahead)) - longest_s
+        if ahead_s > CATCH_UP_S:
+            raise RefusedError(
+                Reason.VELOCITY_LIMIT,
+                f"the stream is {ahead_s:.3f} s ahead at the joints' speeds, allowed "
+                f"{CATCH_UP_S:g} s",
+            )
 
     def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""

@@ -1,4 +1,4 @@
-"""What the controller tells the joint correction node, and what the node tells of time. Over DDS."""
+"""What the controller tells the joint correction node, and what that tells of time. Over DDS."""
 
 import time
 from collections.abc import Callable
