@@ -113,7 +113,10 @@ class JointMessage:
         return joint_command(self._message) if self._is_reading else finite_command(self._message)
 
     def unchanged(self) -> Any:
-        """What came, to publish."""
+        """What came, to publish; of a reading without what its driver does not know."""
+        if self._message is None and not self._wire.is_finite:
+            self._message = read_message(self._data, JointState)
+            self._drop_unknown(self._message)
         return self._data if self._message is None else self._message
 
     def changed(self, command: JointCommand) -> Any:

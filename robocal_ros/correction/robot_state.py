@@ -48,7 +48,7 @@ class RobotState:
         self.measured = np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
-        self._reference, self._reference_s = np.full(arm.n, np.nan), -np.inf
+        self._reference, self._reference_s = np.full(arm.n, np.nan), np.full(arm.n, -np.inf)
         self.scaling = 1.0
 
     # ---- joints by name -------------------------------------------------------------------------
@@ -131,15 +131,14 @@ class RobotState:
         self, index: Index, reference: Array, scaling: float | None, now_s: float
     ) -> None:
         """Where the controller is: its reference (k,); ``scaling``: how fast its clock runs."""
-        self._reference[index], self._reference_s = reference, now_s
+        self._reference[index], self._reference_s[index] = reference, now_s
         if scaling is not None:
             self.scaling = float(np.clip(scaling, 0.0, 1.0))
 
     def reference(self, index: Index, now_s: float) -> Array | None:
         """The controller's own place (k,), where it is known and fresh."""
-        found = self._reference[index]
-        fresh = now_s - self._reference_s <= REFERENCE_AGE_S
-        return found if fresh and bool(np.isfinite(found).all()) else None
+        fresh = np.all(now_s - self._reference_s[index] <= REFERENCE_AGE_S)
+        return self._reference[index] if fresh else None
 
     def require_fresh(self, index: Index, now_s: float) -> None:
         """Refuse while one of these joints has not been read, or not lately."""
