@@ -30,8 +30,9 @@ RATE_HZ = 500
 CHANGE_S = 10.0  # between two models
 SETTLED_S = 4.0  # after this a model is in force: twice 0.3 deg at 2 deg/s, and stalls
 STALL_S = 0.02  # the probe sees outputs so much closer together than they went out
-# A longer silence is a stall, which is caught up with for a while: what lags is no correction.
-SILENCE_S, LAGS_S = 2.0 / RATE_HZ, 2.0
+# A longer silence is a stall, which is caught up with in 20 times as long (5 % faster than the
+# stream), and some more: what lags is no correction.
+SILENCE_S, LAGS = 2.0 / RATE_HZ, 25.0
 LARGEST_M = 0.5e-3
 WARM = 2  # models until caches are full
 MOST_GROWTH_MB = 5.0
@@ -65,7 +66,7 @@ class Watch:
         """Judge one target that came back."""
         now_s, shift = time.monotonic(), corrected - taught
         if self._last is not None and now_s - self._last[0] > SILENCE_S:
-            self._clear_s = now_s + LAGS_S
+            self._clear_s = max(self._clear_s, now_s + LAGS * (now_s - self._last[0]))
         if now_s < self._clear_s:
             self._last = now_s, shift
             return
