@@ -90,10 +90,6 @@ def in_tables(found: dict[str, Any]) -> Sequence[Table]:
             ratio = node[figure] / relay[figure]
             goal = Goal(ratio, MOST[figure])
             beside.add(rate, words, relay[figure], node[figure], ratio, goal)
-        lost = sum(
-            r["lost"] for r in found["streams"] if r["rate_hz"] == rate and r["through"] == NODE
-        )
-        beside.add(rate, "messages lost", None, lost, None, Goal(lost, 0))
     paths = Table(
         "correction_path",
         f"A whole trajectory of {POINTS} points, there and back",

@@ -297,17 +297,17 @@ class JointCorrectionNode(HouseNode):
         def receive(came: Any) -> None:
             message, now = read(came), time.monotonic()
             if guard.fault:
-                self._refuse_input(topic, Reason.OWN_OUTPUT, guard.fault, now)
+                self._refuse_message(topic, Reason.OWN_OUTPUT, guard.fault, now)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
             rivals = senders.hear(topic, now) if senders else ""
             if rivals:
-                self._refuse_input(topic, Reason.TWO_SOURCES, rivals, now)
+                self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message)
 
         return receive
 
-    def _refuse_input(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
+    def _refuse_message(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
         """Refuse a message; a stream that it is of is ended in order."""
         if topic in (TARGETS, COMMANDS):
             self._session.end_stream(RefusedError(reason, detail), now_s)
@@ -320,7 +320,7 @@ class JointCorrectionNode(HouseNode):
         try:
             command = message.command()
         except RefusedError as error:
-            self._refuse_input(topic, error.reason, error.detail, now)
+            self._refuse_message(topic, error.reason, error.detail, now)
         try:
             self._put_out(topic, message, command, self._session.target(command, now))
         finally:

@@ -24,7 +24,12 @@ Index = NDArray[np.int64]
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
 RESUME_S = 1.0  # after a longer silence a stream is over
-INTERVALS = 7  # whose median is the period
+INTERVALS = 15  # whose median is the period
+# How fast what was held up is caught up with: at so much more than the stream's own speed, but at
+# no less than this share of the joints' speeds, which counts where the stream stands.
+CATCH_UP, LEAST = 1.05, 0.1
+SPEED_S = 0.2  # in which the stream's own speed is looked at
+LATE = 0.8  # of `CATCH_UP_S`: one that lags more catches up at the joints' speeds
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
 
 
@@ -42,6 +47,7 @@ class TargetStream:
     Attributes
     ----------
     phase : what it does.
+    period_s : of its messages; NaN before two have come.
     lag_s : how long the fastest joint needs from what was put out to what came in.
     """
 
@@ -64,8 +70,12 @@ class TargetStream:
         self._interval_s = 0.0
         self._came_s = -np.inf
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
+        self.period_s = np.nan
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
+        self._held_up = False  # and lags since
+        self._credit_s = 0.0  # time that one that is held up has not used
+        self._way: deque[tuple[float, Array]] = deque()  # targets of the last `SPEED_S`
         self._step_s = 0.0  # time that the last output used
         self._before, self._spare = np.full((2, arm.n), np.nan)  # what was put out before it
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
@@ -73,11 +83,6 @@ class TargetStream:
         self._lasts_s, self._slowed_s = 0.0, 0.0
 
     # ---- time -----------------------------------------------------------------------------------
-
-    @property
-    def period_s(self) -> float:
-        """Of its messages; NaN before two have come."""
-        return median(self._intervals) if self._intervals else float("nan")
 
     def runs(self, now_s: float) -> bool:
         """Whether it is under way."""
@@ -125,13 +130,16 @@ class TargetStream:
         if self.phase is Phase.IDLE:
             self._active[:] = 0.0
             self._intervals.clear()
-            interval = 0.0
+            self._way.clear()
+            self.period_s, interval = np.nan, 0.0
         if interval > 0.0:
             self._intervals.append(interval)
+            self.period_s = median(self._intervals)
         if index is not self._index or self.phase is Phase.IDLE:
             self._choose(index, q, now_s)
         self._last[:], self._interval_s = self._goal, interval
         self._goal[:] = q
+        self._note_way(q, now_s)
         self._output.path = None
         self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
         self._advance(now_s)
@@ -175,6 +183,10 @@ class TargetStream:
         output = self._output
         elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
         self._spare[:] = output.out
+        limits = self._limits
+        self._held_up = longest < elapsed or (self._held_up and self.lag_s > 0.0)
+        if self._held_up and self.lag_s < LATE * CATCH_UP_S:
+            limits = self._catching_up(elapsed, longest), *limits[1:]
         q, fraction = self._goal, 1.0
         for _ in range(TRIES):
             desired = self._desired.at_one(q)
@@ -184,7 +196,7 @@ class TargetStream:
                 elapsed,
                 longest,
                 self._active,
-                self._limits,
+                limits,
                 (output.taught, output.out),
             )
             if share < 0.0:
@@ -205,6 +217,31 @@ class TargetStream:
         if fraction < 1.0:
             ahead = np.abs(self._goal - output.taught) * self._active / self._fastest
             self.lag_s = float(np.max(ahead))
+
+    def _note_way(self, q: Array, now_s: float) -> None:
+        """Keep a target; of several in a burst the last one, at the time of the first."""
+        way = self._way
+        if way and now_s - way[-1][0] < 0.5 * self._step_period_s():
+            way[-1] = way[-1][0], q
+        else:
+            way.append((now_s, q))
+        while len(way) > 2 and way[1][0] <= now_s - SPEED_S:
+            way.popleft()
+
+    def _catching_up(self, elapsed_s: float, longest_s: float) -> Array:
+        """Speeds (n,) of a step, so that what a controller's cycle adds up is no burst.
+
+        Messages that were late or early share their time, but none uses more than a period.
+        """
+        (begin_s, begin), (end_s, end) = self._way[0], self._way[-1]
+        speed = np.abs(end - begin) / (end_s - begin_s) if end_s > begin_s else 0.0 * end
+        period = self._step_period_s()
+        credit = longest_s if longest_s < elapsed_s else self._credit_s + elapsed_s
+        usable = min(credit, period)
+        self._credit_s = min(credit, 1.5 * period) - usable
+        speed = np.maximum(CATCH_UP * speed, LEAST * self._fastest)
+        share = usable / longest_s if longest_s > 0.0 else 0.0
+        return np.minimum(speed * share, self._fastest)
 
     def _require_near(self, longest_s: float) -> None:
         """Refuse a target that the joints do not come near: none of the way there goes out."""
@@ -284,6 +321,7 @@ class TargetStream:
         late = now_s - self._came_s > 1.5 * self._step_period_s()
         if self.phase is Phase.RUNNING and self.lag_s > 0.0 and late:
             command = replace(self._command, position=self._goal[self._index], velocity=None)
+            self._note_way(self._goal.copy(), now_s)
             self._advance(now_s)
             return self._message(command)
         return None

@@ -233,20 +233,22 @@ def test_at_rest_the_offset_comes_in_as_fast_as_it_may_and_no_faster() -> None:
 
 
 def test_a_stall_is_not_made_up_for_in_a_burst() -> None:
-    """Only the newest of what waited is heard; no step is longer than the speeds in a period."""
-    speed, most = np.radians(60.0), LIMITS["velocity_limits"][0] * DT + ROUNDING
+    """Only the newest of what waited is heard; no step is much longer than the stream's own."""
+    speed = np.radians(60.0)
     robot, q = under_way(speed)
     for stall in (0.05, 0.06):
         q[0] += speed * stall
         before = robot.at[0]
         robot.stream(q, dt=stall)
-        assert 0.0 < robot.at[0] - before <= most
-        for _ in range(60):
+        assert 0.0 < robot.at[0] - before <= 1.06 * speed * DT
+        steps = 0
+        while robot.at[0] != q[0]:
             q[0] += speed * DT
-            before = robot.at[0]
+            before, steps = robot.at[0], steps + 1
             robot.stream(q)
-            assert robot.at[0] - before <= most
-        assert robot.at[0] == q[0]
+            assert robot.at[0] - before <= 1.06 * speed * DT
+        assert steps * DT < 1.3
+        assert robot.session.status().lag_s == 0.0
 
 
 def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
@@ -389,15 +391,16 @@ def test_jitter_moves_nothing_faster() -> None:
     q = HOME - speed * 0.4
     robot.at = q.copy()
     robot.rest()
+    late = DT * rng.uniform(-0.35, 0.35, 401)  # of the instant at which each is due
     for i in range(400):
         ramp = min(i * DT / 0.3, 1.0)
         q = q + speed * DT * ramp
         t += DT
         if np.any(q > NOMINAL.upper - 0.05):
             break
-        robot.stream(q, dt=float(DT * rng.uniform(0.3, 1.7)))
+        robot.stream(q, dt=float(DT + late[i + 1] - late[i]))
         watch.out(NAMES, robot.at)
-        assert robot.session.status().lag_s <= 5.0 * DT  # early messages in a row
+        assert robot.session.status().lag_s <= 2.0 * DT
 
 
 def test_a_last_message_that_came_late_is_still_reached() -> None:
@@ -410,7 +413,7 @@ def test_a_last_message_that_came_late_is_still_reached() -> None:
     q[0] += speed * 0.06
     robot.stream(q, dt=0.06)
     assert robot.session.status().lag_s > 0.0
-    for _ in range(50):
+    for _ in range(100):
         robot.now += DT
         if (command := robot.session.tail(robot.now)) is not None:
             robot.go(command)
