@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import solution, straight
-from robocal_ros.correction.joint_correction import JointCorrection, pack_model
+from robocal_ros.correction.joint_correction import RATE_STEP_S, JointCorrection, pack_model
 from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.rates import rates_batch
 from robocal_ros.correction.solution import MOST_OVER, REPORT
-from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.correction.staged import EXACT, StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
@@ -342,7 +342,7 @@ def crossings(name: str, count: int, seed: int = 0) -> Iterator[Crossing]:
     described, rng = load_robot(name), np.random.default_rng(seed)
     while count:
         turn, place = frames.exp_rotation(rng.uniform(-1.0, 1.0, 3)), rng.uniform(-0.15, 0.15, 3)
-        tool = frames.transform(turn, place + [0.0, 0.0, 0.2])
+        tool = frames.transform(turn, place + 0.2 * np.eye(3)[2])
         reference = replace(described, T_flange_tool=tool)
         actual = drifted(reference, rng, 10.0 ** rng.uniform(np.log10(4e-6), np.log10(1.2e-4)))
         way, middle = rng.uniform(-1.0, 1.0, 6), rng.uniform(-2.0, 2.0, 6)
@@ -392,8 +392,11 @@ def test_rates_are_the_derivative_all_through_a_crossing() -> None:
         rate = (8.0 * (ahead - behind) - (on - off)) / (12.0 * h)
         bend = (16.0 * (ahead + behind) - (on + off) - 30.0 * (result.q - q)) / (12.0 * h**2)
         some += result.weak.any() and not result.weak.all()
-        assert np.abs(v - qd - rate).max() <= 1e-4 * np.abs(rate).max()
-        assert np.abs(a - bend).max() <= 1e-3 * np.abs(bend).max()
+        # the least drift's zone is crossed in some 15 ms: (0.2 ms / 15 ms)^2 in a rate's third
+        # derivative, and its square root where the damping ends, in an acceleration's
+        assert np.abs(v - qd - rate).max() <= 1e-3 * np.abs(rate).max()
+        rounding = 4.0 * EXACT / RATE_STEP_S**2
+        assert np.abs(a - bend).max() <= 2e-2 * np.abs(bend).max() + rounding
     assert some > 5
 
 
