@@ -44,7 +44,7 @@ SEED = 11
 START_NS = 1_790_000_000_000_000_000
 STATION = "north"
 RADIUS_M = 2.5e-3
-BENT = bent(TAUGHT, [0.003, -0.002, 0.001], [0.03, -0.02, 0.0])
+BENT = bent(TAUGHT, [0.003, -0.002, 0.001], [0.02, 0.03, 0.0])  # 100 mm above the tip
 INPUT = TrueInput(latency_s=0.004, sample_period_s=0.002)
 NOISE = TrueNoise(3e-5, 1e-5)
 JOINTS, EVENTS, TRUTH = "joint_states", "/tcf_node/session_events", "/truth/tool"

@@ -42,6 +42,7 @@ PARTS = {
     "correction_stream": "correction_stream",
     "closed_loop": "closed_loop.tables",
     "fault_checks": "closed_loop.checks",
+    "knocks": "closed_loop.knocks",
     "files": "files",
     "replay_speed": "replay_speed",
 }

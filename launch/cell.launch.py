@@ -26,6 +26,7 @@ NODES = (
 )
 CONTROLLER = "joint_trajectory_controller/joint_trajectory"
 ACTION = "joint_trajectory_controller/follow_joint_trajectory"
+STATE = "joint_trajectory_controller/controller_state"
 MOTIONS = {"follow_joint_trajectory": LaunchConfiguration("action")}
 
 
@@ -36,7 +37,9 @@ def in_share(*path):
 
 def cell_node(name, condition=None):
     """Describe a node with its own file, and where its topics lead."""
-    trajectories = "joint_trajectory" if name == "cell_sim_node" else "~/joint_trajectory"
+    simulated = name == "cell_sim_node"
+    trajectories = "joint_trajectory" if simulated else "~/joint_trajectory"
+    state = "~/controller_state" if simulated else "controller_state"
     return Node(
         package=PACKAGE,
         executable=name,
@@ -50,6 +53,7 @@ def cell_node(name, condition=None):
         remappings=[
             (trajectories, LaunchConfiguration("controller")),
             (CONTROLLER, LaunchConfiguration("controller")),  # as recorder_node knows it
+            (state, LaunchConfiguration("state")),
             ("kinematic_model", "thermal_node/model"),
             ("tool", "tcf_node/tool"),
         ],
@@ -67,6 +71,7 @@ def generate_launch_description():
             DeclareLaunchArgument("namespace", default_value=""),
             DeclareLaunchArgument("controller", default_value=CONTROLLER),
             DeclareLaunchArgument("action", default_value=ACTION),
+            DeclareLaunchArgument("state", default_value=STATE),
             DeclareLaunchArgument("simulated", default_value="false"),
             *(cell_node(name) for name in NODES),
             cell_node("cell_sim_node", simulated),

@@ -11,5 +11,6 @@ earlier      shifts at the pace of the cycles, and what they teach
 drift_bound  what the stated bound of the drift is made of
 faults       what each fault costs, and from which size on it is reported
 checks       the tool's check alone, with faults of many sizes
+knocks       what a knock of station, sensor or sphere costs, in many cells
 tables       all of it as the tables of the bench
 """

@@ -71,15 +71,24 @@ Sizes = Mapping[Fault, Sequence[float]]
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check said of a fault; ``before``: what it said without it, where it was asked."""
+    """What a check said of a fault.
+
+    Attributes
+    ----------
+    before : what it said without it, where it was asked.
+    in_doubt : a tool was measured, and whether it changed or the station is left to a person.
+    """
 
     trial: Trial
     code: Code
     before: Code = Code.NONE
+    in_doubt: bool = False
 
     @property
     def right(self) -> bool:
-        """Whether it is the code of this fault, which was not told before it."""
+        """Whether it is the code of this fault, or doubt, and was not told before it."""
+        if self.in_doubt and RIGHT[self.trial.fault] is Code.STATION_MOVED:
+            return True
         return self.code is RIGHT[self.trial.fault] and self.before is not self.code
 
 
@@ -96,7 +105,8 @@ def checked(seed: int, sizes: Sizes = SWEEP) -> Iterator[Checked]:
             for size in sizes.get(fault, (0.0,)):
                 cell.set_fault(fault, size)
                 said = plant.measure_tool(suite, mode, f"{fault} {size}")
-                yield Checked(Trial(fault, size, seed), said.status, before.status)
+                doubt = (said.document or {}).get("witness", {}).get("cause") == "doubt"
+                yield Checked(Trial(fault, size, seed), said.status, before.status, doubt)
                 cell.set_fault("none")
                 plant.listen(plant.now_s + SETTLES_S)
                 plant.home_from_station(suite)
@@ -130,7 +140,8 @@ def power_table(found: Sequence[Checked]) -> Table:
         ("fault", "right code", "size: right of all", "smallest with 90 %", "told below it",
          "at the usual size at least, %", "goal"),
         "Simulated: the commissioned cell, the fault, one quick check of the tool; a full "
-        "measurement where the station was knocked; for what else was knocked or moved a thermal "
+        "measurement where the station was knocked, which is right too where it leaves to a person "
+        "whether the tool changed or the station; for what else was knocked or moved a thermal "
         "cycle. A measurement without it comes before; right is only "
         "who does not tell the same in that. The smallest size from which on a power of 90 % is "
         "proven, as "

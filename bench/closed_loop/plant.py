@@ -111,8 +111,8 @@ class Plant:
 
     # ---- time -----------------------------------------------------------------------------------
 
-    def send(self, plan: JointPlan) -> None:
-        """Let the robot follow a plan at once; a point at 0 would make it jump there."""
+    def send(self, plan: JointPlan, stop: bool = False) -> None:
+        """Follow a plan, or a stop, at once; a point at 0 would make the robot jump there."""
         self.cell.follow(self.now_s + plan.time_s[1:], plan.q[1:], plan.qd[1:])
 
     def step(self, step_s: float = STEP_S) -> None:

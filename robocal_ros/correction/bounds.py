@@ -182,18 +182,6 @@ def require_limits(q: Array, arm: SerialArm) -> None:
         )
 
 
-def require_speeds(velocity: Array, limits: Array, arm: SerialArm) -> None:
-    """Refuse velocities (m, n) beyond their limits (n,), rad/s (prismatic: m/s)."""
-    within = np.abs(velocity) <= limits * (1.0 + ROUNDING)
-    if not within.all():
-        point, joint = np.argwhere(~within)[0]
-        raise RefusedError(
-            Reason.VELOCITY_LIMIT,
-            f"{arm.joint_names[joint]} would move at {velocity[point, joint]:.6f}, allowed "
-            f"{limits[joint]:.6f} (point {point + 1})",
-        )
-
-
 def _require(fine: NDArray[np.bool_], reason: Reason, detail: str) -> None:
     if not fine.all():
         raise RefusedError(reason, f"{detail} (point {int(np.argmin(fine)) + 1})")

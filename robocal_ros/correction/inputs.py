@@ -132,7 +132,7 @@ def finite_command(message: Any) -> JointCommand:
 
 def _require_finite(values: Any, what: str) -> None:
     if not np.all(np.isfinite(values)):
-        raise RefusedError(Reason.NOT_FINITE, f"{what}: {list(values)}")
+        raise RefusedError(Reason.NOT_FINITE, f"{what}: {np.asarray(values).tolist()}")
 
 
 def require_finite(names: tuple[str, ...], values: Array | None) -> None:

@@ -26,6 +26,7 @@ from robocal_ros.correction.inputs import (
     TrajectoryCommand,
     finite_command,
     joint_command,
+    require_few,
     require_finite,
     trajectory_command,
 )
@@ -112,7 +113,10 @@ class JointMessage:
         return joint_command(self._message) if self._is_reading else finite_command(self._message)
 
     def unchanged(self) -> Any:
-        """What came, to publish."""
+        """What came, to publish; of a reading without what its driver does not know."""
+        if self._message is None and not self._wire.is_finite:
+            self._message = read_message(self._data, JointState)
+            self._drop_unknown(self._message)
         return self._data if self._message is None else self._message
 
     def changed(self, command: JointCommand) -> Any:
@@ -183,7 +187,9 @@ class PathMessage:
 
     def __init__(self, came: bytes | JointTrajectory) -> None:
         self._came = came
-        self._path: SerializedPath | None = read_path(came) if isinstance(came, bytes) else None
+        self._path: SerializedPath | None = None
+        if isinstance(came, bytes):
+            self._path = read_path(came, require_few)
         self._read: Any = None
         self.points = len(self._message().points) if self._path is None else len(self._path)
 

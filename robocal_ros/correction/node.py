@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
@@ -196,9 +196,14 @@ class JointCorrectionNode(HouseNode):
         self._release.append(self._graph.close)
 
     def activate(self) -> None:
-        """Look who else is there, and tell at once what is done."""
+        """Look who else is there, and tell at once what is done.
+
+        Also in the log: the first line of a process takes rclpy some 50 ms, which a refusal in
+        motion has not.
+        """
         self._look_at_graph()
         self._tell()
+        self.get_logger().info(in_words(self._session.status(time.monotonic())))
 
     def deactivate(self) -> None:
         """Bring the robot to rest, for half a second at most; goals under way are stopped."""
@@ -290,23 +295,33 @@ class JointCorrectionNode(HouseNode):
         senders = self._senders.get(topic)
 
         def receive(came: Any) -> None:
-            message = read(came)
+            message, now = read(came), time.monotonic()
             if guard.fault:
-                self._session.refuse(Reason.OWN_OUTPUT, guard.fault)
+                self._refuse_input(topic, Reason.OWN_OUTPUT, guard.fault, now)
             if self._shadow and message.is_finite():
                 self._outputs[topic].publish(message.unchanged())
-            rivals = senders.hear(topic, time.monotonic()) if senders else ""
+            rivals = senders.hear(topic, now) if senders else ""
             if rivals:
-                self._session.refuse(Reason.TWO_SOURCES, rivals)
+                self._refuse_input(topic, Reason.TWO_SOURCES, rivals, now)
             act(message)
 
         return receive
+
+    def _refuse_input(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
+        """Refuse a message; a stream that it is of is ended in order."""
+        if topic in (TARGETS, COMMANDS):
+            self._session.end_stream(RefusedError(reason, detail), now_s)
+            self._arm_tail()
+        self._session.refuse(reason, detail)
 
     def _on_target(self, topic: str, message: JointMessage | ArrayMessage) -> None:
         now = time.monotonic()
         self._stream, self._stream_s = topic, now
         try:
-            command = self._session.counted(message.command)
+            command = message.command()
+        except RefusedError as error:
+            self._refuse_input(topic, error.reason, error.detail, now)
+        try:
             self._put_out(topic, message, command, self._session.target(command, now))
         finally:
             self._arm_tail()
@@ -431,8 +446,9 @@ class JointCorrectionNode(HouseNode):
                 self._proxy.end("stopped")
 
     def _arm_tail(self) -> None:
-        """Look after a period of the stream whether something goes out without a message."""
+        """Put out what must go out without a message, now and after each period of the stream."""
         if not self._shadow:
+            self._emit_tail()
             self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
             self._tail_timer.reset()
 

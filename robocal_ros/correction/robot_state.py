@@ -1,7 +1,6 @@
 """What is known of the robot: its joints by name, where it was read, where its controller is."""
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +48,7 @@ class RobotState:
         self.measured = np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
-        self._reference, self._reference_s = np.full(arm.n, np.nan), -np.inf
+        self._reference, self._reference_s = np.full(arm.n, np.nan), np.full(arm.n, -np.inf)
         self.scaling = 1.0
 
     # ---- joints by name -------------------------------------------------------------------------
@@ -132,15 +131,14 @@ class RobotState:
         self, index: Index, reference: Array, scaling: float | None, now_s: float
     ) -> None:
         """Where the controller is: its reference (k,); ``scaling``: how fast its clock runs."""
-        self._reference[index], self._reference_s = reference, now_s
+        self._reference[index], self._reference_s[index] = reference, now_s
         if scaling is not None:
             self.scaling = float(np.clip(scaling, 0.0, 1.0))
 
     def reference(self, index: Index, now_s: float) -> Array | None:
         """The controller's own place (k,), where it is known and fresh."""
-        found = self._reference[index]
-        fresh = now_s - self._reference_s <= REFERENCE_AGE_S
-        return found if fresh and bool(np.isfinite(found).all()) else None
+        fresh = np.all(now_s - self._reference_s[index] <= REFERENCE_AGE_S)
+        return self._reference[index] if fresh else None
 
     def require_fresh(self, index: Index, now_s: float) -> None:
         """Refuse while one of these joints has not been read, or not lately."""
@@ -178,10 +176,3 @@ def _require_single(names: tuple[str, ...]) -> None:
     if len(set(names)) != len(names):
         doubled = next(name for name in names if names.count(name) > 1)
         raise RefusedError(Reason.DOUBLED_JOINT, doubled)
-
-
-def finite_velocity(state: JointCommand) -> JointCommand:
-    """Readings without velocities of which one is not finite: drivers that have none say NaN."""
-    if state.velocity is None or np.isfinite(state.velocity).all():
-        return state
-    return replace(state, velocity=None)

@@ -7,13 +7,13 @@ aligned to their size, counted from the end of the encapsulation.
 """
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.compiled import kernel
-from robocal_ros.correction.inputs import require_few
 
 Array = NDArray[np.float64]
 
@@ -124,10 +124,10 @@ def _string_size(text: str) -> int:
     return 4 + -(-(len(text.encode()) + 1) // 4) * 4
 
 
-def read_path(data: bytes) -> SerializedPath | None:
+def read_path(data: bytes, require_few: Callable[[int], None]) -> SerializedPath | None:
     """Read a serialized trajectory; None for one that is not regular, or no such message at all.
 
-    Raises `RefusedError` for one of too many points, before it is read.
+    ``require_few`` may refuse the number of points before they are read.
     """
     size = len(data) - len(ENCAPSULATION)
     if size < STAMP or data[:2] != ENCAPSULATION[:2]:

@@ -42,7 +42,7 @@ Answer = TypeVar("Answer")
 CLOCK_RESET_NS = 1_000_000_000
 MOST_SOURCES = 64  # of so many drivers the order in time is watched one by one
 # What is dropped without ending a stream: it is not the stream's.
-DROPPED = {Reason.TIME_BACKWARDS, Reason.OWN_OUTPUT, Reason.TWO_SOURCES}
+DROPPED = {Reason.TIME_BACKWARDS, Reason.OWN_OUTPUT}
 
 
 class CorrectionSession:
@@ -132,7 +132,7 @@ class CorrectionSession:
     def hold(self, reason: Reason, detail: str, now_s: float) -> None:
         """While this lasts no command is taken; a stream that runs is ended in order."""
         self._held[reason] = detail
-        self._stream.end(RefusedError(reason, detail), now_s)
+        self.end_stream(RefusedError(reason, detail), now_s)
 
     def release(self, reason: Reason) -> None:
         """It is over."""
@@ -208,6 +208,10 @@ class CorrectionSession:
             raise self._count(error) from None
         self._goal[:] = q
         return corrected
+
+    def end_stream(self, why: RefusedError, now_s: float) -> None:
+        """A stream that runs cannot go on: `tail` slows the robot down."""
+        self._stream.end(why, now_s)
 
     def tail(self, now_s: float) -> JointCommand | None:
         """What must go out now although no message came; None when nothing must.

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
+HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
 RESUME_S = 1.0  # after a longer silence a stream is over
 INTERVALS = 7  # whose median is the period
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
@@ -65,10 +66,11 @@ class TargetStream:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
-        self._step_s = 0.0  # of the last output
-        self._before = np.full(arm.n, np.nan)  # what was put out before it
-        self._end_s, self._end_out, self._end_speed = 0.0, np.empty(0), np.empty(0)
-        self._lasts_s = 0.0
+        self._step_s = 0.0  # time that the last output used
+        self._before, self._spare = np.full((2, arm.n), np.nan)  # what was put out before it
+        # of the slow-down: from where, how fast, how long, and how much of that has gone out
+        self._end_out, self._end_speed = np.empty(0), np.empty(0)
+        self._lasts_s, self._slowed_s = 0.0, 0.0
 
     # ---- time -----------------------------------------------------------------------------------
 
@@ -88,10 +90,19 @@ class TargetStream:
         period = self.period_s
         return max(self._config.stream_gap_s, 2.0 * period if period > 0.0 else 0.0)
 
-    def _longest_s(self) -> float:
-        """Time that a step may use of what has passed: no more goes out at once after a silence."""
+    def _step_period_s(self) -> float:
+        """The period, or what stands for it before two messages have come."""
         period = self.period_s
-        return 2.0 * period if period > 0.0 else LONGEST_STEP_S
+        return period if period > 0.0 else LONGEST_STEP_S
+
+    def _holds(self, elapsed_s: float) -> bool:
+        """Whether the robot stands, as nothing went out for so long: the controller holds."""
+        return elapsed_s > HELD_PERIODS * self._step_period_s()
+
+    def _usable_s(self, now_s: float) -> float:
+        """Time that the next output may use: a robot that stands makes no longer step."""
+        elapsed = max(now_s - self._output.out_s, 0.0)
+        return min(elapsed, self._step_period_s()) if self._holds(elapsed) else elapsed
 
     # ---- targets --------------------------------------------------------------------------------
 
@@ -124,12 +135,6 @@ class TargetStream:
         self._output.path = None
         self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
         self._advance(now_s)
-        if self.lag_s > CATCH_UP_S:
-            raise RefusedError(
-                Reason.VELOCITY_LIMIT,
-                f"the stream is {self.lag_s:.3f} s ahead at the joints' speeds, allowed "
-                f"{CATCH_UP_S:g} s",
-            )
         return self._message(command)
 
     def _choose(self, index: Index, q: Array, now_s: float) -> None:
@@ -168,9 +173,8 @@ class TargetStream:
     def _advance(self, now_s: float) -> None:
         """Put out what came in last, or as much of the way there as the speeds allow."""
         output = self._output
-        elapsed = max(now_s - output.out_s, 0.0)
-        longest = min(elapsed, self._longest_s())
-        self._before[:] = output.out
+        elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
+        self._spare[:] = output.out
         q, fraction = self._goal, 1.0
         for _ in range(TRIES):
             desired = self._desired.at_one(q)
@@ -187,17 +191,31 @@ class TargetStream:
                 require_limits(tried[None], self._arm)
             if share <= 1.0 + ROUNDING:
                 break
+            if fraction == 1.0:
+                self._require_near(longest)
             fraction *= 0.999 / share
             way = (self._goal - output.taught) * self._active
             q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
         else:
             output.limiter.state[OFFSET_RATE] = 0.0
-        self._step_s, output.out_s = elapsed, now_s
+        self._before, self._spare = self._spare, self._before
+        self._step_s, output.out_s = longest, now_s
         output.stage = self._desired.stage if self._desired.made else None
         self.lag_s = 0.0
         if fraction < 1.0:
             ahead = np.abs(self._goal - output.taught) * self._active / self._fastest
             self.lag_s = float(np.max(ahead))
+
+    def _require_near(self, longest_s: float) -> None:
+        """Refuse a target that the joints do not come near: none of the way there goes out."""
+        ahead = np.abs(self._goal - self._output.taught) * self._active / self._fastest
+        ahead_s = float(np.max(ahead)) - longest_s
+        if ahead_s > CATCH_UP_S:
+            raise RefusedError(
+                Reason.VELOCITY_LIMIT,
+                f"the stream is {ahead_s:.3f} s ahead at the joints' speeds, allowed "
+                f"{CATCH_UP_S:g} s",
+            )
 
     def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""
@@ -237,20 +255,25 @@ class TargetStream:
     # ---- without a message ----------------------------------------------------------------------
 
     def end(self, why: RefusedError, now_s: float) -> None:
-        """End it: the robot is slowed down from where and as fast as it was sent last."""
+        """End it: the robot is slowed down from where and as fast as it was sent last.
+
+        After a silence the controller has held the last target since: the robot stands, and
+        nothing more goes out, which would set it in motion again.
+        """
         if self.phase is not Phase.RUNNING:
             return
         output, index, self._why = self._output, self._index, why
-        held = now_s - output.out_s > self._gap_s()  # the controller holds since: it stands
         speed = np.zeros(len(index))
-        if not held and self._step_s > 0.0:
-            speed = (output.out - self._before)[index] / self._step_s
-        lasts = np.max(np.abs(speed) / self._slowdown[index]) if len(index) else 0.0
-        if not lasts > 0.0 or not np.isfinite(lasts):
+        if self._step_s > 0.0 and not self._holds(now_s - output.out_s):
+            # a message that came early is no faster motion
+            speed = (output.out - self._before)[index] / max(self._step_s, self._step_period_s())
+        lasts = np.max(np.abs(speed) / self._slowdown[index], initial=0.0)
+        self.lag_s = 0.0
+        if not 0.0 < lasts < np.inf:
             self.phase = Phase.IDLE
             return
-        self.phase, self.lag_s, self._lasts_s = Phase.ENDING, 0.0, float(lasts)
-        self._end_s, self._end_out, self._end_speed = output.out_s, output.out[index].copy(), speed
+        self.phase, self._lasts_s, self._slowed_s = Phase.ENDING, float(lasts), 0.0
+        self._end_out, self._end_speed = output.out[index].copy(), speed
 
     def tail(self, now_s: float) -> JointCommand | None:
         """What must go out now without a message; None when nothing must."""
@@ -258,16 +281,22 @@ class TargetStream:
             return None
         if self.phase is Phase.ENDING:
             return self._slowed(self._command, now_s)
-        late = now_s - self._came_s > 1.5 * self._longest_s() / 2.0
+        late = now_s - self._came_s > 1.5 * self._step_period_s()
         if self.phase is Phase.RUNNING and self.lag_s > 0.0 and late:
             command = replace(self._command, position=self._goal[self._index], velocity=None)
             self._advance(now_s)
             return self._message(command)
         return None
 
-    def _slowed(self, command: JointCommand, now_s: float) -> JointCommand:
+    def _slowed(self, command: JointCommand, now_s: float) -> JointCommand | None:
+        """The slow-down, as far as it is by the time since the last output."""
         output, index = self._output, self._index
-        t = min(now_s - self._end_s, self._lasts_s)
+        elapsed = max(now_s - output.out_s, 0.0)
+        if self._holds(elapsed):  # it was held up itself
+            self.phase = Phase.IDLE
+            return None
+        self._slowed_s = min(self._slowed_s + elapsed, self._lasts_s)
+        t = self._slowed_s
         place = self._end_out + self._end_speed * (t - 0.5 * t * t / self._lasts_s)
         place = np.clip(place, self._arm.lower[index], self._arm.upper[index])
         output.taught[index] += place - output.out[index]

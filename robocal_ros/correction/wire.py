@@ -46,10 +46,15 @@ class JointWire:
     ----------
     is_reading : velocities and efforts of which one is not finite are none: many drivers have
         none, and say NaN.
+
+    Attributes
+    ----------
+    is_finite : whether every number of the message read last is.
     """
 
     def __init__(self, *, is_reading: bool = False) -> None:
         self._is_reading = is_reading
+        self.is_finite = True
         self._layout: _Layout | None = None
         self._counts: tuple[int, ...] = ()  # of what goes out: positions, velocities, efforts
         self._out = bytearray()
@@ -69,7 +74,8 @@ class JointWire:
         )
         # for so few numbers this takes a fifth of the time of NumPy's isfinite
         finite = [all(map(math.isfinite, n.tolist())) for n in (position, velocity, effort)]
-        if not (all(finite) or (finite[0] and self._is_reading)):
+        self.is_finite = all(finite)
+        if not (self.is_finite or (finite[0] and self._is_reading)):
             return None
         self._counts = tuple(
             count if known else 0 for (_, count), known in zip(layout.counts, finite, strict=True)

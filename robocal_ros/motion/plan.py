@@ -14,8 +14,9 @@ LEAD_S = 0.05
 """First point of what is sent, ahead of its arrival.
 
 joint_trajectory_controller 4.42.1 commands a first point at time 0 at once, wherever the robot is;
-one ahead of now begins where it measures the robot, without a jump. 0.05 s are five cycles of a
-slow controller (100 Hz), and more than the 10 ms from a message to what becomes of it.
+one ahead of now begins where the controller is, without a jump. 0.05 s are five cycles of a slow
+controller (100 Hz), and more than the 10 ms from a message to what becomes of it. From rest the
+cubic to that point is the plan itself.
 """
 
 
@@ -69,13 +70,6 @@ class JointPlan:
         vertex = before + 0.5 * h * first**2 / np.where(turns, first - last, np.inf)
         speed = np.maximum(np.max(np.abs(self.qd), axis=0), np.max(np.abs(vertex), axis=0))
         return speed, np.max(np.maximum(np.abs(first), np.abs(last)), axis=0)
-
-    def after(self, lead_s: float) -> "JointPlan":
-        """The same way, from rest, after a time in which nothing moves."""
-        return JointPlan(
-            np.concatenate([[0.0], self.time_s + lead_s]),
-            *(np.concatenate([part[:1], part]) for part in (self.q, self.qd, self.qdd)),
-        )
 
     def points(self, spacing_s: float = 0.0) -> tuple[Array, Array, Array]:
         """Times (k,), joints and velocities (k, n) that a controller is sent.

@@ -23,10 +23,10 @@ LEAST, OLDEST_S = 5, 0.2  # of them, if not too old: one wild reading is outvote
 REST_RAD = 1e-4  # a robot that rests moves less
 BACK_S = 1.0  # stamps that go back by more began anew
 FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
+AS_NEAR = 0.01  # of the allowed deviation: what no reading tells apart
 APART_S = 0.00375  # instants of the plan that a reading is compared with
 TOLD_S = 1.0  # a speed scaling that was not said again for so long is not known
 REFERENCE_S = 0.1  # a controller's place that is older is none
-ALIKE = 0.01  # of the allowed deviation: two places that differ by less are as near
 JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
 UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
 PAUSED_S = 15.0  # a robot that stands on its path is waited for so long where no scaling is known
@@ -236,9 +236,11 @@ class RobotWatch:
         tips = T[:, :3, :3] @ cell.tool.p_tip + T[:, :3, 3]
         tip = np.linalg.norm(tips[:-1] - tips[-1], axis=1)
         driving = self._driving
-        nearest = int(
-            np.argmin(np.hypot(tip / driving.deviation_m, joints / driving.deviation_rad))
-        )
+        shares = np.hypot(tip / driving.deviation_m, joints / driving.deviation_rad)
+        nearest = int(np.argmin(shares))
+        # where the plan rests all its instants are as near: it is as far as its clock
+        as_near = (shares <= shares[nearest] + AS_NEAR) & (times <= self.driven_s(heard_s))
+        nearest = max(nearest, int(np.max(np.flatnonzero(as_near), initial=0)))
         found = float(tip[nearest]), float(joints[nearest])
         if self.keeps(*found) and times[nearest] > self._reached_s:
             self._reached_s = float(times[nearest])
@@ -310,13 +312,16 @@ class RobotWatch:
         return here, np.clip(velocity / max(self.scaling, 0.1), -self._fastest, self._fastest)
 
     def speed(self, now_s: float) -> float:
-        """Largest unscaled speed of a joint, rad/s (m/s); NaN where nothing tells it."""
+        """Largest unscaled speed of a joint, rad/s (m/s); NaN where nothing tells it.
+
+        Readings from before a silence do not: the robot may have stopped meanwhile.
+        """
         if (reference := self.reference(now_s)) is not None:
             return float(np.max(np.abs(reference[1])))
         if not self._readings:
             return float("nan")
         times, q = self._latest()
-        if len(times) < 2:
+        if len(times) < 2 or np.max(np.diff(times)) > self._driving.silence_s:
             return float("nan")
         return float(np.max(np.abs(self._slope(times, q)))) / max(self.scaling, 0.1)
 

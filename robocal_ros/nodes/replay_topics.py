@@ -23,7 +23,7 @@ LATCHED_DEPTH = 100
 CLOCK = "/clock"
 OWN = "a live node makes its own"
 MOVES = "it may move a robot"
-VOUCHES = "it says that a robot may move now"
+VOUCHES = "it says that a robot may move now, or how it is moved"
 LEFT_OUT = {  # unless they are named, by type or by the last part of the name
     "robocal_msgs/msg/SessionEvent": OWN,
     "diagnostic_msgs/msg/DiagnosticArray": OWN,

@@ -28,13 +28,7 @@ from robocal_ros.nodes.tcf_outputs import TcfOutputs
 from robocal_ros.nodes.tcf_services import Runner, TcfServices
 from robocal_ros.nodes.tcf_settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 from robocal_ros.sessions.edge_log import EDGES
-from robocal_ros.sessions.events import (
-    BREAK_OFF,
-    MEASURE_TOOL,
-    TOOL_STEP,
-    Command,
-    Outcome,
-)
+from robocal_ros.sessions.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
 from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_in_force import ToolInForce

@@ -14,7 +14,7 @@ from robocal_ros.core.errors import ConflictError, RobocalError
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.measuring import approach, measuring
-from robocal_ros.motion.plan import LEAD_S, JointPlan
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import stop
 from robocal_ros.motion.watched_stop import WatchedStop
@@ -242,7 +242,6 @@ class ToolDriver:
     def _start(self, plan: JointPlan, cell: MotionCell, phase: Phase, now_s: float) -> None:
         self._beams.clear()
         self._stopping.forget()
-        plan = plan.after(LEAD_S)
         self.phase = phase
         self.robot.follow(plan, cell, now_s)
         sent_s = self._send(plan, False)  # making the plan may have taken long

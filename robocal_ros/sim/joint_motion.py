@@ -131,11 +131,12 @@ class JointMotion:
         t = np.asarray(time_s, dtype=np.float64)
         if len(t):
             self._run(int(np.floor(np.max(t) / CYCLE_S * (1.0 + 1e-12))) + 1)
-        rows = self._rows[: self._count - self._begin, :2]
-        rows = np.concatenate([rows, self.here[None]])
         number = np.floor(t / CYCLE_S * (1.0 + 1e-12)).astype(np.int64)
-        row = np.clip(number - self._begin, 0, len(rows) - 2)
-        s = np.clip(t / CYCLE_S - (row + self._begin), 0.0, 1.0)[:, None]
+        number = np.clip(number, self._begin, self._count - 1)
+        first = int(np.min(number, initial=self._count - 1))
+        known = self._rows[first - self._begin : self._count - self._begin, :2]
+        rows, row = np.concatenate([known, self.here[None]]), number - first
+        s = np.clip(t / CYCLE_S - number, 0.0, 1.0)[:, None]
         (q0, v0), (q1, v1) = (rows[row + i].transpose(1, 0, 2) for i in (0, 1))
         # Drives interpolate between two cycles as the controller does between two points.
         way, v0, v1 = q1 - q0, v0 * CYCLE_S, v1 * CYCLE_S

@@ -1,7 +1,8 @@
 """Names of commands in a recording: nobody listens to them, whoever plays it.
 
-What moves a robot, or says that it may be moved, lies under `RECORDED`: ``/robot/gap_open`` as
-``/recorded/robot/gap_open``. `BagReader` gives each topic the name that it had on the graph.
+What moves a robot, says that it may be moved, or how its controller moves it, lies under
+`RECORDED`: ``/robot/gap_open`` as ``/recorded/robot/gap_open``. `BagReader` gives each topic the
+name that it had on the graph.
 """
 
 RECORDED = "/recorded"
@@ -15,8 +16,12 @@ MOVES_TYPES = {
     "robocal_msgs/msg/ToolStep",
 }
 MOVES_ENDS = {"joint_targets", "joint_commands"}  # last parts of names
-VOUCHES_TYPES = {"robocal_msgs/msg/GapOpen", "robocal_msgs/msg/MotionLease"}
-VOUCHES_ENDS = {"gap_open"}
+VOUCHES_TYPES = {
+    "robocal_msgs/msg/GapOpen",
+    "robocal_msgs/msg/MotionLease",
+    "control_msgs/msg/JointTrajectoryControllerState",  # where the robot's reference is, how fast
+}
+VOUCHES_ENDS = {"gap_open", "speed_scaling"}
 
 
 def recorded_name(topic: str, msgtype: str) -> str:

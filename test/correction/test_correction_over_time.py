@@ -233,24 +233,19 @@ def test_at_rest_the_offset_comes_in_as_fast_as_it_may_and_no_faster() -> None:
 
 
 def test_a_stall_is_not_made_up_for_in_a_burst() -> None:
-    """Only the newest of what waited is heard; the step after it is no longer than the speeds."""
-    robot, speed = Robot(), np.radians(60.0)
-    q = HOME.copy()
-    robot.stream(q)
-    for _ in range(50):
-        q[0] += speed * DT
-        robot.stream(q)
+    """Only the newest of what waited is heard; no step is longer than the speeds in a period."""
+    speed, most = np.radians(60.0), LIMITS["velocity_limits"][0] * DT + ROUNDING
+    robot, q = under_way(speed)
     for stall in (0.05, 0.06):
         q[0] += speed * stall
         before = robot.at[0]
         robot.stream(q, dt=stall)
-        step = robot.at[0] - before
-        assert 0.0 < step <= 2.0 * LIMITS["velocity_limits"][0] * DT + ROUNDING
+        assert 0.0 < robot.at[0] - before <= most
         for _ in range(60):
             q[0] += speed * DT
             before = robot.at[0]
             robot.stream(q)
-            assert robot.at[0] - before <= LIMITS["velocity_limits"][0] * DT + ROUNDING
+            assert robot.at[0] - before <= most
         assert robot.at[0] == q[0]
 
 
@@ -269,29 +264,88 @@ def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
     assert robot.session.tail(robot.now + DT) is None  # it stands already
 
 
-def test_a_refusal_in_motion_slows_the_robot_down() -> None:
-    robot, speed = Robot(), np.radians(60.0)
-    watch, q = Watch(robot), HOME.copy()
+BEGIN = np.where(np.arange(6) == 3, NOMINAL.upper - 1e-4, HOME)
+SLOWEST = LIMITS["acceleration_limits"][0]
+BAD = {
+    Reason.NOT_FINITE: np.full(6, np.nan),
+    Reason.JOINT_LIMIT: np.where(
+        np.arange(6) == 3, NOMINAL.upper + 1e-4, HOME + 0.1 * np.eye(6)[0]
+    ),
+    Reason.VELOCITY_LIMIT: HOME - 1.0,
+    Reason.DEGREES: np.degrees(HOME),
+}
+
+
+def under_way(speed: float = np.radians(60.0)) -> tuple[Robot, np.ndarray]:
+    """A stream at a constant speed of joint 1, and its last target."""
+    robot, q = Robot(rested=False), BEGIN.copy()
+    robot.at = q.copy()
+    robot.rest()
     robot.stream(q)
     for _ in range(50):
         q[0] += speed * DT
         robot.stream(q)
-        watch.out(NAMES, robot.at)
-    refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan))
-    begin, rates, sent_s = robot.at[0], [speed], robot.now - DT  # the refused one left its turn out
-    for _ in range(200):
-        robot.now += DT
-        refused_too = q + speed * DT
+    return robot, q
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.05, 0.95), st.booleans(), st.sampled_from([*BAD]))
+def test_a_refusal_in_motion_slows_the_robot_down(
+    seed: int, jitter: float, repeated: bool, why: Reason
+) -> None:
+    """Over the time that really passes, as evenly as the joint may, from its last speed to rest.
+
+    Also while the messages that are refused go on.
+    """
+    periods = np.random.default_rng(seed).uniform(1.0 - jitter, 1.0 + jitter, 2000)
+    speed = np.radians(60.0)
+    robot, q = under_way(speed)
+    sent_s, begin = robot.now, robot.at[0]
+    refused(why, robot.stream, BAD[why], dt=periods[0] * DT)
+    for dt in periods[1:].tolist():
         if (command := robot.session.tail(robot.now)) is None:
             break
-        rates.append((command.position[0] - robot.at[0]) / (robot.now - sent_s))
-        sent_s = robot.now
         robot.go(command)
-    slowest = LIMITS["acceleration_limits"][0]
-    assert np.diff(rates).min() >= -slowest * DT * 2.5
-    assert rates[-1] <= 2.0 * slowest * DT
-    assert abs((robot.at[0] - begin) - speed**2 / (2.0 * slowest)) < 2.0 * speed * DT
-    refused(Reason.START_MISMATCH, robot.stream, refused_too, dt=0.5)
+        t = min(robot.now - sent_s, speed / SLOWEST)
+        way = speed * t - 0.5 * SLOWEST * t * t
+        assert np.isclose(robot.at[0] - begin, way, rtol=0.0, atol=1e-9)
+        if repeated:
+            with np.testing.assert_raises(RefusedError):
+                robot.stream(BAD[why], dt=dt * DT)
+        else:
+            robot.now += dt * DT
+    else:
+        raise AssertionError("the stream does not end")
+    assert np.isclose(robot.at[0] - begin, speed**2 / (2.0 * SLOWEST), rtol=0.0, atol=1e-9)
+    q[0] += speed * DT
+    refused(Reason.START_MISMATCH, robot.stream, q, dt=0.5)
+
+
+def test_a_target_that_is_refused_moves_nothing_that_stands() -> None:
+    for why, q in BAD.items():
+        robot, _ = under_way(speed=0.0)
+        refused(why, robot.stream, q)
+        for _ in range(10):
+            assert robot.session.tail(robot.now) is None
+            robot.now += DT
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(2.01, 100.0), st.integers(0, 20))
+def test_a_robot_that_stands_is_not_set_in_motion_to_be_stopped(held: float, count: int) -> None:
+    """A controller that was sent nothing for two periods holds: so at once, or while it slows."""
+    robot, _ = under_way()
+    dt = DT if count else held * DT
+    refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan), dt=dt)
+    for _ in range(count):
+        command = robot.session.tail(robot.now)
+        assert command is not None
+        robot.go(command)
+        robot.now += DT
+    robot.now += held * DT if count else 0.0
+    for _ in range(50):
+        assert robot.session.tail(robot.now) is None
+        robot.now += DT
 
 
 def test_a_stream_of_some_joints_then_of_all_moves_no_other_joint_at_once() -> None:

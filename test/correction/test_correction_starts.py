@@ -90,3 +90,23 @@ def test_a_model_from_the_future_is_as_stale_as_an_old_one() -> None:
     robot.session.offer_model(offer(drifted(), stamp_ns=200 * SECOND))
     robot.session.look(robot.now, 100 * SECOND)
     assert "100.0 s in the future" in robot.session.status().stale
+
+
+def test_a_controllers_reference_is_as_old_as_what_it_said_of_the_joint() -> None:
+    """A scaling alone, and the states of other joints, say nothing of where it is."""
+    robot = Robot()
+    session, nothing = robot.session, np.empty(0)
+    ahead = HOME + 0.01  # of the robot, which lags
+    session.controller(NAMES, ahead, 1.0, robot.now)
+    assert np.array_equal(robot.stream(ahead), ahead)
+    for names, position in (
+        ((), nothing),
+        (("gripper",), np.zeros(1)),
+        (NAMES[:5], ahead[:5]),
+        (NAMES, np.array([*ahead[:5], np.nan])),
+    ):
+        robot = Robot()
+        robot.session.controller(NAMES, ahead, 1.0, robot.now)
+        robot.rest(0.2)
+        robot.session.controller(names, position, 1.0, robot.now)
+        refused(Reason.START_MISMATCH, robot.stream, ahead)

@@ -147,8 +147,11 @@ class Graph:
             if isinstance(executable, Path)
             else [str(EXECUTABLES / executable)]
         )
-        command = [*program, *arguments, "--ros-args", *ros_arguments]
-        process = Executable(str(executable), command, self._environment)
+        return self.run(str(executable), [*program, *arguments, "--ros-args", *ros_arguments])
+
+    def run(self, name: str, command: list[str]) -> Executable:
+        """Start any command; it is ended with the test."""
+        process = Executable(name, command, self._environment)
         self._executables.append(process)
         return process
 

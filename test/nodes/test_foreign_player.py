@@ -18,9 +18,9 @@ from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.recorder_node import RecorderNode
 from robocal_ros.nodes.replay_topics import chosen_topics, message_class
 from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.storage.bag_recording import recordings
 from robocal_ros.storage.bags import BagReader
 from robocal_ros.storage.recorded_names import RECORDED, graph_name, recorded_name
+from robocal_ros.storage.recording_folders import recordings
 
 COMMANDS = {  # what moves a robot, or says that it may be moved, by the name on the graph
     "/gap_open": GapOpen,
@@ -51,13 +51,13 @@ def recording(graph: Any, folder: Path) -> Path:
     for publisher in publishers.values():
         graph.probe.destroy_publisher(publisher)
     (found,) = recordings(folder)
-    return found
+    return found.folder
 
 
 def test_what_another_player_publishes_reaches_no_node(graph: Any, tmp_path: Path) -> None:
     bag = recording(graph, tmp_path / "recordings")
     laser = written_laser(tmp_path, noisy_cell())
-    graph.add(JointCorrectionNode, {})
+    graph.add(JointCorrectionNode, {"robot": "ur10"})  # one history, one robot
     graph.add(MaintenanceNode, {"home_deg": HOME_DEG})
     graph.add(TcfNode, {"motion": "trajectory", "laser": laser})
     graph.add(CellSimNode, {})

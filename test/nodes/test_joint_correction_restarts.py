@@ -16,7 +16,7 @@ import pytest
 from joint_correction_live import HOME, NAMES, NODE, NOMINAL, drifted, joints
 from robocal_msgs.msg import CorrectionStatus
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 from tool_driver import noisy_cell
 
 from robocal_ros.core.documents import model_document
@@ -31,7 +31,7 @@ from robocal_ros.storage.laser_files import LaserFile, write_laser
 
 PERIOD_S = 0.02
 SPEED_RAD_S, SWING_RAD = 0.05, 0.1
-BLEND_RAD_S = np.radians(0.5)  # as the node has it by default
+OFFSET_RAD_S = np.radians(2.0)  # by default, besides what the posture changes
 START_RAD = np.radians(0.02)  # how far from where it stands a command may begin
 LONGEST_S = 0.1  # what a pause counts for at most, in a stream that goes on
 TAUGHT_M = [0.01, 0.0, 0.25]
@@ -136,7 +136,7 @@ class Cell:
             if len(self.sent) > count + 10:
                 return
             if self.status[-1].state == CorrectionStatus.MISMATCH:
-                assert self.graph.call(SetBool, f"{NODE}/enable", data=True).success
+                assert self.graph.call(Trigger, f"{NODE}/acknowledge").success
         logs = "".join(f"\n--- {name}:\n{e.output}" for name, e in self.nodes.items())
         pytest.fail(f"no commands come any more: {self.status[-1]}{logs}")
 
@@ -147,7 +147,7 @@ class Cell:
         """
         self._pauses = True
         self.graph.spin_for(0.5)
-        assert self.graph.call(SetBool, f"{NODE}/enable", data=True).success
+        self.graph.call(SetBool, f"{NODE}/enable", data=True)
         self._pauses = False
         self.status.clear()
         self.graph.spin_until(self._is_on, "the correction is on", 20.0)
@@ -158,12 +158,12 @@ class Cell:
         return bool(told.state == CorrectionStatus.ON and revisions == (1, 1))
 
     def largest_step(self) -> float:
-        """How much more the commands moved than the path, the blend and a new begin allow."""
+        """How much more the commands moved than the path, the limiter and a new begin allow."""
         over = []
         for (t0, taught0, out0), (t1, taught1, out1) in itertools.pairwise(self.sent):
             dt = min(t1 - t0, LONGEST_S) + PERIOD_S  # and what the messages' way differs by
             step = np.abs(out1 - out0).max()
-            over.append(step - np.abs(taught1 - taught0).max() - BLEND_RAD_S * dt)
+            over.append(step - np.abs(taught1 - taught0).max() - OFFSET_RAD_S * dt)
         return float(np.max(over))
 
 

@@ -19,14 +19,13 @@ from joint_correction_live import (
     trajectory,
 )
 from robocal_msgs.msg import CorrectionStatus
-from robocal_ros.correction.periods import LONGEST_GAP_S
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.samples import CORRECTED
-from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.correction.node import ONE_SOURCE_S, JointCorrectionNode
 from robocal_ros.nodes import conversions
 
 
@@ -51,7 +50,7 @@ def test_what_goes_out_is_what_came_in(shadow: Line) -> None:
         before = copy.deepcopy(message)
         publisher.publish(message)
         assert shadow.wait(inbox) == before
-    shadow.graph.spin_for(LONGEST_GAP_S + 0.1)  # the stream of targets is over
+    shadow.graph.spin_for(ONE_SOURCE_S + 0.1)  # the stream of targets is over
     command = Float64MultiArray(data=array("d", HOME))
     shadow.to_array.publish(command)
     assert shadow.wait(shadow.arrays) == command
@@ -64,15 +63,16 @@ def test_it_tells_what_it_would_do(shadow: Line) -> None:
     def done() -> bool:
         shadow.at = HOME  # nothing moves the robot elsewhere
         assert list(shadow.target().position) == HOME.tolist()
-        return bool(shadow.offsets) and shadow.offsets[-1].blend == 1.0
+        return bool(shadow.offsets) and any(shadow.offsets[-1].offset)
 
-    shadow.graph.spin_until(done, "the blend is over")
+    shadow.graph.spin_until(done, "the offset that would be added")
     offset = np.array(shadow.offsets[-1].offset)
     assert shadow.offsets[-1].shadow
     assert shadow.offsets[-1].model_revision == 3
     assert distance(actual, HOME) > 1e-4
     # the offset holds where the robot is, which it did not move: second order
     assert distance(actual, HOME + offset) < 1e-7
+    shadow.graph.spin_until(lambda: shadow.statuses[-1].tool_shift_mm > 0.0, "a status of it")
     told = shadow.told(state=CorrectionStatus.ON)
     assert told.shadow
     assert told.reason.startswith("shadow, nothing is changed")
@@ -136,7 +136,9 @@ def test_its_own_output_is_not_passed_round(graph: Any) -> None:
 
 def test_as_a_process_it_passes_a_stream_on(graph: Any) -> None:
     process = graph.start("joint_correction_node", {"shadow": "true", "enable_on_start": "true"})
-    assert graph.call(SetBool, f"{NODE}/enable", data=True).success
+    answer = graph.call(SetBool, f"{NODE}/enable", data=True)
+    assert not answer.success  # nothing is corrected
+    assert answer.message.startswith("shadow, nothing is changed")
     outputs = graph.collect(JointState, f"{NODE}/joint_targets")
     target = graph.publisher(JointState, "joint_targets")
     sent: list[JointState] = []

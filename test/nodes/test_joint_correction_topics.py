@@ -247,7 +247,7 @@ def test_a_mismatch_is_a_state_of_its_own(graph: Any) -> None:
     line = Line(graph, enable_on_start=True)
     line.take(model_message(drifted()), line.to_model, "kinematic_model")
     line.at = HOME + 0.01
-    line.stand()
+    line.rest()
     line.refused(line.to_target, joints(HOME), "joint_targets")
     told = line.told(state=CorrectionStatus.MISMATCH)
     assert "joint_a1" in told.mismatch
@@ -328,7 +328,7 @@ def test_parameters_become_the_sessions_configuration(graph: Any) -> None:
 
 def test_an_input_has_the_type_of_the_output_that_is_called_like_it(graph: Any, tmp_path: Path):
     """A remapping by the name alone joins what belongs together."""
-    graph.add(JointCorrectionNode)
+    graph.add(JointCorrectionNode, {"robot": "ur10"})  # as tcf_node's: one history, one robot
     graph.add(TcfNode, {"laser": written_laser(tmp_path, noisy_cell())})
 
     def pairs() -> dict[str, tuple[list[str], list[str]]]:

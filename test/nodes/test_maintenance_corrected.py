@@ -57,7 +57,8 @@ def test_after_a_restart_the_line_reads_that_nothing_is_corrected(graph):
     correction = graph.add(JointCorrectionNode, {"serial": "K7", "robot": "ur10"})
     told = line.reads(AccuracyState.DEGRADED, "joint_correction_node is OFF: call ~/enable")
     assert (told.predicted_error_mm, told.bound_mm) == (-1.0, -1.0)
-    assert graph.call(SetBool, "/joint_correction_node/enable", data=True).success
+    answer = graph.call(SetBool, "/joint_correction_node/enable", data=True)
+    assert not answer.success  # no model yet
     line.reads(AccuracyState.DEGRADED, "wire its inputs")
     models = graph.publisher(KinematicModel, "kinematic_model", qos.LATCHED)
     models.publish(

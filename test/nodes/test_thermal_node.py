@@ -18,7 +18,7 @@ from history_content import content
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.node import Node
-from robocal_msgs.msg import AccuracyState, KinematicModel, SessionEvent
+from robocal_msgs.msg import AccuracyState, CorrectionStatus, KinematicModel, SessionEvent
 from robocal_msgs.srv import Decide, ListCalibrations
 from sensor_msgs.msg import JointState
 from shift import Shift, built, postures, warmed
@@ -412,8 +412,10 @@ class Recorder:
 
 
 def test_uncorrected_joint_states_are_refused(graph, visits):
+    """Who publishes the status of a correction is one, whatever its name."""
     cell = Cell(graph)
-    impostor = Node("joint_correction_node", context=graph.context)
+    impostor = Node("renamed", context=graph.context)
+    impostor.create_publisher(CorrectionStatus, "~/status", qos.LATCHED)
     publisher = impostor.create_publisher(JointState, "/joint_states", DEEP)
     graph.spin_until(lambda: publisher.get_subscription_count(), "the node hears it")
     graph.spin_until(

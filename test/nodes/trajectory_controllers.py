@@ -12,7 +12,6 @@ import pytest
 import yaml
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from builtin_interfaces.msg import Duration, Time
-from conftest import Executable, Graph
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState, SpeedScalingFactor
 from rclpy.action import ActionClient
@@ -80,7 +79,7 @@ def seconds(stamp: Any) -> float:
 class Controlled:
     """The controller, what it tells, and a client of its action."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: Any) -> None:
         self.graph, node = graph, graph.probe
         self.states: list[JointTrajectoryControllerState] = graph.collect(
             JointTrajectoryControllerState, f"{NODE}/controller_state", DEEP
@@ -164,7 +163,7 @@ class Controlled:
 # ---- simulated -----------------------------------------------------------------------------------
 
 
-def simulated(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
+def simulated(graph: Any, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
     """The cell's robot, without a lag, as mock hardware has none."""
     given = {"velocities": str(velocities).lower(), "lag_ms": 0.0, "rate_hz": 250.0} | parameters
     controlled = Controlled(graph)
@@ -176,7 +175,7 @@ def simulated(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -
 # ---- real ----------------------------------------------------------------------------------------
 
 
-def real(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
+def real(graph: Any, folder: Path, velocities: bool, **parameters: Any) -> Controlled:
     """joint_trajectory_controller on mock_components/GenericSystem; skipped where it is missing."""
     if missing := missing_packages():
         pytest.skip(f"ros2_control is not installed: no {', '.join(missing)}")
@@ -202,7 +201,7 @@ def real(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -> Con
         get_package_prefix("controller_manager"), "lib/controller_manager/ros2_control_node"
     )
     command = [str(node), "--ros-args", "--params-file", str(file)]
-    graph._executables.append(Executable("ros2_control_node", command, graph._environment))
+    graph.run("ros2_control_node", command)
     for name in controllers:
         for kind, service in (
             (LoadController, "load_controller"),
@@ -214,7 +213,7 @@ def real(graph: Graph, folder: Path, velocities: bool, **parameters: Any) -> Con
     return controlled
 
 
-def _ask(graph: Graph, service: str, kind: Any, request: Any) -> None:
+def _ask(graph: Any, service: str, kind: Any, request: Any) -> None:
     """Call a service of the controller manager."""
     client = graph.probe.create_client(kind, f"controller_manager/{service}")
     graph.spin_until(client.service_is_ready, f"{service} appears", 30.0)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from robocal_ros.core.codes import Code
 from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.plan import LEAD_S
-from robocal_ros.motion.robot_watch import MotionReport
+from robocal_ros.motion.plan import LEAD_S, JointPlan
+from robocal_ros.motion.robot_watch import REST_RAD, MotionReport
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
 from robocal_ros.sessions.events import TOOL_STEP
 from robocal_ros.sessions.tool_driving import Phase
@@ -72,10 +72,18 @@ def test_a_stop_throws_no_joint_back_and_none_ahead(speed, lag_cycles, late_s):
 def test_every_motion_begins_ahead_of_now_with_velocities(robot, phase):
     driven(robot, phase, 0.1)
     for _, plan in robot.sent:
-        time_s, _, qd = plan.points()
+        time_s, q, qd = plan.points()
         assert time_s[0] == pytest.approx(LEAD_S)
-        assert np.all(qd[0] == 0.0)  # from rest
         assert np.all(qd[-1] == 0.0)
+        # what a controller makes of it from rest is the plan
+        begin = JointPlan(
+            np.array([0.0, LEAD_S]),
+            np.array([plan.q[0], q[0]]),
+            np.array([0.0 * qd[0], qd[0]]),
+            np.zeros((2, 6)),
+        )
+        between = np.linspace(0.0, LEAD_S, 20)
+        assert np.max(np.abs(begin.at(between)[0] - plan.at(between)[0])) < REST_RAD
 
 
 # ---- speed scaling and pauses -------------------------------------------------------------------

@@ -11,6 +11,7 @@ from bench.closed_loop.checks import (
     MISSES,
     SEEN_BY_CHECK,
     SEEN_BY_CYCLE,
+    SEEN_BY_FULL,
     Checked,
     healthy_table,
     power_table,
@@ -22,7 +23,7 @@ from bench.closed_loop.tables import detection_table, faults_table
 from robocal_ros.core.codes import Code
 from robocal_ros.sim.cell_faults import SIZES
 
-TRIED = (*SEEN_BY_CHECK, *SEEN_BY_CYCLE)
+TRIED = (*SEEN_BY_CHECK, *SEEN_BY_FULL, *SEEN_BY_CYCLE)
 
 
 def found(fault, code_of, cells=CELLS):
@@ -156,12 +157,12 @@ def test_the_table_of_detection_says_what_its_seeds_prove():
 
 @pytest.mark.parametrize(("alarms", "met"), [(0, True), (1, False)])
 def test_an_alarm_without_a_fault_is_a_missed_goal(alarms, met):
-    """One check before all sizes of a fault, in each of ten cells."""
+    """One check, or measurement, before all sizes of a fault, in each of ten cells."""
     told = [
         replace(one, before=Code.LIMIT_EXCEEDED if one.trial.seed < alarms else Code.ACCEPT)
-        for fault in ("collision", "sphere_knocked")
+        for fault in ("collision", "station_knocked", "sphere_knocked")
         for one in found(fault, lambda size, cell, code=RIGHT[fault]: code, cells=10)
     ]
-    checks, cycles = healthy_table(told).texts()
-    assert (checks[1], cycles[1]) == ("10", str(10 * len(SWEEP["sphere_knocked"])))
+    rows = healthy_table(told).texts()
+    assert [row[1] for row in rows] == ["10", "10", str(10 * len(SWEEP["sphere_knocked"]))]
     assert healthy_table(told).met is met

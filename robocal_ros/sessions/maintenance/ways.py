@@ -16,7 +16,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import ToolBody
 from robocal_ros.motion.measuring import along, least_s, raised_way
-from robocal_ros.motion.plan import LEAD_S, JointPlan, joined
+from robocal_ros.motion.plan import JointPlan, joined
 from robocal_ros.motion.travel import departure, joint_way
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 
@@ -91,11 +91,11 @@ class Ways:
 
     def home_s(self, pose: int) -> float:
         """Duration of the way home from a pose."""
-        return LEAD_S + min(sum(self._line_s[:pose]), sum(self._line_s[pose:]))
+        return min(sum(self._line_s[:pose]), sum(self._line_s[pose:]))
 
     def longest_line_s(self) -> float:
         """Duration of the longest taught line."""
-        return LEAD_S + max(self._line_s)
+        return max(self._line_s)
 
     def beside(self, place: Line, q: Array) -> Array:
         """How far each joint (n,) is from a taught line, or from a point of the ring, rad (m)."""
@@ -127,7 +127,7 @@ class Ways:
         """
         if place != STATION:
             return self.to(place, q, HOME)
-        plan = departure(self.station, q, self._home).after(LEAD_S)
+        plan = departure(self.station, q, self._home)
         return Route(plan, ((STATION[0], HOME),), (plan.duration_s,))
 
     def _require_time(self, tool_home_s: float) -> None:
@@ -161,5 +161,5 @@ class Ways:
         for _, end in lines:
             plans.append(joint_way(self.cell, q, self._points[end]))
             q = self._points[end]
-        ends = LEAD_S + np.cumsum([plan.duration_s for plan in plans])
-        return Route(joined(plans).after(LEAD_S), tuple(lines), tuple(ends.tolist()))
+        ends = np.cumsum([plan.duration_s for plan in plans])
+        return Route(joined(plans), tuple(lines), tuple(ends.tolist()))
