@@ -19,8 +19,7 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.kinematics.universal_robots import link_transform
 from robocal_ros.correction import solution
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, TrajectoryCommand
-from robocal_ros.correction.joint_correction import JointCorrection, pack_model
-from robocal_ros.correction.room import work_size
+from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
@@ -67,6 +66,11 @@ def make_case(name: str, shift_m: float, turn_deg: float) -> Case:
     lever = (actual.fk(q)[:, :3, :3] @ actual.T_flange_tool[:3, 3])[..., None]
     J[:, :3] += np.cross(J[:, 3:], lever, axis=1)
     return Case(reference, actual, q[np.linalg.cond(J) < LARGEST_CONDITION])
+
+
+def in_full(found: CorrectionResult) -> NDArray[np.bool_]:
+    """Which points were corrected in all directions."""
+    return found.converged & ~found.weak
 
 
 # ---- Speed
@@ -140,9 +144,8 @@ def kdl_loop(case: Case, q: Array) -> Callable[[], Array]:
 def compiled_entry(correction: JointCorrection, q: Array) -> Callable[[], Array]:
     """The compiled code called from Python, once for each point, into arrays that are there."""
     n = q.shape[1]
-    points, ones, out = q[:, None].copy(), np.ones(1), np.empty((len(q), 1, n + solution.REPORT))
-    work = np.empty(work_size(n))
-    given = correction.models, ones, correction.largest, correction.free_axis, work
+    points, out = q[:, None].copy(), np.empty((len(q), 1, n + solution.REPORT))
+    given = correction.largest, correction.free_axis, correction.work
 
     def run() -> Array:
         for point, into in zip(points, out, strict=True):
@@ -159,7 +162,7 @@ def speed_table() -> Table:
     free = JointCorrection.between(case.reference, case.actual, free_axis=True)
     # where all of them find the solution that is near
     found = correction.correct(case.q)
-    near = np.flatnonzero((found.share == 1.0) & (np.abs(found.joint_shift).max(axis=1) < 0.1))
+    near = np.flatnonzero(in_full(found) & (np.abs(found.joint_shift).max(axis=1) < 0.1))
     q = case.q[near[:SINGLE]]
     rivals = {"Pinocchio": pinocchio_loop(case, q)}
     with contextlib.suppress(ImportError):
@@ -251,11 +254,10 @@ def trajectory_table() -> Table:
     rated = replace(plain, velocity=qd, acceleration=qdd)
     models = pack_model(case.reference), pack_model(case.actual)
     bounds = np.radians([[0.24] * 6, [5.0] * 6])
-    ones, zero = np.ones(POINTS), np.zeros(POINTS)
 
     def staged(free_axis: bool) -> Callable[[], object]:
-        stage = StagedCorrection(models[0], models[1], models[1], *bounds, free_axis=free_axis)
-        return lambda: stage.rates(q, qd, qdd, ones, zero, stage.correct(q, ones))
+        stage = StagedCorrection(*models, *bounds, free_axis=free_axis)
+        return lambda: stage.rates(q, qd, qdd, stage.correct(q))
 
     tasks: dict[str, Callable[[], object]] = {
         "positions": lambda: settled.run(plain),
@@ -307,7 +309,7 @@ def reach_table() -> Table:
 def _reach(case: Case, free: bool, most: int) -> Sequence[Cell | Goal]:
     correction = JointCorrection.between(case.reference, case.actual, LARGEST_SHIFT, free)
     found = correction.correct(case.q)
-    whole = found.share == 1.0
+    whole = in_full(found)
     counts = np.bincount(found.iterations[whole], minlength=11)
     goal = case.reference.fk(case.q[whole]) @ case.reference.T_flange_tool
     T = case.actual.fk(found.q[whole]) @ case.actual.T_flange_tool
@@ -354,15 +356,14 @@ def _round_trip(case: Case, free: bool) -> Array:
     correction = JointCorrection.between(case.reference, case.actual, LARGEST_SHIFT, free)
     there = correction.correct(case.q)
     back = correction.inverse().correct(there.q)
-    whole = (there.share == 1.0) & (back.share == 1.0)
+    whole = in_full(there) & in_full(back)
     taught = back.q
     if free:
         models = pack_model(case.reference), pack_model(case.actual)
         largest = np.full((2, case.q.shape[1]), LARGEST_SHIFT)
-        stage = StagedCorrection(models[0], models[1], models[1], *largest, free_axis=True)
-        ones = np.ones(len(case.q))
-        staged = stage.correct(case.q, ones)
-        whole, taught = whole & staged.whole, stage.uncorrect(staged.q, ones)
+        stage = StagedCorrection(*models, *largest, free_axis=True)
+        staged = stage.correct(case.q)
+        whole, taught = whole & staged.whole, stage.uncorrect(staged.q)
     return np.asarray(np.abs(taught - case.q)[whole].max(axis=1))
 
 
