@@ -42,9 +42,10 @@ Array = NDArray[np.float64]
 LARGEST_SHIFT = 1.0
 # Of the shift per unit of a singular value: at 60 deg/s of the joints a drift's correction moves
 # by less than 2 deg/s; a tool's, which is larger, keeps the map from taught joints one to one.
-DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 20.0, 1.0 / 2.0
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 25.0, 1.0 / 2.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
-RATE_STEP_S = 1e-3
+# Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
+RATE_STEP_S = 2e-4
 
 
 def pack_model(arm: SerialArm) -> Array:
@@ -180,7 +181,7 @@ def path_rates(
 ) -> tuple[Array, Array]:
     """Rates (m, n) of ``corrected(q)`` along the path q + v t + a t^2 / 2 at t = 0.
 
-    Central differences of the shift over 1 ms each way.
+    Central differences of the shift over 0.2 ms each way.
     """
     h = RATE_STEP_S
     shift = []

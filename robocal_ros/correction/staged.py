@@ -204,6 +204,7 @@ class StagedCorrection:
 def load_kernels(arm: SerialArm) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
     packed, largest, q = pack_model(arm), np.ones(arm.n), np.zeros((2, arm.n))
+    arm.fk(q)
     stage = StagedCorrection(packed, packed, largest, largest)
     stage.rates(q, q, q, stage.correct(q))
     stage.correct_one(q[0], np.empty((stage.stages, arm.n + solution.REPORT)))

@@ -13,6 +13,7 @@ from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.joint_correction import plain
 from robocal_ros.correction.limiter import DESIRED, LONGEST_STEP_S, OFFSET, OFFSET_RATE
 from robocal_ros.correction.output import ROUNDING, Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
@@ -62,7 +63,10 @@ class TargetStream:
         self._arm, self._config, self._state = arm, config, state
         self._desired, self._output = desired, output
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
-        self._limits = config.velocity_limits, arm.lower, arm.upper
+        fastest, lower, upper = (
+            plain(limit, (arm.n,)) for limit in (config.velocity_limits, arm.lower, arm.upper)
+        )
+        self._limits = fastest, lower, upper
         self.phase, self.lag_s = Phase.IDLE, 0.0
         self._why: RefusedError | None = None
         self._active = np.zeros(arm.n)  # 1 where a joint is commanded

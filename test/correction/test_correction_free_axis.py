@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
+from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
@@ -51,14 +52,20 @@ def miss(
     return np.linalg.norm((T - goal)[:, :3, 3], axis=1), np.linalg.norm(axis, axis=1)
 
 
+def tool_jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    """Geometric Jacobian (m, 6, n) at the tool's origin."""
+    J = arm.jacobian(q)
+    lever = (arm.fk(q)[:, :3, :3] @ arm.T_flange_tool[:3, 3])[..., None]
+    J[:, :3] += np.cross(J[:, 3:], lever, axis=1)
+    return J
+
+
 def origin_and_axis_rates(
     arm: SerialArm, q: np.ndarray, qd: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Velocity (m, 3) of the tool's origin, m/s, and of its z, 1/s."""
-    twist = (arm.jacobian(q) @ qd[..., None])[..., 0]
-    T = arm.fk(q)
-    lever, z = T[:, :3, :3] @ arm.T_flange_tool[:3, 3], (T @ arm.T_flange_tool)[:, :3, 2]
-    return twist[:, :3] + np.cross(twist[:, 3:], lever), np.cross(twist[:, 3:], z)
+    twist = (tool_jacobian(arm, q) @ qd[..., None])[..., 0]
+    return twist[:, :3], np.cross(twist[:, 3:], (arm.fk(q) @ arm.T_flange_tool)[:, :3, 2])
 
 
 def both(
@@ -83,14 +90,14 @@ def test_position_and_axis_are_reached(name: str, shift_m: float, turn_deg: floa
     actual = changed(reference, rng, shift_m, turn_deg)
     q = rng.uniform(-2.0, 2.0, (2000, 6))
     free, six = both(reference, actual, q, 1.0)
-    whole = ~free.weak
+    whole, all_six = (~r.weak & r.converged for r in (free, six))
     position, axis = miss(reference, actual, q[whole], free.q[whole])
     assert position.max() < NM
     assert axis.max() < NM
     assert free.position_error_m[whole].max() < NM
     assert free.rotation_error_rad[whole].max() < NM
     # Five equations are singular in fewer poses than six.
-    assert np.mean(whole) > np.mean(~six.weak)
+    assert np.mean(whole) > np.mean(all_six)
     # What is reported without the correction is the axis' angle.
     before, angle = miss(reference, actual, q, q)
     assert np.allclose(free.tcp_shift_m, before, rtol=0.0, atol=1e-14)
@@ -104,12 +111,17 @@ def test_joints_move_no_further_than_with_six_equations(seed: int, name: str) ->
     reference = robot(name)
     actual = changed(reference, rng)
     q = rng.uniform(-2.0, 2.0, (300, 6))
-    free, six = both(reference, actual, q, ARM_BOUND)
-    whole = (~free.weak) & (~six.weak)
-    moved, most = (np.linalg.norm(r.joint_shift[whole], axis=1) for r in (free, six))
+    free, six = both(reference, actual, q, 1.0)
+    moved, most = (np.linalg.norm(r.joint_shift, axis=1) for r in (free, six))
+    J = tool_jacobian(actual, q)
+    J[:, :3] /= LENGTH
+    s = np.linalg.svd(J, compute_uv=False)
+    turn = most * s[:, 0] / s[:, 5]  # of the weakest direction within the shift, at most
+    whole = ~free.weak & ~six.weak & free.converged & six.converged & (turn < 0.1)
+    moved, most = moved[whole], most[whole]
     assert np.sum(whole) > 100
-    # The least shift is found to the second order of a shift of some mrad.
-    assert np.all(moved <= most * (1.0 + 1e-6))
+    # J(q)^T y is not quite J(q')^T y: they differ by the turn, their lengths by its square.
+    assert np.all(moved <= most * (1.0 + turn[whole] ** 2))
     assert np.median(moved / most) < 0.99
 
 
@@ -161,9 +173,9 @@ def test_there_and_back_is_exact(seed: int, bend: tuple[float, float]) -> None:
     stage = staged(reference, changed(reference, rng, *bend))
     q = HOME + rng.uniform(-0.7, 0.7, (30, 6))
     there = stage.correct(q)
-    assert np.mean(there.whole) > 0.5
-    back = stage.uncorrect(there.q)
-    assert np.abs(back - q)[there.whole].max() < 1e-12
+    assert there.arm.converged.all()
+    assert there.tool is None or there.tool.converged.all()
+    assert np.abs(stage.uncorrect(there.q) - q).max() < 1e-12
 
 
 def test_rates_keep_the_tool_and_its_axis_moving_as_taught() -> None:
@@ -176,13 +188,14 @@ def test_rates_keep_the_tool_and_its_axis_moving_as_taught() -> None:
     result = stage.correct(q)
     v, a = stage.rates(q, qd, zero, result)
     assert np.abs(v - qd).max() > 1e-3
+    assert np.sum(result.whole) > 10
     for wanted, found in zip(
         origin_and_axis_rates(reference, q, qd),
         origin_and_axis_rates(actual, result.q, v),
         strict=True,
     ):
-        # central differences over 1 ms of a shift of 0.1 rad
-        assert np.abs(found - wanted).max() < 1e-6
+        # central differences over 0.2 ms of a shift of 0.1 rad; what is given up moves otherwise
+        assert np.abs(found - wanted)[result.whole].max() < 1e-6
     h = 3e-3
     before, after = (stage.correct(q + t * qd).q for t in (-h, h))
     assert np.allclose(a, (after - 2.0 * result.q + before) / h**2, rtol=0.0, atol=1e-5)

@@ -72,12 +72,12 @@ def test_clamped_it_goes_to_the_bound_and_no_further() -> None:
     assert np.allclose(robot.read(out[-1]).position, HOME, rtol=0.0, atol=1e-11)
 
 
-def test_passed_on_it_is_blended_out_on_the_way_there_and_in_on_the_way_back() -> None:
+def test_passed_on_the_offset_goes_on_the_way_there_and_comes_on_the_way_back() -> None:
     arm, far = good_here_only()
     robot = Robot(policy=Policy.PASS)
     robot.session.offer_model(offer(arm))
     robot.session.enable(True)
-    shift = robot.settle() - HOME
+    shift = first = robot.settle() - HOME
     assert np.abs(shift).max() > 1e-4
     way = np.linspace(0.0, 1.0, 800)
     for x in np.concatenate([way, np.ones(200), way[::-1]]):
@@ -91,7 +91,11 @@ def test_passed_on_it_is_blended_out_on_the_way_there_and_in_on_the_way_back() -
             there = now
     assert np.array_equal(there, np.zeros(6))
     assert robot.session.status().passed[Reason.TCP_BOUND] > 200
-    assert distance(pose(arm, robot.settle()), pose(NOMINAL, HOME)) < 1e-9
+    assert np.allclose(robot.settle() - HOME, first, rtol=0.0, atol=1e-11)
+    # of a direction that is weak for so large a drift, so much is given up as is reported
+    left = robot.session.status().remaining_m
+    assert distance(pose(arm, robot.at), pose(NOMINAL, HOME)) == pytest.approx(left, abs=1e-9)
+    assert left < 1e-2 * distance(pose(arm, HOME), pose(NOMINAL, HOME))
 
 
 def test_a_trajectory_is_clamped_or_passed_on_as_a_whole() -> None:

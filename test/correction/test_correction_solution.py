@@ -1,7 +1,7 @@
 """The correction reaches the taught pose, can be undone, and never leaves its bounds."""
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction import solution
-from robocal_ros.correction.joint_correction import JointCorrection, pack_model
+from robocal_ros.correction import solution, straight
+from robocal_ros.correction.joint_correction import RATE_STEP_S, JointCorrection, pack_model
+from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.rates import rates_batch
 from robocal_ros.correction.solution import MOST_OVER, REPORT
-from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.correction.staged import EXACT, StagedCorrection
 from robocal_ros.storage.robots import load_robot
 
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
@@ -61,6 +62,13 @@ def tool_jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
     return J
 
 
+def scaled_jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    """At the tool, with the units of the damping."""
+    J = tool_jacobian(arm, q)
+    J[..., :3, :] /= LENGTH
+    return J
+
+
 def pose_error(arm: SerialArm, q: np.ndarray, goal: np.ndarray) -> tuple[float, float]:
     T = arm.fk(q) @ arm.T_flange_tool
     turn = frames.log_rotation(goal[..., :3, :3] @ np.swapaxes(T[..., :3, :3], -1, -2))
@@ -75,13 +83,27 @@ def well_conditioned(arm: SerialArm, rng: np.random.Generator, m: int) -> np.nda
     return q[np.linalg.cond(tool_jacobian(arm, q)) < 1e3]
 
 
+def at_most_iterations(arm: SerialArm, q: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Newton's iterations (m,) by Kantorovich's bound, 0 where it bounds nothing.
+
+    ``error`` (m,) is the norm of the scaled twist at the tool. A Jacobian changes per radian by no
+    more than its own norm. The last iteration is one of which the step is below 0.1 urad.
+    """
+    s = np.linalg.svd(scaled_jacobian(arm, q), compute_uv=False)
+    step, bend = error / s[:, -1], s[:, 0] / (2.0 * s[:, -1])
+    bounded, count = 2.0 * bend * step < 0.5, np.ones(len(q), np.int64)
+    for _ in range(10):
+        count += step > solution.SMALL_STEP
+        step = np.where(bounded & (step > solution.SMALL_STEP), bend * step**2, step)
+    return np.where(bounded, count, 0)
+
+
 @pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
 @pytest.mark.parametrize(
-    ("drift_m", "shift_m", "turn_deg", "most"),
-    [(1e-3, 0.0, 0.0, 3), (1e-3, 2e-3, 0.5, 3), (1e-3, 20e-3, 7.0, 5)],
+    ("drift_m", "shift_m", "turn_deg"), [(1e-3, 0.0, 0.0), (1e-3, 2e-3, 0.5), (1e-3, 20e-3, 7.0)]
 )
 def test_reaches_the_taught_pose(
-    name: str, drift_m: float, shift_m: float, turn_deg: float, most: int
+    name: str, drift_m: float, shift_m: float, turn_deg: float
 ) -> None:
     rng = np.random.default_rng(1)
     reference = robot(name)
@@ -97,7 +119,11 @@ def test_reaches_the_taught_pose(
     assert result.rotation_error_rad[whole].max() < NM
     # A pose from which the goal lies beyond the reach, or too many radians away, has no solution.
     assert np.mean(whole) > (0.92 if turn_deg < 1.0 else 0.6)
-    assert np.mean(result.iterations[whole] <= most) > 0.99
+    error = np.hypot(result.tcp_shift_m / LENGTH, result.tcp_rotation_rad)
+    most = at_most_iterations(actual, q, error)
+    assert np.all(whole[most > 0])
+    assert np.all(result.iterations[most > 0] <= np.maximum(most, straight.ITERATIONS)[most > 0])
+    assert np.mean(most > 0) > 0.3 or turn_deg > 1.0
     assert np.allclose(result.joint_shift, result.q - q)
     apart = (actual.fk(q) @ actual.T_flange_tool - goal)[:, :3, 3]
     assert np.allclose(result.tcp_shift_m, np.linalg.norm(apart, axis=1), rtol=0.0, atol=1e-14)
@@ -133,7 +159,7 @@ def test_there_and_back_is_exact(seed: int) -> None:
     correction = JointCorrection.between(reference, actual)
     there = correction.correct(well_conditioned(reference, rng, 20))
     back = correction.inverse().correct(there.q)
-    whole = (~there.weak) & (~back.weak)
+    whole = ~there.weak & ~back.weak & there.converged & back.converged
     assert np.sum(whole) > 10
     taught = there.q - there.joint_shift
     sides = [np.sign(np.linalg.det(tool_jacobian(reference, q))) for q in (taught, back.q)]
@@ -156,8 +182,12 @@ def test_bounds_hold_at_and_around_singularities(seed: int, size: float, largest
     assert np.all(np.isfinite(result.q))
     # The bound steers the first step; the solution bends beyond it, and what bends far is dropped.
     assert np.abs(result.joint_shift).max() <= MOST_OVER * largest
-    assert np.all(result.position_error_m <= result.tcp_shift_m + 1e-9)
-    assert np.all(result.rotation_error_rad <= result.tcp_rotation_rad + 1e-9)
+    # Of no direction more is left than there was, but for what the arm bends within the shift.
+    before = np.hypot(result.tcp_shift_m / LENGTH, result.tcp_rotation_rad)
+    after = np.hypot(result.position_error_m / LENGTH, result.rotation_error_rad)
+    bend = np.linalg.norm(scaled_jacobian(actual, q), ord=2, axis=(-2, -1)) / 2.0
+    square = np.sum(result.joint_shift**2, axis=1)
+    assert np.all(after <= before + bend * square + 1e-12)
 
 
 def test_the_shift_is_continuous_through_a_wrist_singularity() -> None:
@@ -253,12 +283,14 @@ def test_an_arm_of_three_joints_gets_as_near_as_it_can() -> None:
     q = rng.uniform(0.1, 0.4, (20, 3))
     result = JointCorrection.between(reference, actual).correct(q)
     assert np.all(result.converged)
-    before = np.hypot(result.tcp_shift_m, result.tcp_rotation_rad)
-    after = np.hypot(result.position_error_m, result.rotation_error_rad)
+    # in the metric in which lengths and turns are weighed against each other
+    before = np.hypot(result.tcp_shift_m / LENGTH, result.tcp_rotation_rad)
+    after = np.hypot(result.position_error_m / LENGTH, result.rotation_error_rad)
     assert np.all(after < before)
     nearby = result.q + rng.uniform(-1e-4, 1e-4, q.shape)
     for row, moved, least in zip(q, nearby, after, strict=True):
-        assert np.hypot(*pose_error(actual, moved, reference.fk(row))) >= least - 1e-9
+        position, rotation = pose_error(actual, moved, reference.fk(row))
+        assert np.hypot(position / LENGTH, rotation) >= least - 1e-9
 
 
 def seven_joints() -> SerialArm:
@@ -285,32 +317,92 @@ def test_a_redundant_arm_reaches_the_pose_with_a_small_shift() -> None:
     assert np.abs(result.joint_shift).max() < 0.02
 
 
-def crossings(name: str, count: int) -> Iterator[tuple[StagedCorrection, SerialArm, Any, Any]]:
-    """Wrist singularities crossed at 60 deg/s, 500 Hz, with drifts of 0.004 to 0.12 mm."""
-    reference, rng, t = robot(name), np.random.default_rng(0), np.arange(-150, 151) * 0.002
-    for _ in range(count):
+@dataclass(frozen=True)
+class Crossing:
+    """A wrist singularity that is crossed along ``q`` (m, 6), at ``speed`` rad/s of the joints."""
+
+    reference: SerialArm
+    actual: SerialArm
+    q: np.ndarray
+    qd: np.ndarray
+    dt: float
+    speed: float
+
+    @property
+    def stage(self) -> StagedCorrection:
+        return StagedCorrection(pack_model(self.reference), pack_model(self.actual), *BOUNDS)
+
+
+def crossings(name: str, count: int, seed: int = 0) -> Iterator[Crossing]:
+    """Random ones of the wrist alone, at up to 60 deg/s and beyond, at 250 or 500 Hz.
+
+    Any tool; drifts of 0.004 to 0.12 mm. The five other singular values are above 0.25 all the
+    way, and with joint 5 at a right angle all six above 0.1: neither shoulder nor elbow is near.
+    """
+    described, rng = load_robot(name), np.random.default_rng(seed)
+    while count:
+        turn, place = frames.exp_rotation(rng.uniform(-1.0, 1.0, 3)), rng.uniform(-0.15, 0.15, 3)
+        tool = frames.transform(turn, place + 0.2 * np.eye(3)[2])
+        reference = replace(described, T_flange_tool=tool)
         actual = drifted(reference, rng, 10.0 ** rng.uniform(np.log10(4e-6), np.log10(1.2e-4)))
-        stage = StagedCorrection(pack_model(reference), pack_model(actual), *BOUNDS)
-        way, middle = rng.uniform(-1.0, 1.0, 6), HOME + rng.uniform(-0.5, 0.5, 6)
+        way, middle = rng.uniform(-1.0, 1.0, 6), rng.uniform(-2.0, 2.0, 6)
         way[4], middle[4] = rng.choice([-1.0, 1.0]), 0.0
-        yield stage, actual, reference, middle + np.radians(60.0) * t[:, None] * way
+        rate, speed = rng.choice([250.0, 500.0]), np.radians(rng.uniform(10.0, 90.0))
+        t = np.arange(-round(0.3 * rate), round(0.3 * rate) + 1)[:, None] / rate
+        q = middle + speed * t * way
+        away = q[::10].copy()
+        away[:, 4] = np.pi / 2.0
+        near, far = (
+            np.linalg.svd(scaled_jacobian(reference, at), compute_uv=False) for at in (q, away)
+        )
+        if near[:, 4].min() > 0.25 and far[:, 5].min() > 0.1:
+            yield Crossing(reference, actual, q, np.tile(speed * way, (len(q), 1)), 1 / rate, speed)
+            count -= 1
 
 
-@pytest.mark.parametrize("name", ["kr150_r3100", "ur10"])
-def test_crossing_a_wrist_singularity_gives_up_one_rotation_alone(name: str) -> None:
-    rate, left = 0.0, 0.0
-    for stage, actual, reference, q in crossings(name, 200):
+@pytest.mark.parametrize("name", ["kr150_r3100", "ur10", "bx200l"])
+def test_crossing_a_wrist_singularity_gives_up_one_direction_alone(name: str) -> None:
+    for crossing in crossings(name, 200):
+        reference, actual, q = crossing.reference, crossing.actual, crossing.q
+        result = crossing.stage.correct(q)
+        assert result.arm.converged.all()
+        assert result.weak.any()
+        rate = np.abs(np.diff(result.q - q, axis=0)).max() / crossing.dt
+        assert np.degrees(rate) <= 2.0 * max(1.0, crossing.speed / np.radians(60.0))
+        goal, T = reference.fk(q) @ reference.T_flange_tool, actual.fk(result.q)
+        T = T @ actual.T_flange_tool
+        left = (goal - T)[:, :3, 3]
+        turn = frames.log_rotation(goal[:, :3, :3] @ np.swapaxes(T[:, :3, :3], -1, -2))
+        assert np.linalg.norm(left, axis=1).max() <= 0.04e-3
+        # without what the weak direction gives up
+        e = np.concatenate([left / LENGTH, turn], axis=1)
+        weak = np.linalg.svd(scaled_jacobian(reference, q))[0][:, :, 5]
+        e -= np.sum(weak * e, axis=1, keepdims=True) * weak
+        assert np.degrees(np.linalg.norm(e[:, 3:], axis=1).max()) <= 0.005
+
+
+def test_rates_are_the_derivative_all_through_a_crossing() -> None:
+    """Against differences of the fourth order, with another step."""
+    some = 0
+    for crossing in crossings("kr150_r3100", 20, seed=1):
+        stage, q, qd, h = crossing.stage, crossing.q, crossing.qd, 5e-4
         result = stage.correct(q)
-        assert result.whole.all() or result.weak.any()
-        shift = result.q - q
-        rate = max(rate, float(np.abs(np.diff(shift, axis=0)).max()) / 0.002)
-        left = max(left, pose_error(actual, result.q, reference.fk(q) @ TOOL)[0])
-    assert np.degrees(rate) <= 2.0
-    assert left <= 0.04e-3
+        v, a = stage.rates(q, qd, np.zeros_like(q), result)
+        ahead, on, behind, off = (shift(stage, q + k * h * qd) for k in (1, 2, -1, -2))
+        rate = (8.0 * (ahead - behind) - (on - off)) / (12.0 * h)
+        bend = (16.0 * (ahead + behind) - (on + off) - 30.0 * (result.q - q)) / (12.0 * h**2)
+        some += result.weak.any() and not result.weak.all()
+        # the least drift's zone is crossed in some 15 ms: (0.2 ms / 15 ms)^2 in a rate's third
+        # derivative, and its square root where the damping ends, in an acceleration's
+        assert np.abs(v - qd - rate).max() <= 1e-3 * np.abs(rate).max()
+        rounding = 4.0 * EXACT / RATE_STEP_S**2
+        assert np.abs(a - bend).max() <= 2e-2 * np.abs(bend).max() + rounding
+    assert some > 5
 
 
 def test_one_point_of_a_stream_has_the_bits_of_a_batch() -> None:
-    for stage, _, _, q in crossings("kr150_r3100", 3):
+    for crossing in crossings("kr150_r3100", 3):
+        stage, q = crossing.stage, crossing.q
         batch, out = stage.correct(q).q, np.empty((stage.stages, 6 + REPORT))
         for row, expected in zip(q, batch, strict=True):
             stage.correct_one(row, out)
