@@ -52,23 +52,27 @@ def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -
     graph.probe.destroy_publisher(cell.drive)
     settings = {"robot": "ur10", "serial": SERIAL}
     graph.start(
-        "joint_correction_node", settings, {"joint_trajectory": PROGRAM, "~/joint_trajectory": ROBOT}
+        "joint_correction_node",
+        settings,
+        {"joint_trajectory": PROGRAM, "~/joint_trajectory": ROBOT},
     )
     said = graph.collect(CorrectionStatus, "/joint_correction_node/status", qos.LATCHED)
-    to_program = graph.publisher(JointTrajectory, PROGRAM)
     target = np.radians(HOME_DEG) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1])
     motion = JointTrajectory(
         joint_names=cell.arm.joint_names,
         points=[JointTrajectoryPoint(positions=target, time_from_start=Duration(sec=2))],
     )
 
-    def becomes(state: int, within_s: float = 10.0) -> CorrectionStatus:
-        graph.spin_until(lambda: said and said[-1].state == state, f"{state}: {said[-1:]}", within_s)
-        return said[-1]
+    def becomes(state: int, within_s: float = 10.0) -> None:
+        graph.spin_until(
+            lambda: said and said[-1].state == state, f"{state}: {said[-1:]}", within_s
+        )
 
     becomes(CorrectionStatus.OFF, 30.0)
+    to_program = graph.publisher(JointTrajectory, PROGRAM)
     cell.begin("c1", 150.0)
-    assert becomes(CorrectionStatus.LEASED).lease.startswith("/maintenance_node: cycle 'c1'")
+    becomes(CorrectionStatus.LEASED)
+    graph.spin_until(lambda: "/maintenance_node: cycle 'c1'" in said[-1].lease, "who holds it")
     graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
     to_program.publish(motion)
     graph.spin_until(lambda: sum(said[-1].refused) == 1, "it is refused")
