@@ -198,8 +198,9 @@ class MaintenanceNode(HouseNode):
 
     def _tick(self) -> None:
         if self._session is not None:
-            self._carry_out(self._session.tick(*self._clocks()))
-            self._hold_lease()
+            requests = self._session.tick(*self._clocks())
+            self._hold_lease()  # before anything moves
+            self._carry_out(requests)
 
     def _hold_lease(self) -> None:
         session = self._session

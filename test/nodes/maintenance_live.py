@@ -151,7 +151,7 @@ class LiveCell:
         recent = self.joints[-round(RESTS_S * 125) :]
         if not self.sensing or len(recent) < 40:
             return
-        q = np.array([message.position for message in recent])
+        q = np.array([self.in_order(message) for message in recent])
         if np.max(np.ptp(q, axis=0)) > 1e-5:
             return
         ball = (T_SENSOR_BASE @ self.arm.fk(q[-1]) @ BALL)[:3]
@@ -163,7 +163,13 @@ class LiveCell:
 
     @property
     def q(self) -> np.ndarray:
-        return np.array(self.joints[-1].position)
+        return self.in_order(self.joints[-1])
+
+    def in_order(self, message: JointState) -> np.ndarray:
+        """Joints (n,) of the arm, rad: joint_state_broadcaster names them by alphabet."""
+        return np.array(
+            [message.position[list(message.name).index(n)] for n in self.arm.joint_names]
+        )
 
     def at_home(self) -> bool:
         return bool(np.max(np.abs(self.q - np.radians(HOME_DEG))) < 1e-3)
