@@ -10,13 +10,14 @@ import numpy as np
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.motion.robot_watch import RobotWatch
+from robocal_ros.motion.robot_watch import REST_RAD, VELOCITY_S, RobotWatch
 from robocal_ros.motion.stopping import stop
 
 STANDS_S = 0.1  # a robot that has rested for so long stands
 # From a message to what the controller says of it (10 ms measured, a cycle), and to readings that
 # show it: drives lag by some 15 ms, and a speed is of readings that are half a span old.
 SEEN_S = {True: 0.02, False: 0.045}
+SLOW = 2.0 * REST_RAD / VELOCITY_S  # rad/s (m/s); of a robot that rests readings may say so much
 SEEN = 0.08  # a planned loss of speed by this share must show, by half at least
 AGAIN_S = 0.02  # a stop that is rejected is not sent again sooner
 SHORTEST_AGAIN_S = 0.08  # of a stop that is sent again: time was lost
@@ -89,11 +90,12 @@ class WatchedStop:
         plan, since_s = self._plan, now_s - self._sent_s
         if self._rejected:
             return since_s >= AGAIN_S
-        lag_s = SEEN_S[robot.reference(now_s) is not None]
+        lag_s = SEEN_S[robot.reference(now_s) is not None] + robot.silent_s
         planned = (
             0.0 if plan is None else min((since_s - lag_s) * robot.scaling / plan.duration_s, 1.0)
         )
-        return planned > SEEN and robot.speed(now_s) > (1.0 - 0.5 * planned) * self._speed
+        obeys = max((1.0 - 0.5 * planned) * self._speed, SLOW)
+        return planned > SEEN and robot.speed(now_s) > obeys
 
     def _again(self, robot: RobotWatch, now_s: float) -> JointPlan:
         keeps = robot.reference(now_s) is not None

@@ -2,15 +2,17 @@
 
 import numpy as np
 import pytest
-from driven_robot import LAG_S, PERIOD_S, Robot
+from driven_robot import HOUSING, LAG_S, PERIOD_S, Robot
 from hypothesis import given
 from hypothesis import strategies as st
 
 from robocal_ros.core.codes import Code
+from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import LEAD_S, JointPlan
-from robocal_ros.motion.robot_watch import REST_RAD, MotionReport
+from robocal_ros.motion.robot_watch import REST_RAD, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
+from robocal_ros.motion.watched_stop import WatchedStop
 from robocal_ros.sessions.events import TOOL_STEP
 from robocal_ros.sessions.tool_driving import Phase
 from robocal_ros.sim.joint_motion import JointMotion
@@ -84,6 +86,21 @@ def test_every_motion_begins_ahead_of_now_with_velocities(robot, phase):
         )
         between = np.linspace(0.0, LEAD_S, 20)
         assert np.max(np.abs(begin.at(between)[0] - plan.at(between)[0])) < REST_RAD
+
+
+def test_a_stop_of_a_robot_that_rests_is_not_sent_again():
+    """Readings that tremble are no motion: a second stop would replace what is driven next."""
+    rng = np.random.default_rng(5)
+    robot = RobotWatch(ARM, DrivingConfig(HOUSING, 0.1, 0.008, 0.05))
+    stopping = WatchedStop(ARM, MotionLimits())
+    for now_s in np.arange(0.0, 1.0, PERIOD_S):
+        robot.reading(now_s, HOME + 3e-5 * rng.uniform(-1.0, 1.0, 6), now_s)
+        robot.silence.look(now_s)
+        if abs(now_s - 0.5) < 0.5 * PERIOD_S:
+            stopping.begin(stop(ARM, MotionLimits(), HOME, np.zeros(6)), now_s)
+        assert stopping.look(robot, now_s) is None
+    assert stopping.sent == 1
+    assert not stopping.under_way
 
 
 # ---- speed scaling and pauses -------------------------------------------------------------------
