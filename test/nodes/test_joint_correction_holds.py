@@ -27,6 +27,7 @@ from robocal_ros.nodes import conversions, qos
 from robocal_ros.storage.robots import load_description
 
 PERIOD_S = 0.02  # of the joint states
+RESTS_S = 0.5  # of a stream that begins: its first messages may be lost
 STREAM_TICKS = 2  # a busy machine must not hold the node up for two periods of the stream
 SPEED = np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.3])  # rad/s
 ROBOT = load_description("kr150_r3100")
@@ -111,14 +112,14 @@ class Moving(Line):
         self.to_states.publish(joints(self.at, velocity=speed.tolist()))
         self._ticks += 1
         if self._stream_from is not None and not self._ticks % STREAM_TICKS:
-            t, stamp = now - self._stream_from, time.time_ns()
+            t, stamp = max(now - self._stream_from - RESTS_S, 0.0), time.time_ns()
             self.stamps.add(stamp)
             place = HOME + SPEED * (0.5 * t * t if t < 1.0 else t - 0.5)
             fields = {"header": conversions.header(stamp, ""), "velocity": SPEED * min(t, 1.0)}
             self.to_target.publish(joints(place, **fields))
 
     def streams(self) -> None:
-        """Begin a stream, and let it come to its speed."""
+        """Begin a stream at rest, and let it come to its speed."""
         self._stream_from = time.time()
         moved = 0.8 * SPEED[0]
         self.graph.spin_until(lambda: self.at[0] - HOME[0] > moved, "the stream runs", 20.0)

@@ -93,10 +93,11 @@ def test_a_stop_of_a_robot_that_rests_is_not_sent_again():
     rng = np.random.default_rng(5)
     robot = RobotWatch(ARM, DrivingConfig(HOUSING, 0.1, 0.008, 0.05))
     stopping = WatchedStop(ARM, MotionLimits())
-    for now_s in np.arange(0.0, 1.0, PERIOD_S):
+    for number in range(125):
+        now_s = number * PERIOD_S
         robot.reading(now_s, HOME + 3e-5 * rng.uniform(-1.0, 1.0, 6), now_s)
         robot.silence.look(now_s)
-        if abs(now_s - 0.5) < 0.5 * PERIOD_S:
+        if number == 60:
             stopping.begin(stop(ARM, MotionLimits(), HOME, np.zeros(6)), now_s)
         assert stopping.look(robot, now_s) is None
     assert stopping.sent == 1
