@@ -69,6 +69,17 @@ class ClampedCorrection(StagedCorrection):
         reason = worst if np.any(kept < 1.0) else None
         return ClampedResult(made, full.arm, full.tool, kept, reason)
 
+    def uncorrect_one(self, corrected: Array) -> Array:
+        """Taught joints (n,) of one point's corrected ones."""
+        return np.asarray(self.uncorrect(corrected[None])[0])
+
+    def _by_chain_rule(
+        self, q: Array, before: Array, velocity: Array, after: Array, works: tuple[Array, Array]
+    ) -> Array | None:
+        if not self.correct(q[None]).whole[0]:
+            return None
+        return super()._by_chain_rule(q, before, velocity, after, works)
+
     def _shares(self, q: Array, full: StagedResult) -> dict[Reason, Array]:
         """Largest share (m,) of the shift by each bound; equation 1."""
         arm, (of_arm, of_tool) = full.arm, self._joint_bounds

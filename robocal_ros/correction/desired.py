@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction import solution
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, require_solved, require_within
 from robocal_ros.correction.clamping import ClampedResult, correction_between
 from robocal_ros.correction.joint_correction import pack_model
@@ -26,6 +27,7 @@ class DesiredOffset:
     known : the same as if it were on: a robot may show it that was corrected before.
     reduced : how many points were corrected in part, as a direction of theirs is weak.
     clamped, passed : how many messages were corrected in part, or not at all, for what bound.
+    made : whether the last message was corrected with ``stage``.
     tcp_shift_m, largest, remaining_m : of the last message: error at the tool that the drift would
         have made, largest offset wanted, error that is left.
     """
@@ -40,6 +42,9 @@ class DesiredOffset:
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
         self.tcp_shift_m = self.largest = self.remaining_m = 0.0
+        self.made = False
+        self._zero, self._out = np.zeros(reference.n), np.zeros((2, reference.n + solution.REPORT))
+        self._bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
 
     def want(self, actual: SerialArm, on: bool) -> None:
         """Correct for an arm with its tool from the next command on, or for nothing."""
@@ -54,6 +59,7 @@ class DesiredOffset:
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
+        self.made = False
         if self.stage is None:
             self.tcp_shift_m = self.largest = self.remaining_m = 0.0
             return np.zeros_like(q), None
@@ -67,12 +73,41 @@ class DesiredOffset:
                 self.passed[result.reason] += 1
                 return np.zeros_like(q), None
             self.clamped[result.reason] += 1
-        offset = result.q - q
+        offset, self.made = result.q - q, True
         self.reduced += int(np.count_nonzero(result.weak))
         self.tcp_shift_m = float(result.arm.tcp_shift_m.max())
         self.largest = float(np.abs(offset).max())
         self.remaining_m = float(result.remaining_m.max())
         return offset, result
+
+    def at_one(self, q: Array) -> Array:
+        """`at` for one point (n,), fast where nothing is out of the ordinary; not kept."""
+        stage, n = self.stage, len(q)
+        self.made = stage is not None
+        if stage is None:
+            self.tcp_shift_m = self.largest = self.remaining_m = 0.0
+            return self._zero
+        if self._config.policy is not Policy.REFUSE:
+            return np.asarray(self.at(q[None])[0][0])
+        out = self._out[: stage.stages]
+        stage.correct_one(q, out)
+        drift = out[0, n:]
+        weak = out[0, n + solution.WEAK] + out[-1, n + solution.WEAK]
+        if weak or not (
+            drift[solution.TCP_SHIFT] <= self._config.thermal.tcp_m
+            and drift[solution.TCP_ROTATION] <= self._config.thermal.tcp_rad
+        ):
+            return np.asarray(self.at(q[None])[0][0])
+        offset = out[-1, :n] - q
+        within = (np.abs(out[0, :n] - q) <= self._bounds[0]).all()
+        if stage.stages > 1:
+            within &= (np.abs(out[1, :n] - out[0, :n]) <= self._bounds[1]).all()
+        if not (within and out[:, n + solution.CONVERGED].all()):
+            return np.asarray(self.at(q[None])[0][0])
+        self.tcp_shift_m = float(drift[solution.TCP_SHIFT])
+        self.largest = float(np.abs(offset).max())
+        self.remaining_m = float(drift[solution.POSITION_ERROR])
+        return np.asarray(offset)
 
     def begins(self, q: Array) -> Array:
         """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.

@@ -33,6 +33,7 @@ LONGEST_STEP_S = 0.02
 MOST_STEPS = 10_000
 # A joint that was given no faster than this stands, rad/s (prismatic: m/s).
 STILL = 1e-3
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,56 @@ def step(
 
 
 @kernel
+def put_out(
+    state: Array, goal: Array, desired: Array, elapsed: float, longest: float, limits: Array,
+    active: Array, fastest: Array,
+    lower: Array, upper: Array, taught: Array, out: Array, most: Array, tried: Array,
+) -> float:  # fmt: skip
+    """Put one target of a stream out, if no joint is too fast on the way.
+
+    Parameters
+    ----------
+    elapsed, longest : time since the last output, and what of it a step may use.
+    active : (n,) 1 for the joints that go out.
+    fastest, lower, upper : (n,) speeds and limits of the joints.
+    taught, out, most : (n,) of the last output, and most that was withheld: renewed.
+    tried : (4, n) scratch; its last row is what would go out.
+
+    Returns
+    -------
+    float
+        Largest share of its speed that a joint takes; -1 where one would be beyond its limits.
+        Unless it is between 0 and 1, nothing has changed.
+    """
+    n, fast, share, inside = goal.shape[0], 0.0, 0.0, True
+    for j in range(n):
+        for row in range(3):
+            tried[row, j] = state[row, j]
+        if active[j] != 0.0:
+            fast = max(fast, abs(goal[j] - taught[j]))
+    if longest > 0.0:
+        moves = fast > STILL * elapsed
+        advance(tried[:3], desired, min(longest, LONGEST_STEP_S), moves, limits, active)
+    for j in range(n):
+        tried[DESIRED, j] = desired[j]
+        tried[3, j] = goal[j] + tried[OFFSET, j]
+        if active[j] != 0.0:
+            inside &= lower[j] - ROUNDING <= tried[3, j] <= upper[j] + ROUNDING
+            step = abs(tried[3, j] - out[j])
+            if step > ROUNDING:
+                share = max(share, step / (fastest[j] * longest) if longest > 0.0 else np.inf)
+    if not (inside and share <= 1.0 + ROUNDING):
+        return share if inside else -1.0
+    for j in range(n):
+        for row in range(3):
+            state[row, j] = tried[row, j]
+        if active[j] != 0.0:
+            taught[j], out[j] = goal[j], tried[3, j]
+            most[j] = max(most[j], abs(state[OFFSET, j] - state[DESIRED, j]))
+    return share
+
+
+@kernel
 def follow(
     state: Array, desired: Array, times: Array, speed: Array, limits: Array, active: Array,
     offsets: Array, rates: Array,
@@ -174,6 +225,7 @@ class OffsetLimiter:
     ----------
     state : (3, n) offset, its rate and the desired offset, at the last step.
     limits : (4, n).
+    most : (n,) most that was withheld of a target.
     """
 
     def __init__(self, prismatic: NDArray[np.bool_], turning: OffsetLimits, sliding: OffsetLimits):
@@ -182,7 +234,8 @@ class OffsetLimiter:
             np.where(prismatic, np.array(sliding.row())[:, None], np.array(turning.row())[:, None])
         )
         self.state = np.zeros((3, n))
-        self._all = np.ones(n)
+        self.most = np.zeros(n)
+        self._tried = np.empty((4, n))
 
     def begin(self, index: NDArray[np.int64], offset: Array, desired: Array) -> None:
         """Joints ``index`` (k,) stand with an offset (k,), at rest."""
@@ -195,11 +248,30 @@ class OffsetLimiter:
         """(n,) offset less the desired one."""
         return np.asarray(self.state[OFFSET] - self.state[DESIRED])
 
-    def step(self, desired: Array, dt_s: float, speed: float, active: Array | None = None) -> None:
-        """One message of a stream, ``dt_s`` after the last one; ``speed`` of the fastest joint."""
-        if dt_s > 0.0:
-            chosen = self._all if active is None else active
-            step(self.state, desired, dt_s, speed > STILL, self.limits, chosen)
+    def step(self, desired: Array, dt_s: float, active: Array) -> None:
+        """A step of ``dt_s`` > 0 at rest."""
+        step(self.state, desired, dt_s, False, self.limits, active)
+
+    def put_out(
+        self,
+        goal: Array,
+        desired: Array,
+        elapsed: float,
+        longest: float,
+        active: Array,
+        arm: tuple[Array, Array, Array],
+        sent: tuple[Array, Array],
+    ) -> tuple[float, Array]:
+        """One target of a stream; see `put_out`. Its share, and what would go out (n,).
+
+        ``arm``: fastest, lower, upper; ``sent``: taught and out of the last output.
+        """
+        times = elapsed, longest
+        share = put_out(
+            self.state, goal, desired, *times, self.limits, active, *arm, *sent, self.most,
+            self._tried,
+        )  # fmt: skip
+        return share, self._tried[3]
 
     def follow(
         self, desired: Array, times: Array, speed: Array, active: Array
@@ -213,5 +285,7 @@ class OffsetLimiter:
 def load_kernels(n: int) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
     limiter = OffsetLimiter(np.zeros(n, dtype=np.bool_), TURNING, SLIDING)
-    limiter.step(np.zeros(n), 0.004, 0.0)
+    limiter.step(np.zeros(n), 0.004, np.ones(n))
+    zeros, ones = np.zeros(n), np.ones(n)
+    limiter.put_out(zeros, zeros, 0.004, 0.004, ones, (ones, -ones, ones), (zeros, zeros.copy()))
     limiter.follow(np.zeros((2, n)), np.arange(2.0), np.zeros(2), np.ones(n))

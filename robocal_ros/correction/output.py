@@ -152,7 +152,7 @@ class Output:
         bare = corrected - withheld
         if stage is None or not np.isfinite(bare).all():
             return bare
-        return np.asarray(stage.uncorrect(bare[None])[0])
+        return stage.uncorrect_one(bare)
 
     # ---- where a command may begin --------------------------------------------------------------
 

@@ -91,7 +91,6 @@ class CorrectionSession:
         self._refused: Counter[Reason] = Counter()
         self._last_refusal = ""
         self._overtaken = 0
-        self._most = np.zeros(n)
 
     # ---- what the operator and the estimators decide --------------------------------------------
 
@@ -208,7 +207,6 @@ class CorrectionSession:
                 self._stream.end(error, now_s)
             raise self._count(error) from None
         self._goal[:] = q
-        np.maximum(self._most, np.abs(self._output.limiter.withheld), out=self._most)
         return corrected
 
     def tail(self, now_s: float) -> JointCommand | None:
@@ -264,7 +262,8 @@ class CorrectionSession:
         self._output.path = path
         self._stream.phase = Phase.IDLE
         self._goal[:] = q[-1]
-        np.maximum(self._most, np.abs(path.withheld).max(axis=0), out=self._most)
+        most = self._output.limiter.most
+        np.maximum(most, np.abs(path.withheld).max(axis=0), out=most)
         return corrected
 
     @property
@@ -365,13 +364,9 @@ class CorrectionSession:
         position[column] = taught[index]
         stage, _ = self._output.correction(now_s)
         if velocity is not None and stage is not None and len(column):
-            speed = np.zeros((1, self._reference.n))
-            speed[0, index], velocity = velocity[column], velocity.copy()
-            found, result = speed.copy(), stage.correct(taught[None])
-            for _ in range(2):  # the correction's slope is small: its square is left
-                found += speed - stage.rates(taught[None], found, np.zeros_like(found), result)[0]
-            if np.isfinite(found).all():
-                velocity[column] = found[0, index]
+            speed, velocity = np.zeros(self._reference.n), velocity.copy()
+            speed[index] = velocity[column]
+            velocity[column] = stage.taught_velocity_one(measured, speed, taught)[index]
         return taught, position, velocity
 
     def controller(
@@ -477,9 +472,9 @@ class CorrectionSession:
             largest_shift=desired.largest,
             remaining_m=desired.remaining_m,
             withheld=withheld,
-            withheld_most=self._most.copy(),
+            withheld_most=output.limiter.most.copy(),
             withheld_m=self._at_tool(withheld),
-            withheld_most_m=self._at_tool(self._most),
+            withheld_most_m=self._at_tool(output.limiter.most),
             lag_s=self._stream.lag_s,
             overtaken=self._overtaken,
             mismatch=output.mismatch,

@@ -232,3 +232,28 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
             first += straight.LANES
     for i in range(first, q.shape[0]):
         _correct_one(q[i], largest, free, room, out[i])
+
+
+@lean
+def uncorrect_staged(
+    corrected: Array, largest: Array, free: bool, works: Array, steps: int, exact: float,
+    out: Array, q: Array,
+) -> bool:  # fmt: skip
+    """Taught joints ``q`` (n,) of corrected ones, by q <- q' - shift(q); whether that is exact.
+
+    ``out``: as of `correct_staged`, at ``q``.
+    """
+    n = corrected.shape[0]
+    for i in range(n):
+        q[i] = corrected[i]
+    for _ in range(steps):
+        correct_staged(q, largest, free, works, out)
+        size = 0.0
+        for i in range(n):
+            miss = corrected[i] - out[works.shape[0] - 1, i]
+            size = max(size, abs(miss))
+            if abs(miss) > exact:
+                q[i] += miss
+        if not size > exact:
+            return size <= exact
+    return False

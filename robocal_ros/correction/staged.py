@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 EXACT = 1e-13  # rad, m: to rounding
 MOST_STEPS = 100
+ROUNDING = 1e-12  # rad/s, m/s
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,8 @@ class StagedCorrection:
         self.stages = len(parts)
         self._works = np.stack([part.work for part in parts])
         self._largest = np.stack([part.largest for part in parts])
+        self._still = np.zeros((1, self.n))
+        self._one = np.empty((self.stages, self.n + solution.REPORT))
         self._back = [part.inverse() for part in reversed(parts)]
 
     def correct(self, q: Array) -> StagedResult:
@@ -109,6 +112,51 @@ class StagedCorrection:
         joints are ``out[-1, :n]``. Both are contiguous arrays of float64.
         """
         solution.correct_staged(q, self._largest, self._free, self._works, out)
+
+    def uncorrect_one(self, corrected: Array) -> Array:
+        """`uncorrect` for one point (n,), for a stream."""
+        q = np.empty(self.n)
+        limits = self._largest, self._free
+        if solution.uncorrect_staged(corrected, *limits, self._works, 20, EXACT, self._one, q):
+            return q
+        return np.asarray(self.uncorrect(corrected[None])[0])
+
+    def velocity_one(self, q: Array, velocity: Array, corrected: Array) -> Array:
+        """Velocities (n,) of one point's corrected joints, as `rates` has them."""
+        found = self._by_chain_rule(q, q, velocity, corrected, (self._works[0], self._works[-1]))
+        if found is not None:
+            return found
+        result = self.correct(q[None])
+        return np.asarray(self.rates(q[None], velocity[None], self._still, result)[0][0])
+
+    def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
+        """Velocities (n,) of one point's taught joints ``q``, of those of the corrected ones."""
+        works = self._back[0].work, self._back[-1].work
+        found = self._by_chain_rule(q, corrected, velocity, q, works)
+        if found is not None:
+            return found
+        speed, result = velocity.copy(), self.correct(q[None])
+        for _ in range(MOST_STEPS):  # the shift changes slower than the joints move
+            miss = velocity - self.rates(q[None], speed[None], self._still, result)[0][0]
+            if not np.max(np.abs(miss)) > ROUNDING:
+                break
+            speed += miss
+        return speed
+
+    def _by_chain_rule(
+        self, q: Array, before: Array, velocity: Array, after: Array, works: tuple[Array, Array]
+    ) -> Array | None:
+        """Velocities (n,) at joints ``after`` where no direction is weak at ``q``."""
+        if self.n != 6 or self._free:
+            return None
+        self.correct_one(q, self._one)
+        if self._one[:, self.n + solution.WEAK].any():
+            return None
+        out, unused = np.empty((2, 1, self.n))
+        rates.rates_batch(
+            before[None], velocity[None], self._still, after[None], *works, out, unused
+        )
+        return out[0] if np.isfinite(out).all() else None
 
     def uncorrect(self, corrected: Array) -> Array:
         """Taught joints (m, n) of corrected ones: the inverse of `correct`.
@@ -160,3 +208,5 @@ def load_kernels(arm: SerialArm) -> None:
     stage.rates(q, q, q, stage.correct(q))
     stage.correct_one(q[0], np.empty((stage.stages, arm.n + solution.REPORT)))
     stage.uncorrect(q)
+    stage.uncorrect_one(q[0])
+    stage.velocity_one(q[0], q[0], q[0])

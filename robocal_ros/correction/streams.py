@@ -17,7 +17,6 @@ from robocal_ros.correction.limiter import DESIRED, LONGEST_STEP_S, OFFSET, OFFS
 from robocal_ros.correction.output import ROUNDING, Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.staged import StagedResult
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -56,10 +55,12 @@ class TargetStream:
         self._arm, self._config, self._state = arm, config, state
         self._desired, self._output = desired, output
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
+        self._limits = config.velocity_limits, arm.lower, arm.upper
         self.phase, self.lag_s = Phase.IDLE, 0.0
         self._why: RefusedError | None = None
         self._active = np.zeros(arm.n)  # 1 where a joint is commanded
-        self._goal, self._speed = np.full(arm.n, np.nan), np.zeros(arm.n)
+        self._goal, self._last = np.full((2, arm.n), np.nan)  # of the newest messages
+        self._interval_s = 0.0
         self._came_s = -np.inf
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._command: JointCommand | None = None
@@ -113,37 +114,41 @@ class TargetStream:
         if self.phase is Phase.IDLE:
             self._active[:] = 0.0
             self._intervals.clear()
-            self._speed[:] = 0.0
-        else:
-            self._note_arrival(index, q, interval)
-        new = index[self._active[index] == 0.0]
-        if len(new):
-            self._begin(new, q, now_s)
+            interval = 0.0
+        if interval > 0.0:
+            self._intervals.append(interval)
+        if index is not self._index or self.phase is Phase.IDLE:
+            self._choose(index, q, now_s)
+        self._last[:], self._interval_s = self._goal, interval
+        self._goal[:] = q
         self._output.path = None
-        self._active[:] = 0.0
-        self._active[index] = 1.0
-        self._goal[:], self._index = q, index
         self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
-        result = self._advance(now_s)
+        self._advance(now_s)
         if self.lag_s > CATCH_UP_S:
             raise RefusedError(
                 Reason.VELOCITY_LIMIT,
                 f"the stream is {self.lag_s:.3f} s ahead at the joints' speeds, allowed "
                 f"{CATCH_UP_S:g} s",
             )
-        return self._message(command, result)
+        return self._message(command)
 
-    def _note_arrival(self, index: Index, q: Array, interval: float) -> None:
-        self._speed[:] = 0.0
-        if interval > 0.0:
-            self._speed[index] = np.abs(q - self._goal)[index] / interval
-            self._intervals.append(interval)
+    def _choose(self, index: Index, q: Array, now_s: float) -> None:
+        """Other joints than before go out from now on; those that are new begin."""
+        new = index[self._active[index] == 0.0]
+        if len(new):
+            self._begin(new, q, now_s)
+        self._active[:] = 0.0
+        self._active[index] = 1.0
+        self._index = index
 
     def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
         """Go on after a pause only where the robot can be there soon; else a new begin."""
         chosen = self._active > 0.0
         self._state.require_fresh(np.flatnonzero(chosen), now_s)
-        spare = np.maximum(self._fastest - self._speed, 0.0)[chosen] * CATCH_UP_S
+        speed = np.zeros(self._arm.n)
+        if self._interval_s > 0.0:
+            speed = np.abs(self._goal - self._last) / self._interval_s
+        spare = np.maximum(self._fastest - speed, 0.0)[chosen] * CATCH_UP_S
         ahead = np.abs(q - self._output.taught)[chosen]
         if pause_s > RESUME_S or np.any(ahead > spare + self._config.start_near(self._arm)[chosen]):
             self.phase = Phase.IDLE
@@ -160,62 +165,74 @@ class TargetStream:
         if self.phase is Phase.IDLE:
             output.out_s = now_s
 
-    def _advance(self, now_s: float) -> StagedResult | None:
+    def _advance(self, now_s: float) -> None:
         """Put out what came in last, or as much of the way there as the speeds allow."""
-        output, limiter, index = self._output, self._output.limiter, self._index
+        output = self._output
         elapsed = max(now_s - output.out_s, 0.0)
         longest = min(elapsed, self._longest_s())
-        state, before = limiter.state.copy(), output.taught
+        self._before[:] = output.out
         q, fraction = self._goal, 1.0
         for _ in range(TRIES):
-            desired, result = self._desired.at(q[None])
-            way = np.abs(q - before)[index]
-            speed = float(np.max(way)) / elapsed if elapsed > 0.0 else 0.0
-            limiter.step(desired[0], min(longest, LONGEST_STEP_S), speed, self._active)
-            limiter.state[DESIRED] = desired[0]
-            out = q + limiter.state[OFFSET]
-            allowed = (self._fastest[index] * longest if longest > 0.0 else 0.0) + ROUNDING
-            step = np.abs(out - output.out)[index]
-            if np.all(step <= allowed):
+            desired = self._desired.at_one(q)
+            share, tried = output.limiter.put_out(
+                q,
+                desired,
+                elapsed,
+                longest,
+                self._active,
+                self._limits,
+                (output.taught, output.out),
+            )
+            if share < 0.0:
+                require_limits(tried[None], self._arm)
+            if share <= 1.0 + ROUNDING:
                 break
-            limiter.state[:] = state
-            fraction *= 0.999 * float(np.min(allowed / np.maximum(step, allowed * 1e-3)))
-            q = self._goal.copy()
-            q[index] = before[index] + fraction * (self._goal - before)[index]
+            fraction *= 0.999 / share
+            way = (self._goal - output.taught) * self._active
+            q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
         else:
-            q, out = before.copy(), output.out.copy()
-            limiter.state[OFFSET_RATE] = 0.0
-        require_limits(out[None], self._arm)
-        self._before[:], self._step_s = output.out, elapsed
-        output.taught[index], output.out[index] = q[index], out[index]
-        output.out_s = now_s
-        output.stage = self._desired.stage if result is not None else None
-        ahead = np.abs(self._goal - output.taught)[index] / self._fastest[index]
-        self.lag_s = float(np.max(ahead)) if len(ahead) else 0.0
-        return result
+            output.limiter.state[OFFSET_RATE] = 0.0
+        self._step_s, output.out_s = elapsed, now_s
+        output.stage = self._desired.stage if self._desired.made else None
+        self.lag_s = 0.0
+        if fraction < 1.0:
+            ahead = np.abs(self._goal - output.taught) * self._active / self._fastest
+            self.lag_s = float(np.max(ahead))
 
-    def _message(self, command: JointCommand, result: StagedResult | None) -> JointCommand:
+    def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""
-        output, index = self._output, self._index
-        position = output.out[index]
-        velocity = command.velocity
+        output, index, velocity = self._output, self._index, command.velocity
+        state = output.limiter.state
         if velocity is not None:
-            rate = output.limiter.state[OFFSET_RATE]
-            stage, withheld = output.stage, output.limiter.withheld[index]
-            if self.lag_s > 0.0 and self._step_s > 0.0:
-                velocity = (output.out - self._before)[index] / self._step_s
-            elif stage is not None and result is not None and not withheld.any():
-                speeds = np.zeros((1, self._arm.n))
-                speeds[0, index] = velocity
-                velocity = stage.rates(self._goal[None], speeds, np.zeros_like(speeds), result)[0][
-                    0, index
-                ]
-            else:
-                velocity = velocity + rate[index]
-            hold_speeds(command.names, velocity[None], np.ones(1), self._fastest[index])
-        if self.lag_s == 0.0 and not output.limiter.state[OFFSET, index].any():
+            velocity = self._velocity(velocity)
+        if self.lag_s == 0.0 and not state[OFFSET].any():
             return command
-        return replace(command, position=position, velocity=velocity, mark=CORRECTED)
+        return JointCommand(command.names, output.out[index], velocity, command.stamp_ns, CORRECTED)
+
+    def _velocity(self, velocity: Array) -> Array:
+        """Velocities (k,) that go out for those of the last target.
+
+        By the chain rule where the offset is the desired one, else by what went out, or the
+        limiter's rates.
+        """
+        output, index = self._output, self._index
+        state, stage = output.limiter.state, output.stage
+        if self.lag_s > 0.0 and self._step_s > 0.0:
+            velocity = (output.out - self._before)[index] / self._step_s
+        elif stage is not None and np.array_equal(state[OFFSET], state[DESIRED]):
+            speeds = np.zeros(self._arm.n)
+            speeds[index] = velocity
+            velocity = stage.velocity_one(output.taught, speeds, output.out)[index]
+        else:
+            velocity = velocity + state[OFFSET_RATE, index]
+        if (np.abs(velocity) > self._fastest[index] * (1.0 + ROUNDING)).any():
+            hold_speeds(
+                [self._arm.joint_names[i] for i in index],
+                velocity[None],
+                np.ones(1),
+                self._fastest[index],
+            )
+        return velocity
 
     # ---- without a message ----------------------------------------------------------------------
 
@@ -244,7 +261,8 @@ class TargetStream:
         late = now_s - self._came_s > 1.5 * self._longest_s() / 2.0
         if self.phase is Phase.RUNNING and self.lag_s > 0.0 and late:
             command = replace(self._command, position=self._goal[self._index], velocity=None)
-            return self._message(command, self._advance(now_s))
+            self._advance(now_s)
+            return self._message(command)
         return None
 
     def _slowed(self, command: JointCommand, now_s: float) -> JointCommand:

@@ -143,7 +143,7 @@ class TrajectoryCorrector:
         limiter, more_s, dt = self._output.limiter, 0.0, 0.02
         target, state = limiter.state[DESIRED].copy(), limiter.state.copy()
         while more_s < LONGEST_WAIT_S and np.any(np.abs(limiter.withheld * active) > SETTLED):
-            limiter.step(target, dt, 0.0, active)
+            limiter.step(target, dt, active)
             more_s += dt
         limiter.state[:] = state
         raise RefusedError(

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-
 from robocal_ros.correction.memory import RESPONSE_S
 from robocal_ros.correction.starting import Sent
 
