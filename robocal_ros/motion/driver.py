@@ -48,8 +48,8 @@ CONTROLLER = (
 )
 LEASE_S = 0.2  # between two messages of a lease that is held
 LINES_S = 0.01  # between points for a controller that has no velocities
-STATED_S = 0.1  # a controller's state that is older says nothing of where it is
-STAMP_LEAD_S = 0.02  # at the present speed, until a stop that is stamped begins: it is taken by then
+STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
+STAMP_LEAD_S = 0.01  # at the present speed, until a stop that is stamped begins: it is taken by then
 BESIDE = 1e-3  # rad (m); a plan that begins further from the controller's reference is not of it
 
 
@@ -92,7 +92,8 @@ class MotionDriver:
         node.add_input(Float64, "speed_scaling", self._take_scaling, qos.SENSOR)
         self._stated_s = -np.inf  # when the controller told its own scaling
         self._stated: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._scaling = 1.0
+        self._ahead_s = np.inf  # its clock, of this one, by its last stamp
+        self._scaling, self._stops = 1.0, False
         self._velocities = True  # whether the hardware has any, as far as the controller says
         self._newest = 0
         self.way = ""
@@ -109,12 +110,14 @@ class MotionDriver:
         """Send a motion, which takes the place of what the controller drives.
 
         A stop is stamped with the controller's own time of the plan's begin, where the controller
-        tells its reference: then it goes on along the plan without a step, whatever the hardware
-        tells. Else, where the hardware tells no velocities, it is lines: the controller would begin
-        cubics with a speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers
-        4.42.1).
+        tells its reference: then the command goes on along the plan without a step, whatever the
+        hardware tells and however it lags, and a stop that comes after its end is rejected. One
+        that is sent again trusts no stamp: it begins when it arrives, where the robot is measured;
+        as lines, where the hardware tells no velocities: the controller would begin cubics with a
+        speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers 4.42.1).
         """
-        begins_ns = self._begin_ns(plan) if stop else None
+        begins_ns = self._begin_ns(plan) if stop and not self._stops else None
+        self._stops = stop
         if begins_ns is not None:
             message = trajectory_message(plan.going_on(STAMP_LEAD_S), self._names, at_once=True)
             message.header.stamp = Time(sec=begins_ns // NS, nanosec=begins_ns % NS)
@@ -139,15 +142,14 @@ class MotionDriver:
         """
         if self._stated is None or self._now() - self._stated_s > STATED_S or self._scaling != 1.0:
             return None
-        stamp_ns, q, qd = self._stated
+        begin_ns, q, qd = self._stated
         speed = float(np.linalg.norm(qd))
-        if speed == 0.0 or not np.isfinite(speed):
+        if not 0.0 < speed < np.inf:
             return None
         after_s = float((plan.q[0] - q) @ qd) / speed**2
         beside = np.max(np.abs(plan.q[0] - q - after_s * qd))
-        if not (abs(after_s) < STATED_S and beside < BESIDE):
-            return None
-        return stamp_ns + round(after_s * NS)
+        known = abs(after_s) < STATED_S and beside < BESIDE
+        return begin_ns + round(after_s * NS) if known else None
 
     def _say(self, way: str) -> None:
         if way == self.way:
@@ -206,7 +208,8 @@ class MotionDriver:
         speeds = np.array(message.feedback.velocities, dtype=np.float64)
         known = len(speeds) == count and bool(np.isfinite(speeds).all())
         self._velocities = known and bool(speeds.any())
-        self._stated_s, self._stated = now_s, None
+        begin_ns, self._stated_s, self._stated = stamp_ns(message.header.stamp), now_s, None
+        before_s, self._ahead_s = self._ahead_s, begin_ns / NS - now_s
         self._scaling = message.speed_scaling_factor
         if robot is not None:
             robot.scaled(self._scaling, now_s)
@@ -214,7 +217,8 @@ class MotionDriver:
         if len(reference.positions) != count or len(reference.velocities) != count:
             return  # a controller that holds may leave them out
         q, qd = np.array(reference.positions)[index], np.array(reference.velocities)[index]
-        self._stated = stamp_ns(message.header.stamp), q, qd
+        if abs(self._ahead_s - before_s) < STATED_S:
+            self._stated = begin_ns, q, qd
         if robot is not None:
             robot.controller(q, qd, now_s)
 

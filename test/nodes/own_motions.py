@@ -6,9 +6,11 @@ are JSON.
 
 import json
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -31,12 +33,17 @@ from robocal_ros.storage.robots import load_robot
 ARM = load_robot("ur10")
 HOME = np.radians([2.3, -124.4, -70.9, 107.7, -91.1, 91.8])
 TICK_S = 0.01
+REST_S = 0.1
+DEEP = QoSProfile(
+    depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
 
 
 class OwnMotions(HouseNode):
-    """Orders: ``{"go": [...]}`` to joints from rest, ``{"replace": [...]}`` in motion, ``{"stop"}``.
+    """Orders: ``{"go": joints}`` from rest, ``{"stop": true}``.
 
-    Reports carry what came of the order: ``moves``, ``arrived``, ``stops``, ``stood``, ``fault``.
+    Of either the first sends may be ``lost``, ``rejected`` (so many), or come ``late_s``; ``slow``:
+    the deceleration of the stop, rad/s^2. Reports: ``moves``, ``arrived``, ``stops``, ``stood``.
     """
 
     NAME = "own_motions"
@@ -45,27 +52,23 @@ class OwnMotions(HouseNode):
     def configure(self) -> None:
         """Open all."""
         load_motion(ARM)
-        config = MaintenanceConfig(
-            home=HOME,
-            poses=np.empty((0, 6)),
-            T_flange_tool=np.eye(4),
-            driving=driving_config(self.settings),
-            travel_speed_m_s=2.0,
-        )
-        self._cell = Ways(ARM, config).cell
-        self.mover, self._steady = Mover(config, Ways(ARM, config)), SteadyClock(lambda for_s: None)
-        self._planned_s = 0.0
-        self._last: dict[str, Any] = {}
+        self._driving = driving_config(self.settings)
+        self._steady = SteadyClock(lambda for_s: None)
+        self.mover = self._mover(10.0)
+        self._order: dict[str, Any] = {}
+        self._stops: dict[str, Any] | None = None
+        self._going = False
+        self._names = list(ARM.joint_names)
         self.motion = MotionDriver(
             self,
-            ARM.joint_names,
+            self._names,
             self.settings["follow_joint_trajectory"],
             self.settings["hard_stop_service"],
             self._reported,
             lambda: self.mover.watch,
             self._steady.now_s,
         )
-        self.reports = self.add_output(String, "own/reports", qos.LATCHED)
+        self.reports = self.add_output(String, "own/reports", DEEP)
         self.add_input(JointState, "joint_states", self._take_joints, qos.STREAM)
         self.add_input(String, "own/orders", self._take_order, qos.RELIABLE)
         self.add_timer(TICK_S, self._tick, steady=True)
@@ -78,9 +81,22 @@ class OwnMotions(HouseNode):
         """Take the client down."""
         self.motion.close()
 
+    def _mover(self, slow: float) -> Mover:
+        limits = replace(self._driving.limits, stop_deceleration=slow)
+        config = MaintenanceConfig(
+            home=HOME,
+            poses=np.empty((0, 6)),
+            T_flange_tool=np.eye(4),
+            driving=replace(self._driving, limits=limits),
+            travel_speed_m_s=2.0,
+        )
+        ways = Ways(ARM, config)
+        self._cell = ways.cell
+        return Mover(config, ways)
+
     def _say(self, what: str, **more: Any) -> None:
-        self._last = {"what": what, "unix_s": time.time(), **more}
-        self.reports.publish(String(data=json.dumps(self._last)))
+        report = {"what": what, "unix_s": time.time(), **more}
+        self.reports.publish(String(data=json.dumps(report)))
 
     def _take_joints(self, message: Any) -> None:
         self.motion.hear(message)
@@ -89,33 +105,41 @@ class OwnMotions(HouseNode):
         self.mover.reading(sample.stamp_ns / NS, q, self._steady.now_s())
 
     def _take_order(self, message: Any) -> None:
-        order, now_s = json.loads(message.data), self._steady.now_s()
-        if "stop" in order:
+        self._order = json.loads(message.data)
+        if "stop" in self._order:
             self._stop("ordered")
-            return
-        if "go" in order:
-            q = self.mover.resting(0.1)
-            if q is None:
-                self._say("fault", why="the robot does not rest")
-                return
-            plan = joint_way(self._cell, q, order["go"])
-        else:
-            q, qd = self.mover.watch.state(now_s, keeps=True)
-            ends = np.stack([q, order["replace"]]), np.stack([qd, np.zeros(6)])
-            plan = JointPlan(np.array([0.0, order["in_s"]]), *ends, np.zeros((2, 6)))
-        self.mover.start(Route(plan, ((0, 0),), (plan.duration_s,)), now_s)
+        else:  # once it rests
+            self._going, self.mover = True, self._mover(self._order.get("slow", 10.0))
+
+    def _go(self, q: Any) -> None:
+        self._going = False
+        plan = joint_way(self._cell, q, self._order["go"])
+        self.mover.start(Route(plan, ((0, 0),), (plan.duration_s,)), self._steady.now_s())
         self.mover.sent(self._steady.now_s())
-        self.motion.send(plan, stop=False)
+        self._send(plan, stop=False)
         self._say("moves", lasts_s=plan.duration_s)
+
+    def _send(self, plan: JointPlan, *, stop: bool) -> None:
+        order, names = self._order, list(ARM.joint_names)
+        if order.get("lost", 0) > 0:
+            order["lost"] -= 1
+            return
+        if order.get("rejected", 0) > 0:
+            order["rejected"] -= 1
+            names = [f"no_{name}" for name in names]
+        time.sleep(order.pop("late_s", 0.0))
+        self._names[:] = names
+        self.motion.send(plan, stop=stop)
+        self._names[:] = ARM.joint_names
 
     def _stop(self, why: str) -> None:
         plan = self.mover.stop(self._steady.now_s())
         if plan is None:
-            self._say("fault", why=f"nothing to stop: {why}")
+            self._say("refused", why=f"nothing to stop: {why}")
             return
-        self._planned_s = plan.duration_s
-        self._say("stops", why=why, planned_s=plan.duration_s)
-        self.motion.send(plan, stop=True)
+        self._stops = {"why": why, "planned_s": plan.duration_s}
+        self._say("stops", **self._stops)
+        self._send(plan, stop=True)
 
     def _reported(self, report: MotionReport) -> None:
         self.mover.reported(report)
@@ -124,18 +148,27 @@ class OwnMotions(HouseNode):
     def _tick(self) -> None:
         mover, now_s = self.mover, self._steady.now_s()
         mover.look(now_s)
-        stopping, stopped = mover.stopping, self._last.get("what") == "stops"
+        stopping = mover.stopping
         if (plan := stopping.look(mover.watch, now_s)) is not None:
-            self.motion.send(plan, stop=True)
-        if stopped and not stopping.under_way:
-            self._say("stood", why=self._last["why"], sent=stopping.sent, planned_s=self._planned_s)
+            self._send(plan, stop=True)
+        if self._stops is not None and not stopping.under_way:
+            self._say("stood", sent=stopping.sent, failed=stopping.failed, **self._stops)
+            self._stops = None
         try:
             mover.require_sane(now_s)
         except FaultError as error:
             self._stop(str(error))
+        if self._going and (q := mover.resting(REST_S)) is not None:
+            self._go(q)
         if mover.arrived(now_s):
             self._say("arrived", way=self.motion.way)
 
 
 if __name__ == "__main__":
+    import os
+
+    from robocal_ros.motion import driver
+
+    if os.environ.get("UNSTAMPED"):
+        driver.STATED_S = -1.0
     run(OwnMotions)
