@@ -93,7 +93,7 @@ class MotionDriver:
         self._stated_s = -np.inf  # when the controller told its own scaling
         self._stated: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
         self._ahead_s = np.inf  # its clock, of this one, by its last stamp
-        self._scaling, self._stops = 1.0, False
+        self._scaling, self._rejected = 1.0, False
         self._velocities = True  # whether the hardware has any, as far as the controller says
         self._newest = 0
         self.way = ""
@@ -111,13 +111,14 @@ class MotionDriver:
 
         A stop is stamped with the controller's own time of the plan's begin, where the controller
         tells its reference: then the command goes on along the plan without a step, whatever the
-        hardware tells and however it lags, and a stop that comes after its end is rejected. One
-        that is sent again trusts no stamp: it begins when it arrives, where the robot is measured;
-        as lines, where the hardware tells no velocities: the controller would begin cubics with a
-        speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers 4.42.1).
+        hardware tells and however it lags, and a stop that comes after its end is rejected. After
+        a rejection no stamp is trusted: then it begins when it arrives, where the robot is
+        measured; as lines, where the hardware tells no velocities: the controller would begin
+        cubics with a speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers
+        4.42.1).
         """
-        begins_ns = self._begin_ns(plan) if stop and not self._stops else None
-        self._stops = stop
+        self._rejected = self._rejected and stop
+        begins_ns = self._begin_ns(plan) if stop and not self._rejected else None
         if begins_ns is not None:
             message = trajectory_message(plan.going_on(STAMP_LEAD_S), self._names, at_once=True)
             message.header.stamp = Time(sec=begins_ns // NS, nanosec=begins_ns % NS)
@@ -163,6 +164,7 @@ class MotionDriver:
     def _answered(self, number: int, future: Future) -> None:
         handle: Any = future.result()
         if not handle.accepted:
+            self._rejected = True
             self._report(number, failed=True, words="the controller rejected the motion")
             return
         self._report(number)

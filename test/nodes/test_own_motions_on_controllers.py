@@ -58,7 +58,11 @@ class Own:
         ends = HOME if abs(start[0] - HOME[0]) > 0.3 else HOME + STEP
         self.side = np.sign(ends[0] - start[0])
         self.order(go=ends.tolist(), **order)
-        self.controller.moved(away, start)
+        try:
+            self.controller.moved(away, start)
+        except BaseException:
+            print("REPORTS", self.reports, start, ends, self.controller.q)
+            raise
 
 
 def test_measure(controller):
