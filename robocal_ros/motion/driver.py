@@ -128,13 +128,13 @@ class MotionDriver:
         self._newest += 1
         number = self._newest
         if self._client is None or not self._client.server_is_ready():
-            self._say(f"the topic {self.topic.topic_name}; no rejection is seen")
             self.topic.publish(message)
+            self._say(f"the topic {self.topic.topic_name}; no rejection is seen")
             return
-        self._say(f"the action {self.action}")
         goal = FollowJointTrajectory.Goal(trajectory=message)
         future = self._client.send_goal_async(goal)
         future.add_done_callback(guarded(self._node, lambda done: self._answered(number, done)))
+        self._say(f"the action {self.action}")
 
     def _begin_ns(self, plan: JointPlan) -> int | None:
         """When the controller is where the plan begins, by its own clock; None: not known.

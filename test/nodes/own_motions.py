@@ -113,11 +113,15 @@ class OwnMotions(HouseNode):
 
     def _go(self, q: Any) -> None:
         self._going = False
+        t0 = time.time()
         plan = joint_way(self._cell, q, self._order["go"])
+        t1 = time.time()
         self.mover.start(Route(plan, ((0, 0),), (plan.duration_s,)), self._steady.now_s())
         self.mover.sent(self._steady.now_s())
+        t2 = time.time()
         self._send(plan, stop=False)
-        self._say("moves", lasts_s=plan.duration_s)
+        t3 = time.time()
+        self._say("moves", lasts_s=plan.duration_s, t=[t0, t1, t2, t3])
 
     def _send(self, plan: JointPlan, *, stop: bool) -> None:
         order, names = self._order, list(ARM.joint_names)
@@ -133,11 +137,12 @@ class OwnMotions(HouseNode):
         self._names[:] = ARM.joint_names
 
     def _stop(self, why: str) -> None:
+        late = self.mover.watch.late_s(self._steady.now_s())
         plan = self.mover.stop(self._steady.now_s())
         if plan is None:
             self._say("refused", why=f"nothing to stop: {why}")
             return
-        self._stops = {"why": why, "planned_s": plan.duration_s}
+        self._stops = {"why": why, "planned_s": plan.duration_s, "late": late}
         self._say("stops", **self._stops)
         self._send(plan, stop=True)
 
