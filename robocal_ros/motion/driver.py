@@ -49,7 +49,9 @@ CONTROLLER = (
 LEASE_S = 0.2  # between two messages of a lease that is held
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
-STAMP_LEAD_S = 0.01  # at the present speed, until a stop that is stamped begins: it is taken by then
+STAMP_LEAD_S = (
+    0.01  # at the present speed, until a stop that is stamped begins: it is taken by then
+)
 BESIDE = 1e-3  # rad (m); a plan that begins further from the controller's reference is not of it
 
 

@@ -40,10 +40,11 @@ DEEP = QoSProfile(
 
 
 class OwnMotions(HouseNode):
-    """Orders: ``{"go": joints}`` from rest, ``{"stop": true}``.
+    """Orders: ``go`` to joints, from rest; ``stop``.
 
-    Of either the first sends may be ``lost``, ``rejected`` (so many), or come ``late_s``; ``slow``:
-    the deceleration of the stop, rad/s^2. Reports: ``moves``, ``arrived``, ``stops``, ``stood``.
+    Of either, so many of the first messages are ``lost`` or of joints that the controller does not
+    have: ``rejected``; ``late_s``: the first one is sent so late. ``slow``: deceleration of the
+    stops of a motion, rad/s^2. Reports: ``moves``, ``arrived``, ``stops``, ``stood``.
     """
 
     NAME = "own_motions"
@@ -59,6 +60,7 @@ class OwnMotions(HouseNode):
         self._stops: dict[str, Any] | None = None
         self._going = False
         self._names = list(ARM.joint_names)
+        self._ticked_s = self._longest_tick_s = 0.0
         self.motion = MotionDriver(
             self,
             self._names,
@@ -113,15 +115,11 @@ class OwnMotions(HouseNode):
 
     def _go(self, q: Any) -> None:
         self._going = False
-        t0 = time.time()
         plan = joint_way(self._cell, q, self._order["go"])
-        t1 = time.time()
         self.mover.start(Route(plan, ((0, 0),), (plan.duration_s,)), self._steady.now_s())
         self.mover.sent(self._steady.now_s())
-        t2 = time.time()
         self._send(plan, stop=False)
-        t3 = time.time()
-        self._say("moves", lasts_s=plan.duration_s, t=[t0, t1, t2, t3])
+        self._say("moves", lasts_s=plan.duration_s)
 
     def _send(self, plan: JointPlan, *, stop: bool) -> None:
         order, names = self._order, list(ARM.joint_names)
@@ -137,13 +135,13 @@ class OwnMotions(HouseNode):
         self._names[:] = ARM.joint_names
 
     def _stop(self, why: str) -> None:
-        late = self.mover.watch.late_s(self._steady.now_s())
         plan = self.mover.stop(self._steady.now_s())
         if plan is None:
             self._say("refused", why=f"nothing to stop: {why}")
             return
-        self._stops = {"why": why, "planned_s": plan.duration_s, "late": late}
+        self._stops = {"why": why, "planned_s": plan.duration_s}
         self._say("stops", **self._stops)
+        self._longest_tick_s = 0.0
         self._send(plan, stop=True)
 
     def _reported(self, report: MotionReport) -> None:
@@ -152,12 +150,15 @@ class OwnMotions(HouseNode):
 
     def _tick(self) -> None:
         mover, now_s = self.mover, self._steady.now_s()
+        self._longest_tick_s = max(self._longest_tick_s, now_s - self._ticked_s)
+        self._ticked_s = now_s
         mover.look(now_s)
         stopping = mover.stopping
         if (plan := stopping.look(mover.watch, now_s)) is not None:
             self._send(plan, stop=True)
         if self._stops is not None and not stopping.under_way:
-            self._say("stood", sent=stopping.sent, failed=stopping.failed, **self._stops)
+            how = {"sent": stopping.sent, "failed": stopping.failed}
+            self._say("stood", longest_tick_s=self._longest_tick_s, **how, **self._stops)
             self._stops = None
         try:
             mover.require_sane(now_s)
@@ -170,10 +171,6 @@ class OwnMotions(HouseNode):
 
 
 if __name__ == "__main__":
-    import os
-
-    from robocal_ros.motion import driver
-
-    if os.environ.get("UNSTAMPED"):
-        driver.STATED_S = -1.0
+    import faulthandler, signal
+    faulthandler.register(signal.SIGUSR1)
     run(OwnMotions)
