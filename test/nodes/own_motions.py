@@ -171,6 +171,4 @@ class OwnMotions(HouseNode):
 
 
 if __name__ == "__main__":
-    import faulthandler, signal
-    faulthandler.register(signal.SIGUSR1)
     run(OwnMotions)
