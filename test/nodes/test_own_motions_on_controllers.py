@@ -4,6 +4,7 @@ The real one is looked for in the environment; without it those tests are skippe
 """
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,20 @@ from typing import Any
 import numpy as np
 import pytest
 from action_msgs.srv import CancelGoal
+from control_msgs.msg import JointTrajectoryControllerState
 from own_motions import DEEP
+from sensor_msgs.msg import JointState
 from std_msgs.msg import String
-from trajectory_controllers import CONTROLLERS, HOME, NODE, Controlled, trajectory
+from trajectory_controllers import (
+    CONTROLLERS,
+    HOME,
+    NAMES,
+    NODE,
+    Controlled,
+    seconds,
+    trajectory,
+)
+from trajectory_msgs.msg import JointTrajectory
 
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
 ACTION = f"/{NODE}/follow_joint_trajectory"
@@ -24,7 +36,7 @@ SCRIPT = Path(__file__).with_name("own_motions.py")
 class Own:
     """The node of `own_motions`, on a controller."""
 
-    def __init__(self, controller: Controlled) -> None:
+    def __init__(self, controller: Controlled, **more: Any) -> None:
         self.controller, self.graph = controller, controller.graph
         self.reports: list[dict[str, Any]] = []
         take: Callable[[Any], None] = lambda message: self.reports.append(json.loads(message.data))  # noqa: E731
@@ -34,7 +46,7 @@ class Own:
             "follow_joint_trajectory": ACTION,
             "motion_silence_s": 0.5,
             "motion_late_s": 0.5,
-        }
+        } | more
         self.graph.start(SCRIPT, parameters, {"controller_state": f"{NODE}/controller_state"})
         self.orders = self.graph.publisher(String, "own/orders")
         self.wait("ready")
@@ -71,9 +83,9 @@ class Own:
         """Wait until it has been stopped, and stands; the report, with how long that ``took``."""
         stood, stops = self.wait("stood"), self.wait("stops")
         self.controller.stands()
-        time, sent = self.controller.sent(stops["unix_s"] - 0.05)
+        at_s, sent = self.controller.sent(stops["unix_s"] - 0.05)
         moved = np.max(np.abs(np.diff(sent, axis=0)), axis=1) > 1e-6
-        last_s = time[1:][moved][-1] if np.any(moved) else stops["unix_s"]
+        last_s = at_s[1:][moved][-1] if np.any(moved) else stops["unix_s"]
         return stood | {"took_s": float(last_s - stops["unix_s"])}
 
     def arrive(self) -> None:
@@ -109,13 +121,13 @@ def test_a_stop_slows_down_evenly_and_never_goes_back(own):
     stood = own.stopped()
     assert stood["sent"] == 1
     assert stood["took_s"] < 1.5 * stood["planned_s"]
-    time, speed = own.controller.speeds(begin_s)
+    at_s, speed = own.controller.speeds(begin_s)
     speed = speed * np.sign(way)
     assert np.min(speed) > -1e-3
     assert np.max(speed) < 1.05
     # Planned: 3.3 rad/s^2. At once it would be 250, and 40 to 220 where the controller begins at
     # the measured position.
-    harder = np.diff(speed, axis=0) / np.diff(time)[:, None]
+    harder = np.diff(speed, axis=0) / np.diff(at_s)[:, None]
     assert np.max(np.abs(harder)) < 2.5 * 3.3
 
 
@@ -151,10 +163,10 @@ def test_a_motion_follows_the_speed_scaling_and_outlasts_a_pause(own):
     own.wait("arrived")
     assert [report["what"] for report in own.reports] == ["moves", "arrived"]
     assert controller.stands() == pytest.approx(HOME + STEP, abs=1e-6)
-    time, speed = controller.speeds(begin_s)
+    at_s, speed = controller.speeds(begin_s)
     assert np.min(speed * np.sign(way)) > -1e-6
     for (since_s, factor), (until_s, _) in zip(changes, [*changes[1:], (np.inf, 0.0)], strict=True):
-        inside = (time > since_s + 0.02) & (time < until_s - 0.02)
+        inside = (at_s > since_s + 0.02) & (at_s < until_s - 0.02)
         assert np.max(np.abs(speed[inside])) < 1.01 * factor + 1e-9
 
 
@@ -198,8 +210,8 @@ def _replace(own: Own, way: np.ndarray) -> None:
 
 
 def _no_number(own: Own, way: np.ndarray) -> None:
-    (time, q, _), end = _elsewhere(own, way)
-    own.controller.goal(trajectory([(time, q, np.full(6, np.nan)), end]))
+    (at_s, q, _), end = _elsewhere(own, way)
+    own.controller.goal(trajectory([(at_s, q, np.full(6, np.nan)), end]))
 
 
 STRANGERS = {
@@ -228,3 +240,50 @@ def test_what_strangers_and_the_network_do_to_a_motion_ends_in_a_stop_and_says_w
         assert why in own.wait("stood")["why"]
         assert own.controller.q == pytest.approx(start, abs=1e-9)
         own.arrive()
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "scaling", "stamped"), [(0.0, 1.0, True), (10.0, 1.0, False), (0.0, 0.5, False)]
+)
+def test_a_stamp_is_trusted_of_a_steady_clock_at_full_speed(graph, ahead_s, scaling, stamped):
+    """A controller that says what it likes: every second state is stamped ``ahead_s`` of now."""
+    controller = Controlled(graph)
+    controller.states.append(JointTrajectoryControllerState())
+    own = Own(controller, follow_joint_trajectory="''")
+    said = graph.publisher(JointTrajectoryControllerState, f"{NODE}/controller_state")
+    readings = graph.publisher(JointState, "joint_states", subscribers=2)
+    sent = graph.collect(JointTrajectory, "own_motions/joint_trajectory")
+    number = 0
+
+    def say() -> None:
+        nonlocal number
+        number += 1
+        now_s = time.time()
+        message = trajectory([(0.0, HOME, 0.3 * STEP)], stamp_s=now_s + ahead_s * (number % 2))
+        said.publish(
+            JointTrajectoryControllerState(
+                header=message.header,
+                joint_names=NAMES,
+                reference=message.points[0],
+                speed_scaling_factor=scaling,
+            )
+        )
+        reading = JointState(name=NAMES, position=HOME.tolist())
+        reading.header = trajectory([], stamp_s=now_s).header
+        readings.publish(reading)
+        graph.spin_for(0.004)
+
+    def until(condition: Callable[[], object]) -> None:
+        graph.spin_until(lambda: say() or condition(), "it is sent")
+
+    until(lambda: len(controller.readings) > 40)
+    own.order(go=(HOME + STEP).tolist())
+    until(lambda: len(sent) == 1)
+    own.order(stop=True)
+    until(lambda: len(sent) > 1)
+    first = seconds(sent[1].points[0].time_from_start)
+    assert (seconds(sent[1].header.stamp) > 0.0) == stamped
+    assert first == pytest.approx(0.0 if stamped else 0.05)
+    if stamped:
+        assert time.time() - 0.3 < seconds(sent[1].header.stamp) < time.time()
+        assert sent[1].points[0].positions == pytest.approx(HOME, abs=0.3 * 0.05)
