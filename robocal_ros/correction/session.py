@@ -222,6 +222,11 @@ class CorrectionSession:
         return self._stream.tail(now_s)
 
     @property
+    def has_tail(self) -> bool:
+        """Whether the stream goes on without a message."""
+        return self._stream.has_tail
+
+    @property
     def stream_period_s(self) -> float:
         """Period of the stream's messages, NaN while it is not known."""
         return self._stream.period_s

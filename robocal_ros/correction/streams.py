@@ -316,6 +316,11 @@ class TargetStream:
         self.phase, self._lasts_s, self._slowed_s = Phase.ENDING, float(lasts), 0.0
         self._end_out, self._end_speed = output.out[index].copy(), speed
 
+    @property
+    def has_tail(self) -> bool:
+        """Whether it goes on without a message: slowed down, or behind its last target."""
+        return self.phase is Phase.ENDING or (self.phase is Phase.RUNNING and self.lag_s > 0.0)
+
     def tail(self, now_s: float) -> JointCommand | None:
         """What must go out now without a message; None when nothing must."""
         if self._command is None:
