@@ -35,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import solution
+from robocal_ros.correction.rates import RATE_STEP_S
 from robocal_ros.correction.room import work_size
 
 Array = NDArray[np.float64]
@@ -44,8 +45,6 @@ LARGEST_SHIFT = 1.0
 # by less than 2 deg/s; a tool's, which is larger, keeps the map from taught joints one to one.
 DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 25.0, 1.0 / 2.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
-# Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
-RATE_STEP_S = 2e-4
 
 
 def pack_model(arm: SerialArm) -> Array:

@@ -15,7 +15,6 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
-from robocal_ros.correction import limiter, serialized_path
 from robocal_ros.correction.action import TrajectoryProxy
 from robocal_ros.correction.graph import (
     CommandSources,
@@ -38,7 +37,7 @@ from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
 from robocal_ros.correction.reported import CorrectionState
 from robocal_ros.correction.robot_stop import REACTION_S, RobotStop, RobotTrack
-from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
     arms,
@@ -46,7 +45,6 @@ from robocal_ros.correction.settings import (
     joint_limits,
     session_config,
 )
-from robocal_ros.correction.staged import load_kernels
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.nodes import qos
@@ -104,8 +102,6 @@ class JointCorrectionNode(HouseNode):
         self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
-        limiter.load_kernels(reference.n)
-        serialized_path.load_kernels()
         if self.settings["enable_on_start"]:
             self._session.enable(True)
         near = config.start_near(nominal)

@@ -1,4 +1,4 @@
-"""Compiled rates of the joint correction: velocities and accelerations by the chain rule."""
+"""Compiled rates of the joint correction: by the chain rule, or by differences along the way."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +7,14 @@ from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction.room import Room, room_in
+from robocal_ros.correction.solution import correct_staged
 
 Array = NDArray[np.float64]
+
+# Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
+RATE_STEP_S = 2e-4
+VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
+MOST_STEPS = 20
 
 
 @lean
@@ -49,3 +55,55 @@ def rates_batch(
         for r in range(6):
             a[r] -= room.step[r]
         newton.solve(J, L, a, velocity, acceleration)
+
+
+@lean
+def _by_differences(
+    q: Array, velocity: Array, largest: Array, free: bool, works: Array, at: Array, report: Array,
+    out: Array,
+) -> None:  # fmt: skip
+    n, h, last = q.shape[0], RATE_STEP_S, works.shape[0] - 1
+    for j in range(n):
+        at[j] = q[j] + velocity[j] * h
+    correct_staged(at, largest, free, works, report)
+    for j in range(n):
+        out[j] = report[last, j] - at[j]
+        at[j] = q[j] - velocity[j] * h
+    correct_staged(at, largest, free, works, report)
+    for j in range(n):
+        out[j] = velocity[j] + (out[j] - (report[last, j] - at[j])) / (2.0 * h)
+
+
+@lean
+def velocity_by_differences(
+    q: Array, velocity: Array, largest: Array, free: bool, works: Array, spare: Array,
+    report: Array, out: Array,
+) -> None:  # fmt: skip
+    """Velocities ``out`` (n,) of the corrected joints at taught ones ``q`` (n,), anywhere.
+
+    ``spare`` (2, n) and ``report`` (k, n + 7) are scratch.
+    """
+    _by_differences(q, velocity, largest, free, works, spare[0], report, out)
+
+
+@lean
+def taught_velocity_by_differences(
+    q: Array, velocity: Array, largest: Array, free: bool, works: Array, spare: Array,
+    report: Array, out: Array,
+) -> None:  # fmt: skip
+    """Velocities ``out`` (n,) of the taught joints ``q``, of those of the corrected ones (n,).
+
+    The shift changes slower than the joints move.
+    """
+    n = q.shape[0]
+    for j in range(n):
+        out[j] = velocity[j]
+    for _ in range(MOST_STEPS):
+        _by_differences(q, out, largest, free, works, spare[0], report, spare[1])
+        size = 0.0
+        for j in range(n):
+            miss = velocity[j] - spare[1, j]
+            size = max(size, abs(miss))
+            out[j] += miss
+        if not size > VELOCITY_EXACT:
+            return

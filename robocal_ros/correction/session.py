@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
+from robocal_ros.correction import limiter, serialized_path, staged
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import (
@@ -506,3 +507,16 @@ class CorrectionSession:
         moved = self._reference.fk(np.stack([places[0], places[0] + withheld]))
         tips = (moved @ self._reference.T_flange_tool)[:, :3, 3]
         return float(np.linalg.norm(tips[1] - tips[0]))
+
+
+def load_kernels(arm: SerialArm) -> None:
+    """Call the compiled code once, so that the first command need not wait for it."""
+    staged.load_kernels(arm)
+    limiter.load_kernels(arm.n)
+    serialized_path.load_kernels()
+    config, q = CorrectionConfig(), np.zeros(arm.n)
+    desired = DesiredOffset(arm, config)
+    desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)
+    desired.at_one(q)
+    state = RobotState(arm, config.joint_state_age_s, config.start_near(arm))
+    state.require_positions(arm.joint_names, np.arange(arm.n), q[None])

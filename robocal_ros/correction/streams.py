@@ -278,7 +278,7 @@ class TargetStream:
         state, stage = output.limiter.state, output.stage
         if self.lag_s > 0.0 and self._step_s > 0.0:
             velocity = (output.out - self._before)[index] / self._step_s
-        elif stage is not None and np.array_equal(state[OFFSET], state[DESIRED]):
+        elif stage is not None and state[OFFSET].tolist() == state[DESIRED].tolist():
             speeds = np.zeros(self._arm.n)
             speeds[index] = velocity
             velocity = stage.velocity_one(output.taught, speeds, output.out)[index]
