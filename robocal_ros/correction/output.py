@@ -160,7 +160,8 @@ class Output:
         """Where the controller is (k,), and whether that is known better than by readings.
 
         Its reference where it tells it; else what it was sent, where the robot is there or on its
-        way; else where the robot stands. ``q`` (k,): joints without limits at the turn nearest.
+        way; else where the robot stands, joints without limits at the turn nearest to ``q`` (k,):
+        what reads them may count no turns, what drives them does.
 
         Raises
         ------
@@ -170,7 +171,7 @@ class Output:
         state = self._state
         known = state.reference(index, now_s)
         if known is not None:
-            return state.unwrapped(index, known, q), True
+            return known, True
         state.require_fresh(index, now_s)
         measured, near = state.measured[index], self._near[index]
         stands, sent = state.stands(index, now_s), self._sent(now_s)[index]
@@ -180,7 +181,7 @@ class Output:
             here = state.unwrapped(index, measured, sent)
             beside = np.maximum(places.min(axis=0) - here, here - places.max(axis=0))
             if np.all(beside <= near):  # it is there, or lags on its way
-                return state.unwrapped(index, sent, q), True
+                return sent, True
         if stands:
             return state.unwrapped(index, measured, q), False
         raise self.refuse("the robot moves, and where its controller is is not known")
