@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 LARGEST_SHIFT = 1.0
 # Of the shift per unit of a singular value: at 60 deg/s of the joints a drift's correction moves
 # by less than 2 deg/s; a tool's, which is larger, keeps the map from taught joints one to one.
-DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 25.0, 1.0 / 10.0
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 55.0, 1.0 / 10.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 # Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
 RATE_STEP_S = 2e-4
