@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, OffsetLimiter
+from robocal_ros.correction.limiter import (
+    DESIRED,
+    DESIRED_RATE,
+    OFFSET,
+    OFFSET_RATE,
+    SHARE,
+    OffsetLimiter,
+)
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
@@ -284,6 +291,7 @@ class Output:
             moving = path.time(now_s) < path.times[-1] and path.live(now_s)
             state[OFFSET_RATE] = path.at(path.rates, now_s) if moving else 0.0
             state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
+            state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
 
     def reject(self, path: SentPath) -> None:
         """The controller did not take a path: what it took the place of goes on there."""
