@@ -12,8 +12,7 @@ from robocal_ros.core.identification import identify
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.kinematics.inverse import inverse
 from robocal_ros.core.samples import Measurements
-from robocal_ros.correction import limiter, serialized_path
-from robocal_ros.correction.staged import load_kernels
+from robocal_ros.correction.session import load_kernels
 
 POSES = 30
 
@@ -57,8 +56,7 @@ def main() -> None:
     identify(arm, data).cell.residual(data)
     fit_pairs(PosePairs(T, frames.invert(T), names))
     load_kernels(arm)
-    limiter.load_kernels(arm.n)
-    for serialized in (mcap_records, serialized_joints, serialized_path):
+    for serialized in (mcap_records, serialized_joints):
         serialized.load_kernels()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction import solution
+from robocal_ros.correction import rates, solution
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, require_solved, require_within
 from robocal_ros.correction.clamping import ClampedResult, correction_between
 from robocal_ros.correction.joint_correction import pack_model
@@ -44,7 +44,9 @@ class DesiredOffset:
         self.tcp_shift_m = self.largest = self.remaining_m = 0.0
         self.made = False
         self._zero, self._out = np.zeros(reference.n), np.zeros((2, reference.n + solution.REPORT))
-        self._bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
+        bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
+        self._bounds = np.array(bounds, dtype=np.float64)
+        self._tcp = np.array([config.thermal.tcp_m, config.thermal.tcp_rad])
 
     def want(self, actual: SerialArm, on: bool) -> None:
         """Correct for an arm with its tool from the next command on, or for nothing."""
@@ -89,25 +91,16 @@ class DesiredOffset:
             return self._zero
         if self._config.policy is not Policy.REFUSE:
             return np.asarray(self.at(q[None])[0][0])
-        out = self._out[: stage.stages]
+        out, offset = self._out[: stage.stages], np.empty(n)
         stage.correct_one(q, out)
-        drift = out[0, n:]
-        weak = out[0, n + solution.WEAK] + out[-1, n + solution.WEAK]
-        if weak or not (
-            drift[solution.TCP_SHIFT] <= self._config.thermal.tcp_m
-            and drift[solution.TCP_ROTATION] <= self._config.thermal.tcp_rad
-        ):
+        if not rates.within(q, out, self._bounds, self._tcp, offset):
             return np.asarray(self.at(q[None])[0][0])
-        offset = out[-1, :n] - q
-        within = (np.abs(out[0, :n] - q) <= self._bounds[0]).all()
-        if stage.stages > 1:
-            within &= (np.abs(out[1, :n] - out[0, :n]) <= self._bounds[1]).all()
-        if not (within and out[:, n + solution.CONVERGED].all()):
-            return np.asarray(self.at(q[None])[0][0])
-        self.tcp_shift_m = float(drift[solution.TCP_SHIFT])
-        self.largest = float(np.abs(offset).max())
-        self.remaining_m = float(drift[solution.POSITION_ERROR])
-        return np.asarray(offset)
+        report = out[:, n:]
+        self.reduced += int(report[:, solution.WEAK].any())
+        self.tcp_shift_m = float(report[0, solution.TCP_SHIFT])
+        self.largest = max(map(abs, offset.tolist()))
+        self.remaining_m = float(report[:, solution.POSITION_ERROR].sum())
+        return offset
 
     def begins(self, q: Array) -> Array:
         """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.

@@ -15,7 +15,6 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
-from robocal_ros.correction import limiter, serialized_path
 from robocal_ros.correction.action import TrajectoryProxy
 from robocal_ros.correction.graph import (
     CommandSources,
@@ -38,7 +37,7 @@ from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
 from robocal_ros.correction.reported import CorrectionState
 from robocal_ros.correction.robot_stop import REACTION_S, RobotStop, RobotTrack
-from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
     arms,
@@ -46,7 +45,6 @@ from robocal_ros.correction.settings import (
     joint_limits,
     session_config,
 )
-from robocal_ros.correction.staged import load_kernels
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.nodes import qos
@@ -76,7 +74,6 @@ ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two 
 AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
 STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither hastens nor turns back
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
-TAIL_LASTS_S = 0.5  # after the last message nothing more may be to go out
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
 PERCENT = 0.01
@@ -105,8 +102,6 @@ class JointCorrectionNode(HouseNode):
         self._shadow = bool(self.settings["shadow"])
         self._session = CorrectionSession(nominal, reference, serial, config)
         load_kernels(reference)  # the first command must not wait for it
-        limiter.load_kernels(reference.n)
-        serialized_path.load_kernels()
         if self.settings["enable_on_start"]:
             self._session.enable(True)
         near = config.start_near(nominal)
@@ -122,7 +117,7 @@ class JointCorrectionNode(HouseNode):
         self._leases = Leases(nominal.name, serial)
         self._violation: GraphViolation | None = None
         self._commanded = self._by_action = False
-        self._stream, self._stream_s = TARGETS, -math.inf
+        self._stream = TARGETS
         self._scalings: dict[str, float] = {}
         self._open_topics()
         self._open_action()
@@ -316,7 +311,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_target(self, topic: str, message: JointMessage | ArrayMessage) -> None:
         now = time.monotonic()
-        self._stream, self._stream_s = topic, now
+        self._stream = topic
         try:
             command = message.command()
         except RefusedError as error:
@@ -447,7 +442,7 @@ class JointCorrectionNode(HouseNode):
 
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
-        if not self._shadow:
+        if self._session.has_tail and not self._shadow:
             self._emit_tail()
             self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
             self._tail_timer.reset()
@@ -457,7 +452,7 @@ class JointCorrectionNode(HouseNode):
         return min(max(period, 1e-3), 0.1) if math.isfinite(period) else TAIL_S
 
     def _on_tail(self) -> None:
-        if not self._emit_tail() and time.monotonic() - self._stream_s > TAIL_LASTS_S:
+        if not self._emit_tail() and not self._session.has_tail:
             self._tail_timer.cancel()
 
     def _emit_tail(self) -> bool:

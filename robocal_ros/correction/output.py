@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, OffsetLimiter
+from robocal_ros.correction.limiter import (
+    DESIRED,
+    DESIRED_RATE,
+    OFFSET,
+    OFFSET_RATE,
+    SHARE,
+    OffsetLimiter,
+)
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
@@ -160,7 +167,8 @@ class Output:
         """Where the controller is (k,), and whether that is known better than by readings.
 
         Its reference where it tells it; else what it was sent, where the robot is there or on its
-        way; else where the robot stands. ``q`` (k,): joints without limits at the turn nearest.
+        way; else where the robot stands, joints without limits at the turn nearest to ``q`` (k,):
+        what reads them may count no turns, what drives them does.
 
         Raises
         ------
@@ -170,7 +178,7 @@ class Output:
         state = self._state
         known = state.reference(index, now_s)
         if known is not None:
-            return state.unwrapped(index, known, q), True
+            return known, True
         state.require_fresh(index, now_s)
         measured, near = state.measured[index], self._near[index]
         stands, sent = state.stands(index, now_s), self._sent(now_s)[index]
@@ -180,7 +188,7 @@ class Output:
             here = state.unwrapped(index, measured, sent)
             beside = np.maximum(places.min(axis=0) - here, here - places.max(axis=0))
             if np.all(beside <= near):  # it is there, or lags on its way
-                return state.unwrapped(index, sent, q), True
+                return sent, True
         if stands:
             return state.unwrapped(index, measured, q), False
         raise self.refuse("the robot moves, and where its controller is is not known")
@@ -283,6 +291,7 @@ class Output:
             moving = path.time(now_s) < path.times[-1] and path.live(now_s)
             state[OFFSET_RATE] = path.at(path.rates, now_s) if moving else 0.0
             state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
+            state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
 
     def reject(self, path: SentPath) -> None:
         """The controller did not take a path: what it took the place of goes on there."""

@@ -1,4 +1,4 @@
-"""Compiled rates of the joint correction: velocities and accelerations by the chain rule."""
+"""Compiled work on corrected points: bounds, and rates by the chain rule or by differences."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,8 +7,14 @@ from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction.room import Room, room_in
+from robocal_ros.correction.solution import CONVERGED, TCP_ROTATION, TCP_SHIFT, correct_staged
 
 Array = NDArray[np.float64]
+
+# Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
+RATE_STEP_S = 2e-4
+VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
+MOST_STEPS = 20
 
 
 @lean
@@ -49,3 +55,79 @@ def rates_batch(
         for r in range(6):
             a[r] -= room.step[r]
         newton.solve(J, L, a, velocity, acceleration)
+
+
+@lean
+def _by_differences(
+    q: Array, velocity: Array, largest: Array, free: bool, works: Array, at: Array, report: Array,
+    out: Array,
+) -> None:  # fmt: skip
+    n, h, last = q.shape[0], RATE_STEP_S, works.shape[0] - 1
+    for j in range(n):
+        at[j] = q[j] + velocity[j] * h
+    correct_staged(at, largest, free, works, report)
+    for j in range(n):
+        out[j] = report[last, j] - at[j]
+        at[j] = q[j] - velocity[j] * h
+    correct_staged(at, largest, free, works, report)
+    for j in range(n):
+        out[j] = velocity[j] + (out[j] - (report[last, j] - at[j])) / (2.0 * h)
+
+
+@lean
+def velocity_by_differences(
+    q: Array, velocity: Array, largest: Array, free: bool, works: Array, spare: Array,
+    report: Array, out: Array,
+) -> None:  # fmt: skip
+    """Velocities ``out`` (n,) of the corrected joints at taught ones ``q`` (n,), anywhere.
+
+    ``spare`` (2, n) and ``report`` (k, n + 7) are scratch.
+    """
+    _by_differences(q, velocity, largest, free, works, spare[0], report, out)
+
+
+@lean
+def taught_velocity_by_differences(
+    q: Array, velocity: Array, largest: Array, free: bool, works: Array, spare: Array,
+    report: Array, out: Array,
+) -> None:  # fmt: skip
+    """Velocities ``out`` (n,) of the taught joints ``q``, of those of the corrected ones (n,).
+
+    The shift changes slower than the joints move.
+    """
+    n = q.shape[0]
+    for j in range(n):
+        out[j] = velocity[j]
+    for _ in range(MOST_STEPS):
+        _by_differences(q, out, largest, free, works, spare[0], report, spare[1])
+        size = 0.0
+        for j in range(n):
+            miss = velocity[j] - spare[1, j]
+            size = max(size, abs(miss))
+            out[j] += miss
+        if not size > VELOCITY_EXACT:
+            return
+
+
+@lean
+def within(q: Array, out: Array, bounds: Array, tcp: Array, offset: Array) -> bool:
+    """Whether a point (n,) is solved within all bounds, by ``out`` (k, n + 7); its offset (n,)."""
+    n, stages = q.shape[0], out.shape[0]
+    fine = out[0, n + TCP_SHIFT] <= tcp[0] and out[0, n + TCP_ROTATION] <= tcp[1]
+    for stage in range(stages):
+        fine = fine and out[stage, n + CONVERGED] > 0.5
+        for j in range(n):
+            before = q[j] if stage == 0 else out[stage - 1, j]
+            fine = fine and abs(out[stage, j] - before) <= bounds[stage, j]
+    for j in range(n):
+        offset[j] = out[stages - 1, j] - q[j]
+    return fine
+
+
+@lean
+def ordinary(position: Array, most: Array, index: NDArray[np.int64]) -> bool:
+    """Whether positions (k,) of joints ``index`` are finite, and none beyond ``most`` (n,)."""
+    fine = True
+    for i in range(position.shape[0]):
+        fine = fine and abs(position[i]) <= most[index[i]]
+    return fine

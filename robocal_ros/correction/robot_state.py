@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.inputs import JointCommand, require_finite
+from robocal_ros.correction.joint_correction import plain
+from robocal_ros.correction.rates import ordinary
 from robocal_ros.correction.refusals import Reason, RefusedError
 
 Array = NDArray[np.float64]
@@ -19,6 +21,7 @@ REFERENCE_AGE_S = 0.1  # a controller's reference that is older is none, s
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
 AHEAD_S = 0.5
+MOST_LAYOUTS = 16  # of readings, by their joints' names, that are remembered
 
 
 class RobotState:
@@ -39,6 +42,7 @@ class RobotState:
         self.names, self.count = arm.joint_names, arm.n
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
+        self._columns: dict[tuple[str, ...], tuple[tuple[str, ...], Index, Index]] = {}
         self._age_limit_s, self._near = age_limit_s, near
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
@@ -71,6 +75,8 @@ class RobotState:
         if position.shape[1] != len(names):
             detail = f"{len(names)} names but {position.shape[1]} positions"
             raise RefusedError(Reason.WRONG_SIZE, detail)
+        if len(position) == 1 and ordinary(plain(position[0]), self._doubtful, index):
+            return
         require_finite(names, position)
         size = np.abs(position)
         if not (size > self._doubtful[index]).any():
@@ -102,15 +108,21 @@ class RobotState:
 
     def find(self, state: JointCommand) -> tuple[Index, Index]:
         """Numbers of the arm's joints in readings, and their columns; joints of others are left."""
-        _require_single(state.names)
         if len(state.position) != len(state.names):
             detail = f"{len(state.names)} names but {len(state.position)} positions"
             raise RefusedError(Reason.WRONG_SIZE, detail)
-        columns = [i for i, name in enumerate(state.names) if name in self._number]
-        index = np.array([self._number[state.names[i]] for i in columns], dtype=np.int64)
-        column = np.array(columns, dtype=np.int64)
-        names = tuple(state.names[i] for i in columns)
-        self.require_positions(names, index, state.position[None, column])
+        known = self._columns.get(state.names)
+        if known is None:
+            _require_single(state.names)
+            columns = [i for i, name in enumerate(state.names) if name in self._number]
+            names = tuple(state.names[i] for i in columns)
+            index = np.array([self._number[name] for name in names], dtype=np.int64)
+            known = names, index, np.array(columns, dtype=np.int64)
+            if len(self._columns) >= MOST_LAYOUTS:
+                self._columns.clear()
+            self._columns[state.names] = known
+        names, index, column = known
+        self.require_positions(names, index, state.position[column][None])
         return index, column
 
     # ---- where it is ----------------------------------------------------------------------------

@@ -62,12 +62,14 @@ def _jacobian(free: bool, room: Room, J: Array) -> None:
 @lean
 def _damp(free: bool, room: Room) -> bool:
     """Damping ``D`` for J and the residual at the taught joints; whether a direction is weak."""
-    n, M, D = room.x.shape[0], room.M, room.D
-    square = 0.0
-    for r in range(6):
-        weighed = room.e[r] * k.WEIGHT if r < 3 else room.e[r]
-        square += weighed * weighed
-    square = k.lambda_square(square, room.settings[STEEPNESS], room.settings[PER_ERROR])
+    n, M, D, settings = room.x.shape[0], room.M, room.D, room.settings
+    position, both = 0.0, 0.0
+    for r in range(3):
+        position += room.e[r] * k.WEIGHT * room.e[r] * k.WEIGHT
+        both += room.e[3 + r] * room.e[3 + r]
+    both += position
+    position = k.lambda_square(position, settings[STEEPNESS], settings[PER_ERROR])
+    rotation = k.lambda_square(both, settings[STEEPNESS], settings[PER_ERROR])
     k.product(room.J, room.J, M)
     absent = max(6 - n, 1 if free else 0)  # directions in which no joint moves the tool
     if n >= 6:
@@ -80,11 +82,10 @@ def _damp(free: bool, room: Room) -> bool:
                 for c in range(3):
                     D[3 + r, 3 + c] = z[r] * z[c]
                     M[3 + r, 3 + c] += z[r] * z[c]
-        if k.WINDOW * square * (k.inverse_norm(M, room.B, room.spare) - absent) <= 1.0:
+        if k.WINDOW * rotation * (k.inverse_norm(M, room.B, room.spare) - absent) <= 1.0:
             return False
         k.product(room.J, room.J, M)
-    k.eigen(M, room.U)
-    return k.damping(M, room.U, square, D) > absent
+    return k.damping(M, position, rotation, D, room.U) > absent
 
 
 @lean

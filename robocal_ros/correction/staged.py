@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 
 EXACT = 1e-13  # rad, m: to rounding
 MOST_STEPS = 100
-ROUNDING = 1e-12  # rad/s, m/s
 
 
 @dataclass(frozen=True)
@@ -95,6 +94,7 @@ class StagedCorrection:
         self._largest = np.stack([part.largest for part in parts])
         self._still = np.zeros((1, self.n))
         self._one = np.empty((self.stages, self.n + solution.REPORT))
+        self._spare = np.empty((2, self.n))
         self._back = [part.inverse() for part in reversed(parts)]
 
     def correct(self, q: Array) -> StagedResult:
@@ -123,25 +123,23 @@ class StagedCorrection:
 
     def velocity_one(self, q: Array, velocity: Array, corrected: Array) -> Array:
         """Velocities (n,) of one point's corrected joints, as `rates` has them."""
-        found = self._by_chain_rule(q, q, velocity, corrected, (self._works[0], self._works[-1]))
-        if found is not None:
-            return found
-        result = self.correct(q[None])
-        return np.asarray(self.rates(q[None], velocity[None], self._still, result)[0][0])
+        ends, given = (self._works[0], self._works[-1]), (self._largest, self._free, self._works)
+        found = self._by_chain_rule(q, q, velocity, corrected, ends)
+        if found is None:
+            found = np.empty(self.n)
+            rates.velocity_by_differences(q, velocity, *given, self._spare, self._one, found)
+        return found
 
     def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
         """Velocities (n,) of one point's taught joints ``q``, of those of the corrected ones."""
-        works = self._back[0].work, self._back[-1].work
-        found = self._by_chain_rule(q, corrected, velocity, q, works)
-        if found is not None:
-            return found
-        speed, result = velocity.copy(), self.correct(q[None])
-        for _ in range(MOST_STEPS):  # the shift changes slower than the joints move
-            miss = velocity - self.rates(q[None], speed[None], self._still, result)[0][0]
-            if not np.max(np.abs(miss)) > ROUNDING:
-                break
-            speed += miss
-        return speed
+        ends, given = (self._back[0].work, self._back[-1].work), (self._largest, self._free)
+        found = self._by_chain_rule(q, corrected, velocity, q, ends)
+        if found is None:
+            found = np.empty(self.n)
+            rates.taught_velocity_by_differences(
+                q, velocity, *given, self._works, self._spare, self._one, found
+            )
+        return found
 
     def _by_chain_rule(
         self, q: Array, before: Array, velocity: Array, after: Array, works: tuple[Array, Array]
@@ -211,3 +209,6 @@ def load_kernels(arm: SerialArm) -> None:
     stage.uncorrect(q)
     stage.uncorrect_one(q[0])
     stage.velocity_one(q[0], q[0], q[0])
+    given = q[0], q[0], np.ones((stage.stages, arm.n)), False, stage._works, np.zeros((2, arm.n))
+    for by_differences in (rates.velocity_by_differences, rates.taught_velocity_by_differences):
+        by_differences(*given, np.empty((stage.stages, arm.n + solution.REPORT)), np.empty(arm.n))

@@ -11,10 +11,9 @@ import pytest
 from correction_robot import HOME, NOMINAL, Robot, bent_tool, drifted, good_here_only, offer, swing
 from numba.core.dispatcher import Dispatcher
 
-from robocal_ros.correction import limiter, serialized_path
 from robocal_ros.correction.bounds import Policy
 from robocal_ros.correction.refusals import RefusedError
-from robocal_ros.correction.staged import load_kernels
+from robocal_ros.correction.session import load_kernels
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -41,8 +40,6 @@ def warm() -> None:
 def configure() -> None:
     """As a node before it becomes active."""
     load_kernels(NOMINAL)
-    limiter.load_kernels(NOMINAL.n)
-    serialized_path.load_kernels()
 
 
 def use(policy: Policy, free_axis: bool) -> None:

@@ -12,8 +12,6 @@ from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
 
-pytestmark = pytest.mark.cell
-
 GAP_S = 150.0
 
 
