@@ -398,13 +398,14 @@ def crossing_table() -> Table:
         "Singularities that are crossed at 60 deg/s",
         (
             "robot", "crossed", "tool", "crossings", "solved", "wanted, deg/s", "goal",
-            "median, mm left", "most, mm left", "goal ", "off, mm", "goal  ", "out, deg/s", "goal   ",
+            "median, mm left", "most, mm left", "goal ", "off, mm", "goal  ",
+            "out, deg/s", "goal   ",
         ),
         f"All joints move, the fastest at 60 deg/s for {CROSSING_S:g} s; {1 / PERIOD_S:g} Hz; "
         "drifts of 0.004 to 0.12 mm at the flange. Wanted: the fastest change of a joint's "
         "offset. Left: position error at the tool; of all crossings the worst instant of each. "
-        "Off: the tool's distance from where it was taught, after the limiter, at most; uncorrected it "
-        "is what the tool is bent by. Out: the fastest change after the limiter.",
+        "Off: the tool's distance from where it was taught, after the limiter, at most; "
+        "uncorrected it is what the tool is bent by. Out: the fastest change after the limiter.",
     )  # fmt: skip
     for name in ROBOTS:
         for crossed, joint in CROSSED.items():
