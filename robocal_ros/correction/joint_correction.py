@@ -48,7 +48,7 @@ LARGEST_SHIFT = 1.0
 # Of the shift per unit of a singular value: at 60 deg/s of the joints through a wrist singularity
 # a drift's correction moves by less than 2 deg/s; a tool's, which is larger, by more, so that in
 # most postures its turn is corrected too.
-DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 55.0, 1.0 / 10.0
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 60.0, 1.0 / 10.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 # Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
 RATE_STEP_S = 2e-4
