@@ -236,15 +236,15 @@ class Settled:
             self.read()
             self.at = self.session.target(JointCommand(self.names, home), self.now).position
 
-    def read(self) -> None:
+    def read(self, later_s: float = 0.002) -> None:
         """Hear where the robot is, a little later."""
-        self.now += 0.002
+        self.now += later_s
         self.session.reading(JointCommand(self.names, self.at), self.now)
 
     def rest(self) -> None:
         """Nothing is commanded, and the robot stands."""
-        for _ in range(250):
-            self.read()
+        for _ in range(20):
+            self.read(0.02)
         self.session.look(self.now, 0)
 
     def run(self, trajectory: TrajectoryCommand) -> TrajectoryCommand:
@@ -264,6 +264,8 @@ def trajectory_table() -> Table:
     q, qd = home + reach * np.sin(angle), reach * speed * np.cos(angle)
     qdd = -reach * speed**2 * np.sin(angle)
     settled = Settled(case, home)
+    little = case.reference.mdh + 0.12 * (case.actual.mdh - case.reference.mdh)
+    less = Settled(replace(case, actual=case.reference.with_mdh(little)), home)
     plain = TrajectoryCommand(settled.names, q, t)
     rated = replace(plain, velocity=qd, acceleration=qdd)
     models = pack_model(case.reference), pack_model(case.actual)
@@ -274,6 +276,7 @@ def trajectory_table() -> Table:
         return lambda: stage.rates(q, qd, qdd, stage.correct(q))
 
     tasks: dict[str, Callable[[], object]] = {
+        "positions, drift of 0.12 mm": lambda: less.run(plain),
         "positions": lambda: settled.run(plain),
         "positions, velocities, accelerations": lambda: settled.run(rated),
         "the same with a changed tool, without the session": staged(free_axis=False),
@@ -289,7 +292,7 @@ def trajectory_table() -> Table:
     )
     for index, (name, seconds) in enumerate(found.items()):
         ms = seconds * 1e3
-        table.add(name, ms, Goal(ms, 10.0) if index == 0 else None)
+        table.add(name, ms, Goal(ms, 10.0) if index < 2 else None)
     return table
 
 
@@ -398,13 +401,14 @@ def crossing_table() -> Table:
         "Singularities that are crossed at 60 deg/s",
         (
             "robot", "crossed", "tool", "crossings", "solved", "wanted, deg/s", "goal",
-            "median, mm left", "most, mm left", "goal ", "off, mm", "goal  ", "out, deg/s", "goal   ",
+            "median, mm left", "most, mm left", "goal ", "off, mm", "goal  ",
+            "out, deg/s", "goal   ",
         ),
         f"All joints move, the fastest at 60 deg/s for {CROSSING_S:g} s; {1 / PERIOD_S:g} Hz; "
         "drifts of 0.004 to 0.12 mm at the flange. Wanted: the fastest change of a joint's "
         "offset. Left: position error at the tool; of all crossings the worst instant of each. "
-        "Off: the tool's distance from where it was taught, after the limiter, at most; uncorrected it "
-        "is what the tool is bent by. Out: the fastest change after the limiter.",
+        "Off: the tool's distance from where it was taught, after the limiter, at most; "
+        "uncorrected it is what the tool is bent by. Out: the fastest change after the limiter.",
     )  # fmt: skip
     for name in ROBOTS:
         for crossed, joint in CROSSED.items():

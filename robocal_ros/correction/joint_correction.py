@@ -46,10 +46,10 @@ from robocal_ros.correction.room import work_size
 Array = NDArray[np.float64]
 
 LARGEST_SHIFT = 1.0
-# Of the shift per unit of a singular value: at 60 deg/s of the joints through a wrist singularity a
-# drift's correction moves by less than 2 deg/s; a tool's, which is larger, by more, so that the tool
-# is turned as it was taught in most postures, too.
-DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 55.0, 1.0 / 10.0
+# Of the shift per unit of a singular value: at 60 deg/s of the joints through a wrist singularity
+# a drift's correction moves by less than 2 deg/s; a tool's, which is larger, by more, so that in
+# most postures its turn is corrected too.
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 60.0, 1.0 / 10.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 
 

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 # rows of the limits (4, n) and of a limiter's state (5, n)
 REST_RATE, REST_ACCELERATION, RATE, ACCELERATION = range(4)
 OFFSET, OFFSET_RATE, DESIRED, DESIRED_RATE, SHARE = STATE = range(5)
-# Of its limit a desired rate may have so much before less of the offset is aimed at; the whole of it
+# A desired rate may have so much of its limit before less of the offset is aimed at; all of it
 # comes back in so long, s.
 FULL_RATE, WHOLE_S = 0.5, 0.5
 # Time steps of a path are divided until they are at most so long, s.

@@ -37,7 +37,7 @@ class Room(NamedTuple):
     e, y, step, spare, order : (6,) residual, multipliers, their step, and scratch.
     x : (n,) shift of the joints.
     settings : steepness and its rise, and whether `straight` serves; see `joint_correction` (3).
-    constants, came, goes : of `straight`, for sixteen points.
+    constants, came, goes, late : of `straight` and `straight_damped`, for sixteen points.
     """
 
     taught_links: Array
@@ -66,11 +66,12 @@ class Room(NamedTuple):
     constants: Array
     came: Array
     goes: Array
+    late: Array
 
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    many = six.CONSTANTS + straight.LANES * (six.N + straight.ROWS)
+    many = six.CONSTANTS + straight.LANES * (six.N + straight.ROWS + 1)
     small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 9 + 6 * TWISTS + SETTINGS
     return 18 * n + 18 * n + n + small + many
 
@@ -90,11 +91,12 @@ def room_in(work: Array, n: int) -> Room:
     settings, at = work[at : at + SETTINGS], at + SETTINGS
     constants, at = work[at : at + six.CONSTANTS], at + six.CONSTANTS
     came, at = work[at : at + straight.LANES * six.N], at + straight.LANES * six.N
+    goes, at = work[at : at + straight.LANES * straight.ROWS], at + straight.LANES * straight.ROWS
     return Room(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
         turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
         twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
-        constants, came, work[at : at + straight.LANES * straight.ROWS],
+        constants, came, goes, work[at : at + straight.LANES],
     )  # fmt: skip
 
 

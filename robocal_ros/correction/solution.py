@@ -1,6 +1,7 @@
 """Compiled solution of the joint correction: one point, a point through all stages, or many.
 
-Most points of six joints are solved by `straight`; the others, and all other arms, here. ``work``
+Nearly all points of six joints are solved by `straight` and, with weak directions, by
+`straight_damped`; the others, and all other arms, here. ``work``
 is that of `room`, with settled models. Equations: see `joint_correction`.
 """
 
@@ -11,7 +12,7 @@ from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction import kernels as k
-from robocal_ros.correction import straight
+from robocal_ros.correction import straight, straight_damped
 from robocal_ros.correction import straight_kinematics as six
 from robocal_ros.correction.room import IS_STRAIGHT, PER_ERROR, STEEPNESS, Room, room_in, settle
 
@@ -177,7 +178,8 @@ def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
         out[i] = goes[i * lanes + lane]
     out[n + POSITION_ERROR] = goes[straight.POSITION_LEFT * lanes + lane]
     out[n + ROTATION_ERROR] = goes[straight.ROTATION_LEFT * lanes + lane]
-    out[n + ITERATIONS], out[n + WEAK] = straight.ITERATIONS, 0.0
+    out[n + ITERATIONS] = straight.ITERATIONS
+    out[n + WEAK] = goes[straight.WEAK * lanes + lane]
     out[n + CONVERGED] = goes[straight.FINE * lanes + lane]
     out[n + TCP_SHIFT] = goes[straight.TCP_SHIFT * lanes + lane]
     out[n + TCP_ROTATION] = goes[straight.TCP_ROTATION * lanes + lane]
@@ -191,7 +193,32 @@ def _correct_one(q: Array, largest: Array, free: bool, room: Room, out: Array) -
         straight.correct_one(room.constants, room.came, room.goes)
         if _take_over(room, 0, 1, out):
             return
+        straight_damped.correct_one(room.constants, room.came, room.goes)
+        if _take_over(room, 0, 1, out):
+            return
     _correct(q, largest, free, room, out)
+
+
+@lean
+def _correct_weak(q: Array, largest: Array, room: Room, out: Array) -> None:
+    """Those of the points (m, 6) of which ``out`` says that they are not solved."""
+    count, n = 0, six.N
+    for i in range(q.shape[0]):
+        if out[i, n + CONVERGED] > 0.5:
+            continue
+        _put(q[i], count, straight.LANES, room)
+        room.late[count] = i
+        count += 1
+        if count == straight.LANES:
+            straight_damped.correct_lanes(room.constants, room.came, room.goes)
+            for lane in range(count):
+                k = int(room.late[lane])
+                if not _take_over(room, lane, count, out[k]):
+                    _correct(q[k], largest, False, room, out[k])
+            count = 0
+    for lane in range(count):
+        k = int(room.late[lane])
+        _correct_one(q[k], largest, False, room, out[k])
 
 
 @lean
@@ -227,10 +254,9 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
                 _put(q[first + lane], lane, straight.LANES, room)
             straight.correct_lanes(room.constants, room.came, room.goes)
             for lane in range(straight.LANES):
-                i = first + lane
-                if not _take_over(room, lane, straight.LANES, out[i]):
-                    _correct(q[i], largest, free, room, out[i])
+                _take_over(room, lane, straight.LANES, out[first + lane])
             first += straight.LANES
+        _correct_weak(q[:first], largest, room, out)
     for i in range(first, q.shape[0]):
         _correct_one(q[i], largest, free, room, out[i])
 
