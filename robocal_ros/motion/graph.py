@@ -10,6 +10,7 @@ from typing import Any
 from rclpy.node import Node
 
 PREFIX = 12  # bytes of a gid
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
 
 
 def publishers(node: Node, topic: str, *, dds: bool = False) -> dict[bytes, str]:

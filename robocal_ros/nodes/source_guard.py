@@ -3,6 +3,7 @@
 from rclpy.node import Node
 
 from robocal_ros.core.samples import UNCORRECTED
+from robocal_ros.motion.graph import PREFIX, UNKNOWN, publishers
 from robocal_ros.sessions.observations import JOINTS
 
 _STATUS = "robocal_msgs/msg/CorrectionStatus"  # who publishes it is a correction node
@@ -25,7 +26,8 @@ class SourceGuard:
             else "it is corrected already, subscribe what the planner publishes"
         )
         self.fault = ""
-        if UNCORRECTED in self._topic:  # before anybody is discovered, its name is a hint
+        self._hinted = UNCORRECTED in self._topic
+        if self._hinted:
             self.fault = f"{self._topic} comes from a correction node: {self._why}"
 
     def fault_at(self, received: int) -> str:
@@ -35,8 +37,9 @@ class SourceGuard:
         return self.fault
 
     def look(self) -> None:
-        """Look again."""
-        if UNCORRECTED in self._topic:
+        """Look again; before its publishers are discovered the topic's name is a hint."""
+        found = self._publishers(self._topic)
+        if self._hinted and (not found or any(name.endswith(UNKNOWN) for _, name in found)):
             return
         correcting = {
             who
@@ -44,18 +47,11 @@ class SourceGuard:
             if _STATUS in kinds
             for who in self._publishers(topic)
         }
-        culprits = sorted({name for _, name in self._publishers(self._topic) & correcting})
+        culprits = sorted({name for _, name in found & correcting})
         self.fault = (
             f"{self._topic} is published by {', '.join(culprits)}: {self._why}" if culprits else ""
         )
 
     def _publishers(self, topic: str) -> set[tuple[bytes, str]]:
-        """DDS participant (12 bytes of the gid) and node of each publisher."""
-        found = self._node.get_publishers_info_by_topic(topic)
-        return {
-            (
-                bytes(info.endpoint_gid)[:12],
-                f"{info.node_namespace.rstrip('/')}/{info.node_name}",
-            )
-            for info in found
-        }
+        """DDS participant and node of each publisher."""
+        return {(gid[:PREFIX], name) for gid, name in publishers(self._node, topic).items()}

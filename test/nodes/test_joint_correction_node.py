@@ -23,6 +23,7 @@ from joint_correction_live import (
     tool_message,
     trajectory,
 )
+from rclpy.node import Node
 from robocal_msgs.msg import KinematicModel, ToolFrame
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -143,6 +144,23 @@ def test_the_output_of_a_renamed_correction_node_is_not_corrected_again(graph: A
     planner = graph.publisher(JointState, "/between", subscribers=1)
     planner.publish(joints(HOME))
     graph.spin_until(lambda: count.invalid > 0, "the target is refused")
+
+
+def test_a_robot_in_a_namespace_named_like_a_correction_node_is_heard(graph: Any) -> None:
+    """The name is a hint as long as nobody is discovered; then who publishes decides."""
+    topic = "/joint_correction_cell/joint_states"
+    guard = SourceGuard(graph.probe, topic)
+    guard.look()
+    assert f"{topic} comes from a correction node" in guard.fault
+    correcting = graph.add(JointCorrectionNode, {"serial": "s1"})
+    # of one process, and so of one DDS participant
+    node = Node("driver", namespace="joint_correction_cell", context=correcting.context)
+    node.create_publisher(JointState, "joint_states", 1)
+    graph.spin_until(lambda: guard.look() or not guard.fault, "the robot's driver is heard")
+    node.destroy_node()
+    own = SourceGuard(graph.probe, "/joint_correction_node/joint_states")
+    said = "/joint_correction_node: its joint states are un-corrected"
+    graph.spin_until(lambda: own.look() or said in own.fault, "the correction node is not")
 
 
 def test_what_its_services_answer_is_so(graph: Any) -> None:
