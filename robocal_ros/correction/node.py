@@ -47,6 +47,7 @@ from robocal_ros.correction.settings import (
 )
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import Health
@@ -76,7 +77,6 @@ STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither ha
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
-PERCENT = 0.01
 
 
 class JointCorrectionNode(HouseNode):
@@ -118,7 +118,7 @@ class JointCorrectionNode(HouseNode):
         self._violation: GraphViolation | None = None
         self._commanded = self._by_action = False
         self._stream = TARGETS
-        self._scalings: dict[str, float] = {}
+        self._scalings, self._scaling = SpeedScaling(), 1.0
         self._open_topics()
         self._open_action()
         self._report = CorrectionReport(
@@ -324,6 +324,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_states(self, message: JointMessage) -> None:
         command, now = self._session.counted(message.command), time.monotonic()
+        self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         taught = self._session.reading(command, now, age)
         self._track.read(command, now)
@@ -465,30 +466,30 @@ class JointCorrectionNode(HouseNode):
 
     # ---- the controller -------------------------------------------------------------------------
 
-    @property
-    def _scaling(self) -> float:
-        """How fast the controller's clock runs, by who says least."""
-        return min(self._scalings.values(), default=1.0)
-
     def _on_controller(self, message: Any) -> None:
-        """Where the controller is. Older ones leave the scaling at 0, and so say nothing by it."""
-        self._scale(CONTROLLER, float(getattr(message, "speed_scaling_factor", math.nan)))
+        """Where the controller is, and how fast its clock runs."""
+        now = time.monotonic()
+        self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
+        self._rescale(now)
         position = np.array(message.reference.positions, dtype=np.float64)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
             self._scaling,
-            time.monotonic(),
+            now,
         )
 
     def _on_scaling(self, message: Any) -> None:
-        """In percent, as ur_robot_driver's speed_scaling_state_broadcaster publishes it."""
-        self._scale(SCALING, float(message.data) * PERCENT)
-        self._session.controller((), np.empty(0), self._scaling, time.monotonic())
+        now = time.monotonic()
+        self._scalings.slider(float(message.data), now)
+        self._rescale(now)
 
-    def _scale(self, topic: str, scaling: float) -> None:
-        if math.isfinite(scaling) and (scaling > 0.0 or topic in self._scalings):
-            self._scalings[topic] = min(max(scaling, 0.0), 1.0)
+    def _rescale(self, now_s: float) -> None:
+        """How fast the controller's clock runs now; as planned where nobody told it lately."""
+        scaling = self._scalings.at(now_s)
+        before, self._scaling = self._scaling, 1.0 if scaling is None else scaling
+        if self._scaling != before:
+            self._session.controller((), np.empty(0), self._scaling, now_s)
 
     # ---- who else commands ----------------------------------------------------------------------
 
@@ -530,6 +531,7 @@ class JointCorrectionNode(HouseNode):
     def _look(self) -> None:
         """Let time pass, and tell what has changed."""
         now = time.monotonic()
+        self._rescale(now)
         self._session.look(now, self.now_ns())
         if self._commanded:
             self._tell_offset(JointOffset.PERIODIC, now)

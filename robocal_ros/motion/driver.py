@@ -25,6 +25,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.motion.settings import trajectory_message
+from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.parameters import Setting
@@ -84,7 +85,8 @@ class MotionDriver:
             JointTrajectoryControllerState, "controller_state", self._take_state, qos.SENSOR
         )
         node.add_input(Float64, "speed_scaling", self._take_scaling, qos.SENSOR)
-        self._stated_s = -np.inf  # when the controller told its own scaling
+        self._scaling = SpeedScaling()
+        self._stated_s = -np.inf  # when the controller told its state
         self._velocities = True  # whether the hardware has any, as far as the controller says
         self._newest = 0
         self.way = ""
@@ -174,9 +176,10 @@ class MotionDriver:
         known = len(speeds) == count and bool(np.isfinite(speeds).all())
         self._velocities = known and bool(speeds.any())
         self._stated_s = now_s
+        self._scaling.controller(getattr(message, "speed_scaling_factor", np.nan), now_s)
         if robot is None:
             return
-        robot.scaled(message.speed_scaling_factor, now_s)
+        self._tell_scaling(robot, now_s)
         reference = message.reference
         if len(reference.positions) != count or len(reference.velocities) != count:
             return  # a controller that holds may leave them out
@@ -195,8 +198,14 @@ class MotionDriver:
 
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()
-        if robot is not None and now_s - self._stated_s > 1.0:
-            robot.scaled(message.data / 100.0, now_s)  # percent, as ur_robot_driver publishes it
+        self._scaling.slider(message.data, now_s)
+        if robot is not None:
+            self._tell_scaling(robot, now_s)
+
+    def _tell_scaling(self, robot: RobotWatch, now_s: float) -> None:
+        scaling = self._scaling.at(now_s)
+        if scaling is not None:
+            robot.scaled(scaling, now_s)
 
 
 def guarded(node: EndpointNode, callback: Callable[[Future], None]) -> Callable[[Future], None]:
