@@ -118,6 +118,7 @@ class JointCorrectionNode(HouseNode):
         self._violation: GraphViolation | None = None
         self._commanded = self._by_action = False
         self._stream = TARGETS
+        self._astray: SentPath | None = None  # a path that the robot is being stopped beside
         self._scalings, self._scaling = SpeedScaling(), 1.0
         self._open_topics()
         self._open_action()
@@ -207,9 +208,7 @@ class JointCorrectionNode(HouseNode):
         try:
             self._session.hold(Reason.STOPPED, why, time.monotonic())
             self._stop(why)
-            while time.monotonic() < until_s and (
-                self._emit_tail() or self._stopping.look(time.monotonic(), self._scaling)
-            ):
+            while time.monotonic() < until_s and (self._emit_tail() or self._is_stopping()):
                 time.sleep(self._tail_period_s())
                 self.take_waiting()  # where the robot is
             if self._proxy is not None:
@@ -397,6 +396,10 @@ class JointCorrectionNode(HouseNode):
         """What the goal took the place of goes on."""
         self._session.reject(path)
 
+    def goal_lost(self, why: str) -> None:
+        """The robot may still follow it, and is stopped by where it is."""
+        self._stop_by_readings(why, time.monotonic())
+
     def uncorrect(self, names: Any, position: Any, velocity: Any) -> Any:
         """As `CorrectionSession.taught`, now."""
         return self._session.taught(names, position, velocity, time.monotonic())
@@ -408,20 +411,31 @@ class JointCorrectionNode(HouseNode):
         now = time.monotonic()
         if self._shadow:
             return
-        planned = self._session.stop(now, AHEAD_S)
-        self._arm_tail()
-        sent = True
-        if planned is not None:
+        self._rescale(now)
+        path, sent = self._session.path, True
+        if path is not None and path.live(now) and not self._track.follows(path, now):
+            self._session.end_stream(RefusedError(Reason.STOPPED, why), now)
+            sent = self._stop_by_readings(why, now)
+        elif (planned := self._session.stop(now, AHEAD_S)) is not None:
             way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
             after_s = way_s / STOP_SHARE
             sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
             self._stopping.watch(why, after_s, now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
-            sent = self._stopping.begin(why, now)
+            sent = self._stop_by_readings(why, now)
+        self._arm_tail()
         if not sent and self._proxy is not None:
             self._proxy.cancel(why)
         if self._stopping.why:
             self._stop_timer.reset()
+
+    def _stop_by_readings(self, why: str, now_s: float) -> bool:
+        """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
+        self._astray = self._session.path
+        sent = self._stopping.begin(why, now_s)
+        if sent:
+            self._stop_timer.reset()
+        return sent
 
     def _send_plan(self, plan: JointPlan) -> None:
         self._send_stop(self._arm_names, plan.q[-1], plan.duration_s, self._stopping.why)
@@ -434,12 +448,22 @@ class JointCorrectionNode(HouseNode):
         return True
 
     def _watch_stop(self) -> None:
-        if not self._stopping.look(time.monotonic(), self._scaling):
+        if not self._is_stopping():
             self._stop_timer.cancel()
             if self._stopping.fault:
                 self.get_logger().error(self._stopping.fault)
             if self._proxy is not None:
                 self._proxy.end("stopped")
+
+    def _is_stopping(self) -> bool:
+        """Let a stop go on; whether one is under way."""
+        now = time.monotonic()
+        if self._stopping.look(now, self._scaling):
+            return True
+        if self._astray is not None and not self._stopping.fault:
+            self._astray.end(now)
+        self._astray = None
+        return False
 
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
@@ -505,8 +529,11 @@ class JointCorrectionNode(HouseNode):
 
     def _judge_graph(self) -> None:
         """Hold the program's commands while somebody else may move the robot."""
-        now, before = time.monotonic(), self._violation
-        found = self._violation = self._graph.look(now)
+        now, before, lost = time.monotonic(), self._violation, self._graph.lost
+        stood_s = self._track.stood_s(now) if self._scaling else 0.0  # one that pauses goes on
+        found = self._violation = self._graph.look(now, stood_s)
+        if self._graph.lost and not lost:
+            self.get_logger().error(self._graph.lost)
         for reason in (Reason.OTHER_COMMANDER, Reason.LEASED):
             if found is not None and found.reason is reason:
                 self._session.hold(reason, found.detail, now)
@@ -556,7 +583,7 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        faults = [*self._faults(), *filter(None, [self._stopping.fault])]
+        faults = [*self._faults(), *filter(None, [self._stopping.fault, self._graph.lost])]
         return self._report.health(faults, self._rivals())
 
 

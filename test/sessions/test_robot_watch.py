@@ -85,3 +85,14 @@ def test_a_span_that_rounding_ends_before_the_first_reading_is_not_there_yet():
     assert not watch.tells_speed(1.0)
     watch.reading(0.05, HOME, 0.05)
     assert watch.resting(span_s) == pytest.approx(HOME, abs=0.0)
+
+
+def test_a_scaling_that_is_not_told_again_is_as_planned():
+    """Finding: one that had died at 0 was believed for ever."""
+    watch = seen(*steady(0.008, 0.0 * FASTEST))
+    begin_s = watch.newest[0]
+    watch.scaled(0.0, begin_s)
+    for count in range(1, 400):
+        watch.reading(begin_s + 0.008 * count, HOME, begin_s + 0.008 * count)
+        assert watch.scaling == float(0.008 * count > 1.0)
+    assert watch.driven_s(begin_s + 3.2) - watch.driven_s(begin_s + 2.2) == pytest.approx(1.0)
