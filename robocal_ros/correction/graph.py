@@ -46,6 +46,12 @@ class Endpoint(NamedTuple):
     participant: bytes
     name: str
 
+    def may_be_node_of(self, other: "Endpoint") -> bool:
+        """Whether it is of the same node, as far as the nodes' names are discovered."""
+        return self.participant == other.participant and (
+            self.name == other.name or any(one.name.endswith(UNKNOWN) for one in (self, other))
+        )
+
 
 def publishers(node: Node, topic: str, *, dds: bool = False) -> list[Endpoint]:
     """Who publishes a resolved ROS topic, or the DDS topic of that name."""
@@ -223,7 +229,8 @@ class GraphWatch:
     commands : resolved topics that this node commands the robot by, and how many publishers of
         its own each has.
     actions : likewise resolved names of the controller's action, and its own clients.
-    leases : of this robot; whoever publishes on ``lease_topic`` moves the robot for the cell.
+    leases : of this robot; the nodes that publish on ``lease_topic`` move the robot for the cell,
+        with a lease; the others of their processes do not.
     """
 
     def __init__(
@@ -254,7 +261,7 @@ class GraphWatch:
         ``stood_s``: how long the robot has stood, as far as that is known.
         """
         leasing = publishers(self._node, self._lease_topic)
-        cell = {one.participant for one in leasing if one.name not in self.leases.others}
+        cell = [one for one in leasing if one.name not in self.leases.others]
         found = []
         for subject, does, own, topic, dds in self._asked:
             who = publishers(self._node, topic, dds=dds)
@@ -271,10 +278,14 @@ class GraphWatch:
             )
         return GraphViolation(Reason.LEASED, self.lease) if self.lease else None
 
-    def _strangers(self, who: list[Endpoint], own: int, cell: set[bytes]) -> list[str]:
+    def _strangers(self, who: list[Endpoint], own: int, cell: list[Endpoint]) -> list[str]:
         """Names of who neither is this node nor moves the robot for the cell."""
         ours = [one for one in who if one == self._own]
-        rest = [one for one in who if one != self._own and one.participant not in cell]
+        rest = [
+            one
+            for one in who
+            if one != self._own and not any(one.may_be_node_of(holder) for holder in cell)
+        ]
         names = [_name(one, self._own.name) for one in rest]
         if len(ours) > own:
             names.append(f"a second {self._own.name} in this process")

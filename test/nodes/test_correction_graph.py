@@ -128,6 +128,21 @@ def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None
     assert not inbox
 
 
+def test_another_node_of_a_holders_process_is_a_stranger(watched: Watched) -> None:
+    """Finding: whatever a process with a publisher of leases did, it was the cell's own."""
+    own = watched.process("some_name")
+    own.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
+    own.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
+    watched.becomes(None)
+    planner = Node("planner", context=own.context)
+    publisher = planner.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.becomes(Reason.OTHER_COMMANDER, f"/planner publishes {PATH}")
+    planner.destroy_publisher(publisher)
+    watched.becomes(None)
+    planner.destroy_node()
+
+
 def test_a_lease_that_ends_by_silence_lasts_until_the_robot_stands() -> None:
     """Finding: the node was killed, its motion was still driven, and the program began."""
     leases = Leases("kr150", "s1")

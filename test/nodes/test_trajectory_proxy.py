@@ -19,7 +19,6 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from rclpy.qos import qos_profile_action_status_default
-from rclpy.task import Future
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
@@ -383,7 +382,10 @@ class InParts(Node):
         impl, within = FollowJointTrajectory.Impl, f"{ACTION}/_action"
         self.create_service(impl.SendGoalService, f"{within}/send_goal", self._asked)
         self.create_service(impl.CancelGoalService, f"{within}/cancel_goal", self._cancelled)
-        self.create_service(impl.GetResultService, f"{within}/get_result", self._never)
+        self.without_answers = Node("results", **options)  # is not spun
+        self.without_answers.create_service(
+            impl.GetResultService, f"{within}/get_result", lambda request, response: response
+        )
         self.create_publisher(impl.FeedbackMessage, f"{within}/feedback", 10)
         status = qos_profile_action_status_default
         self.status = self.create_publisher(impl.GoalStatusMessage, f"{within}/status", status)
@@ -402,10 +404,6 @@ class InParts(Node):
 
     def _cancelled(self, request: Any, response: Any) -> Any:
         self.cancels.append(request)
-        return response
-
-    async def _never(self, request: Any, response: Any) -> Any:
-        await Future()
         return response
 
     def _tick(self) -> None:
@@ -438,6 +436,8 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
         graph.spin_until(lambda: not path.live(time.monotonic()), "it is known to stand", 5.0)
         assert time.monotonic() > robot._ends_s
     cell.client.destroy()
+    robot.without_answers.destroy_node()
+    robot.destroy_node()
 
 
 # ---- node and controller as processes: the node in its own executor -----------------------------
