@@ -79,6 +79,9 @@ class GoalHandling(Protocol):
     def goal_rejected(self, path: SentPath) -> None:
         """The controller did not take it."""
 
+    def goal_lost(self, why: str) -> None:
+        """Nothing more is heard of a goal, which the robot may still follow: stop it."""
+
     def uncorrect(
         self, names: tuple[str, ...], position: Array, velocity: Array | None
     ) -> tuple[Array, Array | None]:
@@ -161,11 +164,11 @@ class TrajectoryProxy:
     def stop(self, message: Any, why: str) -> bool:
         """Send a trajectory that stops the robot; it preempts the goals, which end for ``why``.
 
-        False when no controller is there to take it. A goal is cancelled only where the controller
-        rejects the stop: a cancel is a dead stop from any speed.
+        False when no controller is configured. A goal is cancelled only where the controller
+        rejects the stop, or is not all there: a cancel is a dead stop from any speed.
         """
         client = self._clients.get(self.controller)
-        if client is None or not client.server_is_ready():
+        if client is None:
             return False
         goals = list(self._goals)
         for goal in goals:
@@ -184,6 +187,9 @@ class TrajectoryProxy:
                 self._forward_cancel(goal)
 
         future.add_done_callback(self._safe(answered))
+        if not client.server_is_ready():  # it may drive on all the same, and may never answer
+            for goal in goals:
+                self._forward_cancel(goal)
         return True
 
     def cancel(self, why: str) -> None:
@@ -340,7 +346,11 @@ class TrajectoryProxy:
             if not goal.servers <= servers:
                 if goal.result is not None:
                     goal.result.cancel()  # rclpy would keep it for ever
-                self._fail(goal, f"the controller that offered {self.controller} vanished")
+                why = f"the controller that offered {self.controller} vanished"
+                goal.stopped = why  # its path ends when the robot is seen to stand
+                self._handling.goal_lost(why)
+                self._forward_cancel(goal)
+                self._fail(goal, f"{why}; the robot may still move")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
                 what = "cancel, the robot may still move" if goal.cancel else "goal"
                 self._fail(

@@ -47,6 +47,7 @@ from robocal_ros.correction.settings import (
 )
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import Health
@@ -76,7 +77,6 @@ STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither ha
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
-PERCENT = 0.01
 
 
 class JointCorrectionNode(HouseNode):
@@ -118,7 +118,8 @@ class JointCorrectionNode(HouseNode):
         self._violation: GraphViolation | None = None
         self._commanded = self._by_action = False
         self._stream = TARGETS
-        self._scalings: dict[str, float] = {}
+        self._astray: SentPath | None = None  # a path that the robot is being stopped beside
+        self._scalings, self._scaling = SpeedScaling(), 1.0
         self._open_topics()
         self._open_action()
         self._report = CorrectionReport(
@@ -207,9 +208,7 @@ class JointCorrectionNode(HouseNode):
         try:
             self._session.hold(Reason.STOPPED, why, time.monotonic())
             self._stop(why)
-            while time.monotonic() < until_s and (
-                self._emit_tail() or self._stopping.look(time.monotonic(), self._scaling)
-            ):
+            while time.monotonic() < until_s and (self._emit_tail() or self._is_stopping()):
                 time.sleep(self._tail_period_s())
                 self.take_waiting()  # where the robot is
             if self._proxy is not None:
@@ -324,6 +323,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_states(self, message: JointMessage) -> None:
         command, now = self._session.counted(message.command), time.monotonic()
+        self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         taught = self._session.reading(command, now, age)
         self._track.read(command, now)
@@ -396,6 +396,10 @@ class JointCorrectionNode(HouseNode):
         """What the goal took the place of goes on."""
         self._session.reject(path)
 
+    def goal_lost(self, why: str) -> None:
+        """The robot may still follow it, and is stopped by where it is."""
+        self._stop_by_readings(why, time.monotonic())
+
     def uncorrect(self, names: Any, position: Any, velocity: Any) -> Any:
         """As `CorrectionSession.taught`, now."""
         return self._session.taught(names, position, velocity, time.monotonic())
@@ -407,20 +411,31 @@ class JointCorrectionNode(HouseNode):
         now = time.monotonic()
         if self._shadow:
             return
-        planned = self._session.stop(now, AHEAD_S)
-        self._arm_tail()
-        sent = True
-        if planned is not None:
+        self._rescale(now)
+        path, sent = self._session.path, True
+        if path is not None and path.live(now) and not self._track.follows(path, now):
+            self._session.end_stream(RefusedError(Reason.STOPPED, why), now)
+            sent = self._stop_by_readings(why, now)
+        elif (planned := self._session.stop(now, AHEAD_S)) is not None:
             way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
             after_s = way_s / STOP_SHARE
             sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
             self._stopping.watch(why, after_s, now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
-            sent = self._stopping.begin(why, now)
+            sent = self._stop_by_readings(why, now)
+        self._arm_tail()
         if not sent and self._proxy is not None:
             self._proxy.cancel(why)
         if self._stopping.why:
             self._stop_timer.reset()
+
+    def _stop_by_readings(self, why: str, now_s: float) -> bool:
+        """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
+        self._astray = self._session.path
+        sent = self._stopping.begin(why, now_s)
+        if sent:
+            self._stop_timer.reset()
+        return sent
 
     def _send_plan(self, plan: JointPlan) -> None:
         self._send_stop(self._arm_names, plan.q[-1], plan.duration_s, self._stopping.why)
@@ -433,12 +448,22 @@ class JointCorrectionNode(HouseNode):
         return True
 
     def _watch_stop(self) -> None:
-        if not self._stopping.look(time.monotonic(), self._scaling):
+        if not self._is_stopping():
             self._stop_timer.cancel()
             if self._stopping.fault:
                 self.get_logger().error(self._stopping.fault)
             if self._proxy is not None:
                 self._proxy.end("stopped")
+
+    def _is_stopping(self) -> bool:
+        """Let a stop go on; whether one is under way."""
+        now = time.monotonic()
+        if self._stopping.look(now, self._scaling):
+            return True
+        if self._astray is not None and not self._stopping.fault:
+            self._astray.end(now)
+        self._astray = None
+        return False
 
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
@@ -465,30 +490,30 @@ class JointCorrectionNode(HouseNode):
 
     # ---- the controller -------------------------------------------------------------------------
 
-    @property
-    def _scaling(self) -> float:
-        """How fast the controller's clock runs, by who says least."""
-        return min(self._scalings.values(), default=1.0)
-
     def _on_controller(self, message: Any) -> None:
-        """Where the controller is. Older ones leave the scaling at 0, and so say nothing by it."""
-        self._scale(CONTROLLER, float(getattr(message, "speed_scaling_factor", math.nan)))
+        """Where the controller is, and how fast its clock runs."""
+        now = time.monotonic()
+        self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
+        self._rescale(now)
         position = np.array(message.reference.positions, dtype=np.float64)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
             self._scaling,
-            time.monotonic(),
+            now,
         )
 
     def _on_scaling(self, message: Any) -> None:
-        """In percent, as ur_robot_driver's speed_scaling_state_broadcaster publishes it."""
-        self._scale(SCALING, float(message.data) * PERCENT)
-        self._session.controller((), np.empty(0), self._scaling, time.monotonic())
+        now = time.monotonic()
+        self._scalings.slider(float(message.data), now)
+        self._rescale(now)
 
-    def _scale(self, topic: str, scaling: float) -> None:
-        if math.isfinite(scaling) and (scaling > 0.0 or topic in self._scalings):
-            self._scalings[topic] = min(max(scaling, 0.0), 1.0)
+    def _rescale(self, now_s: float) -> None:
+        """How fast the controller's clock runs now; as planned where nobody told it lately."""
+        scaling = self._scalings.at(now_s)
+        before, self._scaling = self._scaling, 1.0 if scaling is None else scaling
+        if self._scaling != before:
+            self._session.controller((), np.empty(0), self._scaling, now_s)
 
     # ---- who else commands ----------------------------------------------------------------------
 
@@ -504,8 +529,11 @@ class JointCorrectionNode(HouseNode):
 
     def _judge_graph(self) -> None:
         """Hold the program's commands while somebody else may move the robot."""
-        now, before = time.monotonic(), self._violation
-        found = self._violation = self._graph.look(now)
+        now, before, lost = time.monotonic(), self._violation, self._graph.lost
+        stood_s = self._track.stood_s(now) if self._scaling else 0.0  # one that pauses goes on
+        found = self._violation = self._graph.look(now, stood_s)
+        if self._graph.lost and not lost:
+            self.get_logger().error(self._graph.lost)
         for reason in (Reason.OTHER_COMMANDER, Reason.LEASED):
             if found is not None and found.reason is reason:
                 self._session.hold(reason, found.detail, now)
@@ -530,6 +558,7 @@ class JointCorrectionNode(HouseNode):
     def _look(self) -> None:
         """Let time pass, and tell what has changed."""
         now = time.monotonic()
+        self._rescale(now)
         self._session.look(now, self.now_ns())
         if self._commanded:
             self._tell_offset(JointOffset.PERIODIC, now)
@@ -554,7 +583,7 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        faults = [*self._faults(), *filter(None, [self._stopping.fault])]
+        faults = [*self._faults(), *filter(None, [self._stopping.fault, self._graph.lost])]
         return self._report.health(faults, self._rivals())
 
 

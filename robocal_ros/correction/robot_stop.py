@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.output import SentPath
+from robocal_ros.correction.robot_state import RESPONSE_S
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
@@ -23,6 +25,7 @@ TRACK_S = 0.1  # readings of so long tell speed and standstill
 LEAST_TRACK_S = 0.02  # shorter ones tell no speed
 REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
 LAG_S = 0.03  # by so much the robot, and what is known of it, may follow a stop late
+FOLLOWED = 25  # instants of a path that a place is compared with
 SEEN = 0.08  # of the speed at the begin: a planned loss of so much must show, at least by half
 GIVE_UP_S = 5.0  # a robot that still moves then is stopped by a person
 DECELERATION = {False: 10.0, True: 1.0}  # turning rad/s^2, sliding m/s^2, where none is known
@@ -43,6 +46,8 @@ class RobotTrack:
         self._q, self._qd = np.full(arm.n, np.nan), np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
+        self._place, self._place_s = np.full(arm.n, np.nan), np.inf  # where it stands, since when
+        self._turning = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
         self._names: tuple[str, ...] = ()
         self._index = self._column = np.empty(0, dtype=np.int64)
 
@@ -54,6 +59,7 @@ class RobotTrack:
             self._index = np.array([self._number[state.names[i]] for i in columns], dtype=np.int64)
         if len(state.position) != len(state.names) or not len(self._index):
             return
+        was_silent = self._silent(now_s)
         self._q[self._index] = state.position[self._column]
         self._qd[self._index] = np.nan
         if state.velocity is not None and len(state.velocity) == len(state.names):
@@ -62,12 +68,17 @@ class RobotTrack:
         self._track.append((now_s, self._q.copy()))
         while len(self._track) > 2 and self._track[1][0] <= now_s - TRACK_S:
             self._track.popleft()
+        if was_silent or not np.all(np.abs(self._q - self._place) < self._near):
+            self._place, self._place_s = self._q.copy(), now_s
+
+    def _silent(self, now_s: float) -> bool:
+        return not now_s - float(np.min(self._read_s)) <= self._age_limit_s
 
     def here(self, now_s: float) -> tuple[Array, Array] | None:
         """Joints and speeds (n,) now; None where they were not all read lately."""
-        age_s = now_s - float(np.min(self._read_s))
-        if not age_s <= self._age_limit_s:
+        if self._silent(now_s):
             return None
+        age_s = now_s - float(np.min(self._read_s))
         last_s = self._track[-1][0]
         earlier = [place for place in self._track if last_s - place[0] >= LEAST_TRACK_S]
         qd = self._qd
@@ -85,6 +96,22 @@ class RobotTrack:
             return False
         places = np.array([q for _, q in self._track])
         return bool(np.all(np.ptp(places, axis=0) < self._near))
+
+    def stood_s(self, now_s: float) -> float:
+        """How long the joints have stood in one place; 0 where they were not all read lately."""
+        return 0.0 if self._silent(now_s) else now_s - self._place_s
+
+    def follows(self, path: SentPath, now_s: float) -> bool:
+        """Whether the robot is where a path has it, or was lately; True where it is not known."""
+        if self.here(now_s) is None:
+            return True
+        read_s = float(np.min(self._read_s))
+        times = np.linspace(read_s - RESPONSE_S, now_s + LAG_S, FOLLOWED)
+        places = np.array([path.place(t) for t in times])
+        q, near = self._q[path.index], self._near[path.index]
+        turns = np.round((q - places[-1]) / (2.0 * np.pi))
+        q = q - 2.0 * np.pi * np.where(self._turning[path.index], turns, 0.0)
+        return bool(np.all((q > places.min(axis=0) - near) & (q < places.max(axis=0) + near)))
 
 
 class RobotStop:
