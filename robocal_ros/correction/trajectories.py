@@ -23,7 +23,9 @@ Index = NDArray[np.int64]
 SPLINE_PEAK = 1.875
 SETTLED = 1e-9  # rad, m: of an offset that is the desired one
 LONGEST_WAIT_S = 60.0  # for which it is worked out how long an offset takes
-STOP_POINTS = 10
+STOP_SPACING_S = 0.025  # of the points of a stop
+SHORTEST_STOP_S = 0.1
+OWN = 1.25  # of a path's own accelerations, where they are larger than the limits: a stop's
 
 
 class TrajectoryCorrector:
@@ -207,27 +209,82 @@ class TrajectoryCorrector:
             names, np.maximum(way, 0.0)[None], np.array([lead_s]), fastest, "would be led in"
         )
 
-    def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:
-        """A trajectory that slows down what was put out last; None where nothing moves by it.
+    def stop(self, now_s: float, ahead_s: float) -> tuple[TrajectoryCommand, SentPath] | None:
+        """Slow down on the way of what was put out last; None where nothing moves by it.
 
-        All joints slow down together. Its first point lies ``ahead_s`` ahead, where the controller
-        is by then; velocities are given, so that it enters without a step.
+        From ``ahead_s`` ahead on the path's own clock slows down until it stands, so that no joint
+        leaves its path, or goes on beyond its end. Where the controller's clock stands it is held.
         """
         path = self._output.path
         if path is None or not path.live(now_s):
             return None
-        then_s = now_s + ahead_s
-        h = 1e-3
-        begin = path.place(then_s)
-        speed = (path.place(then_s) - path.place(then_s - h)) / h
-        lasts = float(np.max(np.abs(speed) / self._config.acceleration_limits[path.index]))
-        if not 0.0 < lasts < np.inf:
-            lasts = ahead_s
-        t = np.linspace(0.0, lasts, STOP_POINTS)[:, None]
-        position = begin + speed * (t - 0.5 * t * t / lasts)
-        velocity = speed * (1.0 - t / lasts)
+        clock = path.time(now_s)
+        rate = (path.time(now_s + ahead_s) - clock) / ahead_s
+        left = float(path.times[-1]) - clock - ahead_s
+        t, slow, on = np.zeros(1), np.zeros(1), np.zeros(1)
+        if rate > 0.0 and left > 0.0:
+            lasts, share = self._slow_down(path, now_s + ahead_s / rate, rate, left)
+            t = np.linspace(0.0, lasts, max(int(np.ceil(lasts / STOP_SPACING_S)), 2) + 1)
+            slow, on = 1.0 - share * t / lasts, t - 0.5 * share * t * t / lasts
+        at_s = now_s + (ahead_s + on) / rate if rate > 0.0 else np.array([now_s])
+        position, speed = _motion(path, at_s, rate)
+        velocity = speed * slow[:, None]
+        velocity[-1] = 0.0
+        offsets, rates, withheld = (
+            np.array([path.at(rows, at) for at in at_s])
+            for rows in (path.offsets, path.rates, path.withheld)
+        )
         names = tuple(self._arm.joint_names[i] for i in path.index)
-        return TrajectoryCommand(names, position, ahead_s + t[:, 0], velocity, mark=CORRECTED)
+        command = TrajectoryCommand(names, position, ahead_s + t, velocity, mark=CORRECTED)
+        return command, SentPath(
+            index=path.index,
+            begin_s=now_s,
+            times=command.time_from_start_s,
+            out=position,
+            velocity=velocity,
+            known_times=command.time_from_start_s,
+            offsets=offsets,
+            rates=rates * slow[:, None],
+            withheld=withheld,
+            stage=path.stage,
+            led_from=path.place(now_s),
+            put_s=now_s,
+            at_once=True,
+        )
+
+    def _slow_down(
+        self, path: SentPath, begin_s: float, rate: float, left: float
+    ) -> tuple[float, float]:
+        """How long to slow down on the ``left`` seconds of a path, and by what share of its speed.
+
+        With c(t) = t - t^2 / 2T, and c' = 1 - t/T = r, a path q(c) has the acceleration
+        q'' r^2 - q' / T: the shortest T is taken with which it is neither above the limit nor
+        much above the path's own. Where there is none, the path itself ends soon (share 0).
+        """
+        limits = self._config.acceleration_limits[path.index]
+        here = _motion(path, np.array([begin_s]), rate)[1][0]
+        least = max(float(np.max(np.abs(here) / limits)), SHORTEST_STOP_S)
+        spans = np.maximum(least * np.geomspace(0.25, 4.0, 33), SHORTEST_STOP_S)
+        spans = np.minimum(spans, 2.0 * left)
+        c = np.linspace(0.0, 0.5 * spans[-1], 101)
+        speed = _motion(path, begin_s + c / rate, rate)[1]
+        bend = np.gradient(speed, c, axis=0)
+        most = np.maximum(limits, OWN * np.abs(bend).max(axis=0))
+        slow = np.maximum(1.0 - 2.0 * c / spans[:, None], 0.0)[..., None]  # (spans, c, 1): r^2
+        over = np.abs(bend * slow - speed / spans[:, None, None]) / most
+        taken = np.max(np.where(slow > 0.0, over, 0.0), axis=(1, 2))
+        if np.any(taken <= 1.0):
+            return float(spans[np.argmax(taken <= 1.0)]), 1.0
+        if spans[-1] >= 2.0 * left:
+            return left, 0.0
+        return float(spans[-1]), 1.0
+
+
+def _motion(path: SentPath, at_s: Array, rate: float) -> tuple[Array, Array]:
+    """Places and speeds (m, k) on a path at instants (m,), the speeds by the path's own clock."""
+    h = 1e-4
+    places = np.array([[path.place(at + d) for at in at_s] for d in (-h, 0.0, h)])
+    return places[1], (places[2] - places[0]) / (2.0 * h * rate) if rate > 0.0 else 0.0 * places[1]
 
 
 def require_times(command: TrajectoryCommand) -> None:
