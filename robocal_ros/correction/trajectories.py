@@ -10,7 +10,17 @@ from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import TrajectoryCommand, require_few, require_finite
-from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, STILL
+from robocal_ros.correction.limiter import (
+    ACCELERATION,
+    DESIRED,
+    LONGEST_STEP_S,
+    OFFSET,
+    OFFSET_RATE,
+    RATE,
+    REST_ACCELERATION,
+    REST_RATE,
+    STILL,
+)
 from robocal_ros.correction.output import Output, SentPath, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
@@ -23,6 +33,7 @@ Index = NDArray[np.int64]
 SPLINE_PEAK = 1.875
 SETTLED = 1e-9  # rad, m: of an offset that is the desired one
 LONGEST_WAIT_S = 60.0  # for which it is worked out how long an offset takes
+TRIES = 12
 STOP_SPACING_S = 0.025  # of the points of a stop
 SHORTEST_STOP_S = 0.1
 OWN = 1.25  # of a path's own accelerations, where they are larger than the limits: a stop's
@@ -55,30 +66,31 @@ class TrajectoryCorrector:
             the correction that belongs there, or a limit is exceeded. Nothing has changed then.
         """
         output, limiter = self._output, self._output.limiter
-        kept = limiter.state.copy()
+        kept, limits = limiter.state.copy(), limiter.limits
         times = command.time_from_start_s + starts_in_s
         desired, result = self._desired.at(q)
         output.take_up(now_s)
         try:
             led_from = self._begin(index, q, desired, times, now_s)
             begin = limiter.state.copy()
-            way = np.abs(np.diff(q, axis=0))[:, index].max(axis=1, initial=0.0)
-            speed = np.append(2.0 * STILL, way / np.diff(times))  # a lead-in is a motion
-            speed[1:-1] = np.maximum(speed[1:-1], speed[2:])  # so is what begins to move
             active = np.zeros(self._arm.n)
             active[index] = 1.0
-            offsets, rates = limiter.follow(desired, np.maximum(times, 0.0), speed, active)
+            follows = self._settled(command, index, q, result)
+            speed = _speeds(q[:, index], times)
+            offsets, rates, bends = self._follow(desired, follows, times, speed, active)
             self._require_end(limiter.withheld[index], active)
             out = q + offsets
-            velocity, acceleration = self._rates(
-                command, index, q, result, offsets - desired, rates, times
-            )
+            velocity = acceleration = None
+            if command.velocity is not None:
+                velocity = command.velocity + rates[:, index]
+            if command.acceleration is not None:
+                acceleration = command.acceleration + bends[:, index]
             require_limits(out, self._arm)
             self._require_speeds(command, index, out, velocity, times, led_from)
         finally:
-            limiter.state[:] = kept
-        known_times, withheld = command.time_from_start_s, offsets - desired
-        sent, sent_rates, sent_withheld = offsets, rates, withheld
+            limiter.state[:], limiter.limits = kept, limits
+        known_times, sent, sent_rates = command.time_from_start_s, offsets, rates
+        withheld = sent_withheld = offsets - desired
         if led_from is not None:  # until its first point: from the offset that there is now
             known_times = np.append(-starts_in_s, known_times)
             sent = np.vstack([begin[OFFSET], offsets])
@@ -115,6 +127,8 @@ class TrajectoryCorrector:
     ) -> Array | None:
         """The offset that it begins with; returns where it leads in from (k,), None at once."""
         output, limiter = self._output, self._output.limiter
+        if output.path is None and self._state.stands(index, now_s):  # a stream's that is over
+            limiter.state[OFFSET_RATE] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
             here, wanted = (
                 np.array([np.interp(0.0, times, column) for column in rows.T])
@@ -154,36 +168,57 @@ class TrajectoryCorrector:
             f"let it last {more_s:.2f} s longer",
         )
 
-    def _rates(
-        self,
-        command: TrajectoryCommand,
-        index: Index,
-        q: Array,
-        result: StagedResult | None,
-        withheld: Array,
-        rates: Array,
-        times: Array,
-    ) -> tuple[Array | None, Array | None]:
-        """Velocities and accelerations (m, k), where the command has any.
-
-        By the chain rule where the offset is the desired one, else by the limiter's rates.
-        """
+    def _settled(
+        self, command: TrajectoryCommand, index: Index, q: Array, result: StagedResult | None
+    ) -> Array | None:
+        """Derivatives (1 or 2, m, n) of the desired offset, as many as the command has."""
         if command.velocity is None:
-            return None, None
-        zero = np.zeros_like(q)
-        speed, bend = zero.copy(), zero.copy()
-        speed[:, index] = command.velocity
+            return None
+        given = np.zeros((2, *q.shape))
+        given[0][:, index] = command.velocity
         if command.acceleration is not None:
-            bend[:, index] = command.acceleration
-        velocity, acceleration = speed, bend
+            given[1][:, index] = command.acceleration
+        rates = np.zeros_like(given)
         if result is not None and self._desired.stage is not None:
-            velocity, acceleration = self._desired.stage.rates(q, speed, bend, result)
-        apart = np.abs(withheld[:, index]).max(axis=1) > 0.0
-        if np.any(apart):
-            velocity[apart] = (speed + rates)[apart]
-            if len(times) > 1:
-                acceleration[apart] = (bend + np.gradient(rates, times, axis=0))[apart]
-        return velocity[:, index], None if command.acceleration is None else acceleration[:, index]
+            rates = np.array(self._desired.stage.rates(q, given[0], given[1], result)) - given
+        return rates if command.acceleration is not None else rates[:1]
+
+    def _follow(
+        self, desired: Array, follows: Array | None, times: Array, speed: Array, active: Array
+    ) -> tuple[Array, Array, Array]:
+        """Offsets, rates, accelerations (m, n), whose spline keeps the limits.
+
+        A controller makes cubics of points with velocities, quintics of those with accelerations
+        too: they bend more than the limiter's steps do, which get a smaller share of the limits
+        until the splines are within them.
+        """
+        limiter = self._output.limiter
+        begin, limits, share = limiter.state.copy(), limiter.limits, np.ones(2)
+        later = times > 0.0
+        for _ in range(TRIES):
+            limiter.state[:] = begin
+            limiter.limits = limits * np.tile(share[::-1], 2)[:, None]
+            offsets, rates = limiter.follow(desired, np.maximum(times, 0.0), speed, active)
+            if follows is None:
+                return offsets, rates, rates
+            withheld = np.vstack([begin[OFFSET] - begin[DESIRED], (offsets - desired)[later]])
+            rows = np.zeros((1 + len(follows), *withheld.shape))
+            rows[:2, 0], rows[0, 1:] = begin[[OFFSET, OFFSET_RATE]], offsets[later]
+            rows[1:, 1:] = follows[:, later]
+            h = np.diff(times[later], prepend=0.0)[:, None]
+            _add_derivatives(rows, withheld, h)
+            rows[1:], withheld = rows[1:] * active, withheld * active
+            over = _over(rows, withheld, h, speed[later] > STILL, limits)
+            if np.all(over <= 1.0 + SETTLED):
+                break
+            share *= np.where(over > 1.0, np.maximum(0.9 / np.maximum(over, 1.0), 0.25), 1.0)
+        else:
+            raise RefusedError(
+                Reason.TOO_SHORT, "between its points the offset would change too fast"
+            )
+        derivatives = np.repeat(rows[1:, :1], len(times), axis=1)
+        derivatives[:, later] = rows[1:, 1:]
+        return offsets, derivatives[0], derivatives[-1]
 
     def _require_speeds(
         self,
@@ -297,3 +332,52 @@ def require_times(command: TrajectoryCommand) -> None:
         raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
     require_finite(command.names, command.velocity)
     require_finite(command.names, command.acceleration)
+
+
+def _add_derivatives(rows: Array, withheld: Array, h: Array) -> None:
+    """Add those of what is withheld (r, n) to the derivatives in rows (2 or 3, r, n).
+
+    By the parabola through each three points, ``h`` (r - 1, 1) apart; what has come in stays.
+    """
+    slope = np.diff(withheld, axis=0) / h
+    both = h[:-1] + h[1:]
+    comes = (withheld[1:-1] != 0.0) | (slope[1:] != 0.0)
+    rows[1, 1:-1] += np.where(comes, (slope[:-1] * h[1:] + slope[1:] * h[:-1]) / both, 0.0)
+    if len(rows) > 2:
+        rows[2, 1:-1] += np.where(comes, 2.0 * np.diff(slope, axis=0) / both, 0.0)
+
+
+def _over(rows: Array, withheld: Array, h: Array, moves: NDArray[np.bool_], limits: Array) -> Array:
+    """Acceleration and rate (2,) of a spline, in units of the limits, where not all has come in.
+
+    ``rows`` (2 or 3, r, n) are offsets and derivatives, ``moves`` (r - 1,) of the ways between.
+    """
+    some = (withheld[:-1] != 0.0).any(axis=1) | (withheld[1:] != 0.0).any(axis=1)
+    if not some.any():
+        return np.zeros(2)
+    h, (p0, v0), (p1, v1) = h[some], rows[:2, :-1][:, some], rows[:2, 1:][:, some]
+    way = (p1 - p0) / h
+    c = [3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0 * way, 0.0 * way]
+    if len(rows) > 2:
+        b0, b1 = rows[2, :-1][some] * h, rows[2, 1:][some] * h
+        c[0] = 0.5 * b0
+        c[1] = 10.0 * way - 6.0 * v0 - 4.0 * v1 - 1.5 * b0 + 0.5 * b1
+        c[2] = -15.0 * way + 8.0 * v0 + 7.0 * v1 + 1.5 * b0 - b1
+        c[3] = 6.0 * way - 3.0 * (v0 + v1) - 0.5 * (b0 - b1)
+    u = np.linspace(0.0, 1.0, 9)[:, None, None]
+    rate = v0 + u * (2.0 * c[0] + u * (3.0 * c[1] + u * (4.0 * c[2] + u * 5.0 * c[3])))
+    bend = (2.0 * c[0] + u * (6.0 * c[1] + u * (12.0 * c[2] + u * 20.0 * c[3]))) / h
+    fast = moves[some][:, None] | (np.abs(v0) > limits[REST_RATE])
+    most = np.where(
+        fast[None], limits[[ACCELERATION, RATE], None], limits[[REST_ACCELERATION, REST_RATE], None]
+    )
+    return np.array([np.max(np.abs(x) / m) for x, m in zip((bend, rate), most, strict=True)])
+
+
+def _speeds(q: Array, times: Array) -> Array:
+    """Fastest joint (m,) on the way to each point; what leads in, or soon moves, is a motion."""
+    way = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0)
+    speed = np.append(2.0 * STILL, way / np.diff(times))
+    soon = np.searchsorted(times, times[1:-1] + LONGEST_STEP_S).clip(max=len(times) - 1)
+    speed[1:-1] = np.maximum(speed[1:-1], speed[soon])
+    return speed
