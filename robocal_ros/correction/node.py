@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
 from sensor_msgs.msg import JointState
@@ -55,6 +56,8 @@ from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
 
+Array = NDArray[np.float64]
+
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
 COMMANDS = "joint_commands"
@@ -73,7 +76,9 @@ KINDS = {
 }
 ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
 AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
-STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither hastens nor turns back
+# A stop's first point that is sent: the controller makes a cubic to it from where and as fast as it
+# is, which does not turn back where the message comes 60 ms late.
+FIRST_S = 0.12
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
@@ -417,10 +422,11 @@ class JointCorrectionNode(HouseNode):
             self._session.end_stream(RefusedError(Reason.STOPPED, why), now)
             sent = self._stop_by_readings(why, now)
         elif (planned := self._session.stop(now, AHEAD_S)) is not None:
-            way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
-            after_s = way_s / STOP_SHARE
-            sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
-            self._stopping.watch(why, after_s, now)
+            times, q, qd = planned.time_from_start_s, planned.position, planned.velocity
+            assert qd is not None
+            k = min(int(np.searchsorted(times, FIRST_S)), len(times) - 1)
+            sent = self._send_stop(planned.names, times[k:] - REACTION_S, q[k:], qd[k:], why)
+            self._stopping.watch(why, times, np.abs(qd).max(axis=1), now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
             sent = self._stop_by_readings(why, now)
         self._arm_tail()
@@ -438,10 +444,11 @@ class JointCorrectionNode(HouseNode):
         return sent
 
     def _send_plan(self, plan: JointPlan) -> None:
-        self._send_stop(self._arm_names, plan.q[-1], plan.duration_s, self._stopping.why)
+        end = plan.time_s[-1:], plan.q[-1:], plan.qd[-1:]
+        self._send_stop(self._arm_names, *end, self._stopping.why)
 
-    def _send_stop(self, names: Any, position: Any, after_s: float, why: str) -> bool:
-        message = stop_message(names, position, after_s)
+    def _send_stop(self, names: Any, times: Array, q: Array, qd: Array, why: str) -> bool:
+        message = stop_message(names, times, q, qd)
         if self._by_action and self._proxy is not None:
             return self._proxy.stop(message, why)
         self._outputs[TRAJECTORY].publish(message)

@@ -120,6 +120,19 @@ class SentPath:
         t = self.time(now_s)
         return np.array([np.interp(t, self.known_times, column) for column in rows.T])
 
+    def offset(self, now_s: float) -> tuple[Array, Array]:
+        """Offset and its rate (n,) now, as the controller drives them between the points."""
+        t, times = self.time(now_s), self.known_times
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        if self.velocity is None or not 0 <= k < len(times) - 1:
+            return self.at(self.offsets, now_s), self.at(self.rates, now_s)
+        h = times[k + 1] - times[k]
+        s, v0, v1 = (t - times[k]) / h, self.rates[k], self.rates[k + 1]
+        way = (self.offsets[k + 1] - self.offsets[k]) / h
+        first, second = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
+        offset = self.offsets[k] + h * s * (v0 + s * (first + s * second))
+        return offset, v0 + s * (2.0 * first + 3.0 * s * second)
+
 
 class Output:
     """What was put out last for each joint.
@@ -266,7 +279,10 @@ class Output:
             return None, whole
         if not exact:
             return None
-        taught = self.uncorrected(place, now_s)
+        if self.path is not None and self.path.live(now_s):
+            taught = place - self.path.offset(now_s)[0]
+        else:
+            taught = self.uncorrected(place, now_s)
         return taught, place - taught
 
     def refuse(self, detail: str) -> RefusedError:
@@ -287,9 +303,9 @@ class Output:
         """The offset goes on from the path that was put out last."""
         if self.path is not None:
             state, path = self.limiter.state, self.path
-            state[OFFSET] = path.at(path.offsets, now_s)
+            state[OFFSET], rate = path.offset(now_s)
             moving = path.time(now_s) < path.times[-1] and path.live(now_s)
-            state[OFFSET_RATE] = path.at(path.rates, now_s) if moving else 0.0
+            state[OFFSET_RATE] = rate if moving else 0.0
             state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
             state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
 

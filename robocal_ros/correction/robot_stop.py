@@ -26,7 +26,7 @@ LEAST_TRACK_S = 0.02  # shorter ones tell no speed
 REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
 LAG_S = 0.03  # by so much the robot, and what is known of it, may follow a stop late
 FOLLOWED = 25  # instants of a path that a place is compared with
-SEEN = 0.08  # of the speed at the begin: a planned loss of so much must show, at least by half
+SEEN = 0.08  # of the fastest speed: a planned loss of so much must show, at least by half
 GIVE_UP_S = 5.0  # a robot that still moves then is stopped by a person
 DECELERATION = {False: 10.0, True: 1.0}  # turning rad/s^2, sliding m/s^2, where none is known
 
@@ -140,7 +140,8 @@ class RobotStop:
         known = np.isfinite(acceleration) & (acceleration > 0.0)
         self._limits = MotionLimits(stop_deceleration=np.where(known, acceleration, assumed))
         self._arm, self._track, self._send = arm, track, send
-        self._began_s = self._sent_s = self._speed = self._lasts_s = 0.0
+        self._began_s = self._sent_s = 0.0
+        self._times = self._speeds = np.zeros(1)
         self.why = self.fault = ""
         self.sent = 0
 
@@ -156,12 +157,16 @@ class RobotStop:
         self.fault = f"{why}: no stop can be planned, the joint states are missing or too old"
         return False
 
-    def watch(self, why: str, lasts_s: float, now_s: float) -> None:
-        """Watch a stop that was sent by others, and send one of its own where it is not obeyed."""
+    def watch(self, why: str, times: Array, speeds: Array, now_s: float) -> None:
+        """Watch a stop that was sent by others, and send one of its own where it is not obeyed.
+
+        ``times``, ``speeds``: (m,) of its points from now on, of the fastest joint.
+        """
         here = self._track.here(now_s)
-        self._speed = 0.0 if here is None else float(np.max(np.abs(here[1])))
+        measured = 0.0 if here is None else float(np.max(np.abs(here[1])))
         self._began_s = self._sent_s = now_s
-        self._lasts_s, self.sent = max(lasts_s, SHORTEST_STOP_S), 1
+        self._times = np.append(0.0, times * max(SHORTEST_STOP_S / times[-1], 1.0))
+        self._speeds, self.sent = np.append(measured, speeds), 1
         self.why, self.fault = why, ""
 
     def look(self, now_s: float, scaling: float = 1.0) -> bool:
@@ -180,10 +185,11 @@ class RobotStop:
             self.why = ""
             return False
         here = self._track.here(now_s)
-        planned = min((since_s - LAG_S) * scaling / self._lasts_s, 1.0)
-        if here is not None and planned > SEEN:
+        planned = float(np.interp((since_s - LAG_S) * scaling, self._times, self._speeds))
+        fastest = float(np.max(self._speeds))
+        if here is not None and planned < (1.0 - SEEN) * fastest:
             speed = float(np.max(np.abs(here[1])))
-            if speed > (1.0 - 0.5 * planned) * self._speed and not self._track.stands(now_s):
+            if speed > 0.5 * (fastest + planned) and not self._track.stands(now_s):
                 self._again(now_s)
         return True
 
@@ -193,8 +199,8 @@ class RobotStop:
             return False
         q, qd = here
         plan = stop(self._arm, self._limits, q + qd * REACTION_S, qd)
-        self._speed, self._sent_s = float(np.max(np.abs(qd))), now_s
-        self._lasts_s = plan.duration_s
+        self._times, self._speeds = plan.time_s, np.abs(plan.qd).max(axis=1)
+        self._sent_s = now_s
         self.sent += 1
         self._send(plan)
         return True

@@ -302,26 +302,12 @@ class CorrectionSession:
         """
         stream = RefusedError(Reason.STOPPED, "a stop was asked for")
         self._stream.end(stream, now_s)
-        command = self._paths.stop(now_s, ahead_s)
-        path = self._output.path
-        if command is not None and path is not None:
-            count, withheld = len(command), path.at(path.withheld, now_s)
-            offset = path.at(path.offsets, now_s)
-            self._output.path = SentPath(
-                index=path.index,
-                begin_s=now_s,
-                times=command.time_from_start_s,
-                out=command.position,
-                velocity=command.velocity,
-                known_times=command.time_from_start_s,
-                offsets=np.tile(offset, (count, 1)),
-                rates=np.zeros((count, len(offset))),
-                withheld=np.tile(withheld, (count, 1)),
-                stage=path.stage,
-                led_from=path.place(now_s),
-                put_s=now_s,
-                at_once=True,
-            )
+        stopped = self._paths.stop(now_s, ahead_s)
+        if stopped is None:
+            return None
+        command, path = stopped
+        path.scale(self._state.scaling, now_s)
+        self._output.path = path
         return command
 
     def _shadow(self, q: Array) -> None:
