@@ -32,6 +32,7 @@ class ToldCorrection:
     waiting_tool_revision : of a tool that waits for a standstill or a trajectory; None: none.
     stale : why the model is not corrected with any more; empty: it is.
     mismatch : why nothing goes out; empty: commands do.
+    commanders : who else commands the robot; nothing goes out in the state OTHER_COMMANDER.
     last_refusal : in words; empty: there was none.
     """
 
@@ -43,6 +44,7 @@ class ToldCorrection:
     waiting_tool_revision: int | None = None
     stale: str = ""
     mismatch: str = ""
+    commanders: str = ""
     last_refusal: str = ""
 
 
@@ -51,8 +53,8 @@ def uncorrected(
 ) -> str:
     """Why commands are not corrected with model and tool in force, and what to do; empty: they are.
 
-    Nominal model and taught tool need no correction. A blend that advances counts as done: it
-    advances with the commands alone, which the line would hold back until it is.
+    Nominal model and taught tool need no correction. An offset that is still on its way counts as
+    done. In the state LEASED the program's commands are refused: none goes out uncorrected.
 
     Parameters
     ----------
@@ -64,8 +66,8 @@ def uncorrected(
         return f"{NODE} is silent: start it, it corrects nothing" if needed else ""
     if needed and (why := _idle(told, thermal)):
         return f"{NODE} {why}"
-    corrects = told.enabled and not told.shadow and told.state is not CorrectionState.MISMATCH
-    if follows or not corrects:
+    silent = told.state in (CorrectionState.MISMATCH, CorrectionState.OTHER_COMMANDER)
+    if follows or not told.enabled or told.shadow or silent:
         return ""
     pairs = [
         _other("thermal model", "kinematic_model", told.model_revision, thermal, told),
@@ -82,6 +84,8 @@ def _idle(told: ToldCorrection, thermal: Head) -> str:
     """Why nothing is corrected, whatever the revisions in use."""
     if told.shadow:
         return "is in shadow mode, nothing is corrected: start it with shadow false"
+    if told.state is CorrectionState.OTHER_COMMANDER:
+        return f"puts nothing out, {told.commanders}: end them"
     if told.state is CorrectionState.MISMATCH:
         return f"puts nothing out, {told.mismatch}: see where the robot stands, call ~/acknowledge"
     if not told.enabled:
