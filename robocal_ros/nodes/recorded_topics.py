@@ -13,6 +13,48 @@ from robocal_ros.storage.bag_types import definition
 from robocal_ros.storage.recorded_names import recorded_name
 
 DEPTH = 1000
+DIAGNOSTICS = "/diagnostics"
+TOPICS = (
+    "joint_states",
+    "beam_events",
+    "sphere_cloud",
+    "sphere_center",
+    "reference_sphere_center",
+    "measured_point",
+    "measured_pose",
+    "motor_temperatures",
+    "profile",
+    "target_pose",
+    "gap_open",
+    "motion_lease",
+    "controller_state",
+    "speed_scaling",
+    "joint_trajectory",
+    "joint_targets",
+    "joint_commands",
+    "joint_correction_node/joint_trajectory",
+    "joint_correction_node/joint_targets",
+    "joint_correction_node/joint_commands",
+    "maintenance_node/joint_trajectory",
+    "tcf_node/joint_trajectory",
+    "tcf_node/next_step",
+    "joint_trajectory_controller/joint_trajectory",
+    "accuracy_state",
+    "thermal_node/session_events",
+    "thermal_node/model",
+    "thermal_node/quality",
+    "thermal_node/accuracy",
+    "tcf_node/session_events",
+    "tcf_node/tool",
+    "tcf_node/quality",
+    "hand_eye_node/session_events",
+    "joint_correction_node/correction",
+    "joint_correction_node/status",
+    "maintenance_node/status",
+    "maintenance_node/session_events",
+    "/tf_static",
+    DIAGNOSTICS,
+)
 
 
 @dataclass

@@ -1,6 +1,8 @@
 """Records what a dispute needs, for as long as there is room (docs/recorder_node.md)."""
 
+import socket
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
 from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.nodes.parameters import Setting
-from robocal_ros.nodes.recorded_topics import Recorded, RecordedTopics
+from robocal_ros.nodes.recorded_topics import DIAGNOSTICS, TOPICS, Recorded, RecordedTopics
 from robocal_ros.nodes.run import run
 from robocal_ros.storage.bag_recording import BagRecording
 from robocal_ros.storage.history_paths import state_folder
@@ -30,49 +32,6 @@ ROOM_S = 5.0
 SHARES = 4  # a recording takes so much of the room at the most: three before it are kept
 AGAIN_S = 10.0  # after a recording broke off
 HOUR_S = 3600.0
-
-DIAGNOSTICS = "/diagnostics"
-TOPICS = (
-    "joint_states",
-    "beam_events",
-    "sphere_cloud",
-    "sphere_center",
-    "reference_sphere_center",
-    "measured_point",
-    "measured_pose",
-    "motor_temperatures",
-    "profile",
-    "target_pose",
-    "gap_open",
-    "motion_lease",
-    "controller_state",
-    "speed_scaling",
-    "joint_trajectory",
-    "joint_targets",
-    "joint_commands",
-    "joint_correction_node/joint_trajectory",
-    "joint_correction_node/joint_targets",
-    "joint_correction_node/joint_commands",
-    "maintenance_node/joint_trajectory",
-    "tcf_node/joint_trajectory",
-    "tcf_node/next_step",
-    "joint_trajectory_controller/joint_trajectory",
-    "accuracy_state",
-    "thermal_node/session_events",
-    "thermal_node/model",
-    "thermal_node/quality",
-    "thermal_node/accuracy",
-    "tcf_node/session_events",
-    "tcf_node/tool",
-    "tcf_node/quality",
-    "hand_eye_node/session_events",
-    "joint_correction_node/correction",
-    "joint_correction_node/status",
-    "maintenance_node/status",
-    "maintenance_node/session_events",
-    "/tf_static",
-    DIAGNOSTICS,
-)
 
 SETTINGS = (
     Setting("topics", list(TOPICS), "What is recorded; relative names are in the namespace"),
@@ -102,13 +61,17 @@ class RecorderNode(HouseNode):
         self._topics: RecordedTopics | None = None
         self._fault = ""
         self._no_room = ""  # why nothing may be recorded now
+        self._gone = ""  # a recording that was removed while it was written
+        self._rivals = ""  # who else says to be this recorder
         self._left: dict[str, str] = {}  # what looks like a recording and is left alone, and why
 
     def configure(self) -> None:
         """Find the folder; nothing is recorded before activation."""
         given = self.settings["folder"]
         self._folder = Path(given) if given else state_folder() / "recordings"
-        self._maker = Maker(self.get_fully_qualified_name(), self.settings["serial"])
+        serial, domain = self.settings["serial"], self.context.get_domain_id()
+        place = "" if serial else f"{socket.gethostname()}, domain {domain}"
+        self._maker = Maker(self.get_fully_qualified_name(), serial, place)
         self.add_service(Trigger, "~/keep", self._keep)
         self.add_service(Trigger, "~/split", self._split)
         self.add_timer(LOOK_S, self._look, steady=True)
@@ -119,7 +82,7 @@ class RecorderNode(HouseNode):
         """Begin a recording."""
         self._fault, self._lost, self._lost_since, self._deleted = "", 0, "", 0
         self._again_s: float | None = None  # when a recording that broke off is begun again
-        self._no_room, self._left = "", {}
+        self._no_room, self._gone, self._rivals, self._left = "", "", "", {}
         self._make_room()
         self._topics = RecordedTopics(self, self.settings["topics"], self._take)
         self._topics.look()
@@ -172,6 +135,12 @@ class RecorderNode(HouseNode):
         if topics is None:
             return
         topics.look()
+        try:
+            if self._recording is not None:
+                self._recording.look()
+        except StorageError as error:
+            self._gone = str(error)
+            self._break_off(error)
         over_s = self.settings["hours"] * HOUR_S
         now = time.monotonic()
         if self._recording is not None and now - self._begun_s >= over_s:
@@ -183,22 +152,24 @@ class RecorderNode(HouseNode):
     def _make_room(self) -> None:
         recording, most = self._recording, round(self.settings["keep_mb"] * MB)
         least_free = round(self.settings["free_mb"] * MB)
-        try:
+        with suppress(OSError):  # `_look` tells of it, and room is made all the same
             if recording is not None and size_bytes(recording.folder) >= most // SHARES:
                 self._next()
+        try:
             room = make_room(self._folder, self._maker, most, least_free)
         except OSError as error:
             self._tell_left(self._left | {str(self._folder): str(error)})
             return
         self._deleted += len(room.deleted)
         self._tell_left(room.left)
+        self._rivals = ", ".join(str(folder) for folder in room.rivals)
         was, self._no_room = self._no_room, ""
         if room.short_bytes:
             free_mb = self.settings["free_mb"] - room.short_bytes / MB
             self._no_room = (
                 f"{free_mb:.0f} MB are free on the disk of {self._folder}, free_mb is "
-                f"{self.settings['free_mb']:g}, and no recording is left to delete: nothing is "
-                "recorded until there is room"
+                f"{self.settings['free_mb']:g}, and deleting its recordings would not bring that: "
+                "none is deleted, and nothing recorded until there is room"
             )
             self._complete()
             if not was:
@@ -260,6 +231,14 @@ class RecorderNode(HouseNode):
         for fault in dict.fromkeys((self._fault, self._no_room)):
             if fault:
                 health.worsen(ERROR, fault)
+        if self._gone and self._gone != self._fault:
+            health.worsen(WARN, self._gone)
+        if self._rivals:
+            health.worsen(
+                WARN,
+                f"another recorder of this name writes {self._rivals}: of what earlier runs made "
+                "nothing is deleted; give each its serial, a name or a folder of its own",
+            )
         if topics is None:
             return health
         if topics.unknown:

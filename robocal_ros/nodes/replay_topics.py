@@ -11,24 +11,15 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.storage.recorded_names import (
-    MOVES_ENDS,
-    MOVES_TYPES,
-    VOUCHES_ENDS,
-    VOUCHES_TYPES,
-)
+from robocal_ros.storage.recorded_names import withheld
 
 DEPTH = 1000
 LATCHED_DEPTH = 100
 CLOCK = "/clock"
 OWN = "a live node makes its own"
-MOVES = "it may move a robot"
-VOUCHES = "it says that a robot may move now, or how it is moved"
-LEFT_OUT = {  # unless they are named, by type or by the last part of the name
+LEFT_OUT = {  # unless they are named
     "robocal_msgs/msg/SessionEvent": OWN,
     "diagnostic_msgs/msg/DiagnosticArray": OWN,
-    **dict.fromkeys(MOVES_TYPES | MOVES_ENDS, MOVES),
-    **dict.fromkeys(VOUCHES_TYPES | VOUCHES_ENDS, VOUCHES),
 }
 
 
@@ -198,8 +189,8 @@ def chosen_topics(
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Topics to play (recorded name to played name), and those left out with the reason.
 
-    ``wanted`` empty means all but the clock and `LEFT_OUT`. ``remap`` has entries
-    ``recorded:=played``.
+    ``wanted`` empty means all but the clock, `LEFT_OUT` and what is `withheld` under the name that
+    it is played by. ``remap`` has entries ``recorded:=played``.
 
     Raises
     ------
@@ -219,17 +210,13 @@ def chosen_topics(
             left[topic] = "the clock is made here"
         elif wanted and topic not in wanted:
             left[topic] = "not wanted"
-        elif not wanted and (why := _left_out(msgtype, topic, names.get(topic, topic))):
+        elif not wanted and (
+            why := LEFT_OUT.get(msgtype) or withheld(names.get(topic, topic), msgtype)
+        ):
             left[topic] = f"{why}; name it in 'topics' to play it"
         else:
             chosen[topic] = names.get(topic, topic)
     return chosen, left
-
-
-def _left_out(msgtype: str, *names: str) -> str:
-    """Why a topic is not played by itself; empty when it is."""
-    ends = (name.rsplit("/", 1)[-1] for name in names)
-    return next((LEFT_OUT[key] for key in (msgtype, *ends) if key in LEFT_OUT), "")
 
 
 def _pair(entry: str) -> tuple[str, str]:

@@ -13,8 +13,8 @@ import yaml
 
 from robocal_ros.core.errors import InputError, StorageError
 from robocal_ros.storage.bag_writer import BagWriter, offered_qos
-from robocal_ros.storage.files import write_text
-from robocal_ros.storage.recording_folders import OPEN, hold_open
+from robocal_ros.storage.files import lies_at, write_text
+from robocal_ros.storage.recording_locks import OPEN, hold_open
 
 
 class BagRecording:
@@ -82,6 +82,28 @@ class BagRecording:
         self._types[topic] = msgtype
         self._counts[topic] = self._counts.get(topic, 0) + 1
 
+    def look(self) -> None:
+        """Look whether what is written still lies in the folder.
+
+        Raises
+        ------
+        StorageError
+            When the folder or the file was removed, moved or replaced: what is written from here on
+            would be found by nobody. What was moved is complete.
+        """
+        try:
+            lies = lies_at(self.folder / OPEN, self._open.fileno())
+            if lies and (self._writer is None or self._writer.in_place):
+                return
+        except OSError as error:
+            raise self._broken(error) from error
+        writer, self._writer = self._writer, None
+        with suppress(OSError):
+            if writer is not None:
+                writer.close()
+        self._open.close()
+        raise StorageError(f"{self.folder}: removed, moved or replaced while it was recorded")
+
     def flush(self) -> None:
         """Bring everything to the disk: from here on a crash loses none of it."""
         if self._writer is None:
@@ -101,7 +123,8 @@ class BagRecording:
 
     def _let_go(self) -> None:
         with suppress(OSError):
-            (self.folder / OPEN).unlink()
+            if lies_at(self.folder / OPEN, self._open.fileno()):
+                (self.folder / OPEN).unlink()
         self._open.close()
 
     def _begin(self, log_time_ns: int) -> BagWriter:

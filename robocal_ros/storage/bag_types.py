@@ -62,11 +62,30 @@ def _known_type(msgtype: str) -> dict[str, Any]:
     """A standard type with all that it is made of."""
     known = ros_types().fielddefs
     types = {msgtype: known[msgtype]}
-    for _, (kind, detail) in known[msgtype][1]:
-        inner = detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
-        if inner[0] == Nodetype.NAME:
-            types |= _known_type(str(inner[1]))
+    for part in _parts(known[msgtype]):
+        types |= _known_type(part)
     return types
+
+
+def _parts(fields: Any) -> list[str]:
+    """Types of the fields of a type, but for the elementary ones."""
+    described = [
+        detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
+        for _, (kind, detail) in fields[1]
+    ]
+    return [str(detail) for kind, detail in described if kind == Nodetype.NAME]
+
+
+def _learn_installed(store: Typestore, msgtype: str) -> None:
+    """Teach ``store`` a type, and what it is made of, by the definitions that are installed."""
+    package, _, name = msgtype.partition("/msg/")
+    for folder in share_folders(package, "msg", f"{package}/msg"):
+        if msgtype in store.types or not (file := folder / f"{name}.msg").is_file():
+            continue
+        types = get_types_from_msg(file.read_text(encoding="utf-8"), msgtype)
+        for part in _parts(types[msgtype]):
+            _learn_installed(store, part)
+        store.register(types)
 
 
 def definition(msgtype: str) -> str:
@@ -78,6 +97,7 @@ def definition(msgtype: str) -> str:
         When the type is not known here.
     """
     store = ros_types()
+    _learn_installed(store, msgtype)
     if msgtype not in store.types:
         package = msgtype.partition("/")[0]
         raise InputError(

@@ -11,6 +11,7 @@ from mcap.writer import CompressionType, Writer
 from robocal_ros import __version__
 from robocal_ros.core.errors import InputError
 from robocal_ros.storage import bag_types
+from robocal_ros.storage.files import lies_at
 
 CHUNK_BYTES = 256 * 1024  # what a writer that is killed can lose
 _COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}
@@ -98,6 +99,11 @@ class BagWriter:
         """Bring everything to the disk: neither a kill nor a power cut loses it any more."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         os.fsync(self._stream.fileno())
+
+    @property
+    def in_place(self) -> bool:
+        """Whether the file that is written is still the one of this name."""
+        return lies_at(self.path, self._stream.fileno())
 
     @property
     def size_bytes(self) -> int:

@@ -93,6 +93,15 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
         raise InputError(f"cannot be written: {reason}", file=str(path)) from error
 
 
+def lies_at(path: Path, descriptor: int) -> bool:
+    """Whether an open file is the one of this name: neither removed, moved nor replaced."""
+    try:
+        found = path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return os.path.samestat(found, os.fstat(descriptor))
+
+
 def sync_folder(folder: Path) -> None:
     """Bring the names in a folder to the disk; an `OSError` where that fails."""
     descriptor = os.open(folder, os.O_RDONLY)

@@ -5,41 +5,44 @@ them, as which folder. What is a link, lies on another disk, has no marker or wa
 alone, and so is every file in a recording that the recorder did not write.
 """
 
-import errno
-import fcntl
 import json
-import os
 import re
 import shutil
-import socket
 import stat
 import time
+import uuid
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TextIO
 
 from robocal_ros import __version__
 from robocal_ros.core.errors import InputError, StorageError
 from robocal_ros.storage.files import read_text, write_text
+from robocal_ros.storage.recording_locks import OPEN, is_open
 
 PREFIX = "robocal_"
 MARKER = "robocal_recording.json"  # in a recording's folder: who made it
 KEEP = "KEEP"  # a file of this name there: it is never deleted
-OPEN = "OPEN"  # of this name, locked by the process that writes it; gone with its end
 MB = 1_000_000
-
-# As file systems say that they know no locks (NFS without its lock daemon).
-_NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 
 
 @dataclass(frozen=True)
 class Maker:
-    """A recorder: the full name of its node, and the serial of its robot ("" without)."""
+    """A recorder, the same after a restart.
+
+    Attributes
+    ----------
+    node : the full name of its node.
+    serial : of its robot; "" without.
+    place : what tells it from others of its name where there is no serial: host and ROS domain.
+    run : of this start alone; no part of who it is.
+    """
 
     node: str
     serial: str = ""
+    place: str = ""
+    run: str = field(default_factory=lambda: uuid.uuid4().hex, compare=False)
 
 
 @dataclass(frozen=True)
@@ -63,12 +66,15 @@ class Room:
     ----------
     deleted : recordings that are gone.
     left : why something that looks like a recording was left alone, by its name.
-    short_bytes : so much is missing to what shall stay free, and nothing is left to delete.
+    short_bytes : so much is missing to what shall stay free, and no deleting would bring it.
+    rivals : recordings that others write who say to be the same recorder: what earlier runs made
+        may be theirs, and stays.
     """
 
     deleted: tuple[Path, ...]
     left: dict[str, str]
     short_bytes: int
+    rivals: tuple[Path, ...] = ()
 
 
 def new_folder(parent: Path, maker: Maker, wall_ns: int | None = None) -> Path:
@@ -124,7 +130,8 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
     """Delete a maker's recordings, the oldest first, until the rest fits and enough is free.
 
     The newest one stays, and so do those that a process writes or that `keep` marked. One that
-    cannot be deleted does not hold up the others.
+    cannot be deleted or measured does not hold up the others. Where deleting all of them did not
+    free enough, none is deleted for that.
 
     Raises
     ------
@@ -134,15 +141,25 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
     if not parent.is_dir():
         return Room((), {}, 0)
     found, left = _look(parent)
-    own = [one.folder for one in found if one.maker == maker]
-    sizes = {folder: size_bytes(folder) for folder in own}
-    total, free = sum(sizes.values()), shutil.disk_usage(parent).free
+    free, total = shutil.disk_usage(parent).free, 0
+    own = [one for one in found if one.maker == maker]
+    rivals = [one.folder for one in own if one.maker.run != maker.run and is_open(one.folder)]
+    if rivals:
+        own = [one for one in own if one.maker.run == maker.run]
+    sizes: dict[Path, int] = {}  # of those that may be deleted
+    for one in own:
+        try:
+            size = size_bytes(one.folder)
+            total += size
+            if not (one is own[-1] or (one.folder / KEEP).exists() or is_open(one.folder)):
+                sizes[one.folder] = size
+        except OSError as error:
+            left[one.folder.name] = f"cannot be measured: {error.strerror or error}"
+    short_bytes = max(least_free_bytes - free - sum(sizes.values()), 0)
     deleted = []
-    for folder in own[:-1]:
-        if total <= most_bytes and free >= least_free_bytes:
+    for folder, size in sizes.items():
+        if total <= most_bytes and (free >= least_free_bytes or short_bytes):
             break
-        if (folder / KEEP).exists() or is_open(folder):
-            continue
         try:
             strangers = _delete(folder)
         except OSError as error:
@@ -152,8 +169,8 @@ def make_room(parent: Path, maker: Maker, most_bytes: int, least_free_bytes: int
             left[folder.name] = f"holds what no recorder wrote: {', '.join(strangers)}"
         deleted.append(folder)
         # counted, not looked at again: some disks give free later what was deleted
-        total, free = total - sizes[folder], free + sizes[folder]
-    return Room(tuple(deleted), left, max(least_free_bytes - free, 0))
+        total, free = total - size, free + size
+    return Room(tuple(deleted), left, max(least_free_bytes - free, 0), tuple(rivals))
 
 
 def keep(folder: Path, why: str) -> None:
@@ -167,58 +184,6 @@ def keep(folder: Path, why: str) -> None:
     if not folder.is_dir():
         raise InputError("no such recording", file=str(folder))
     write_text(folder / KEEP, f"{why}\n")
-
-
-def hold_open(folder: Path) -> TextIO:
-    """Say that this process writes a recording, as long as the file is open.
-
-    Raises
-    ------
-    OSError
-        When it cannot be said, or another process writes it.
-    """
-    file = (folder / OPEN).open("w", encoding="utf-8")
-    try:
-        file.write(f"{socket.gethostname()} {os.getpid()}\n")
-        file.flush()
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno not in _NO_LOCKS:
-            file.close()
-            raise
-    return file
-
-
-def is_open(folder: Path) -> bool:
-    """Whether a process writes it; one that a crash left behind is not.
-
-    Where the disk knows no locks, one of another host counts as open, and one of this host as long
-    as there is a process of its number.
-    """
-    try:
-        with (folder / OPEN).open("r+", encoding="utf-8") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                return error.errno not in _NO_LOCKS or _writer_lives(file.read())
-    except FileNotFoundError:
-        return False
-    except OSError:  # it cannot be told: a read-only disk, another user's
-        return True
-    return False
-
-
-def _writer_lives(text: str) -> bool:
-    host, _, process = text.strip().rpartition(" ")
-    if host != socket.gethostname() or not process.isdigit():
-        return True
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
 
 
 def _look(parent: Path) -> tuple[list[Recording], dict[str, str]]:
@@ -250,7 +215,7 @@ def _recording(folder: Path, disk: int) -> Recording:
         raise InputError(f"has no {MARKER}: no recorder made it")
     try:
         mark = json.loads(read_text(marker, "marker"))
-        maker = Maker(str(mark["node"]), str(mark["serial"]))
+        maker = Maker(*(str(mark[key]) for key in ("node", "serial", "place", "run")))
         name, number, begun_ns = mark["folder"], int(mark["number"]), int(mark["begun_ns"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"has a {MARKER} that cannot be read: {error}") from error

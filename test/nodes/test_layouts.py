@@ -10,6 +10,7 @@ import pytest
 
 from robocal_ros.nodes.recorder_node import TOPICS
 from robocal_ros.nodes.replay_topics import message_class
+from robocal_ros.storage.recorded_names import recorded_name
 
 LAYOUTS = Path(__file__).parents[2] / "config" / "layouts"
 # Without the namespace; that nodes offer them is shown by the tests of the cell.
@@ -64,6 +65,18 @@ def test_the_command_of_the_page_puts_a_layout_into_a_namespace(file):
     assert done.stdout.count('"/robot_1/') + done.stdout.count('"/diagnostics') == before.count(
         '"/'
     )
+
+
+@pytest.mark.parametrize("file", ["foxglove_cell.json", "plotjuggler_cell.xml"])
+def test_the_command_of_the_page_gives_the_names_of_a_recording(file):
+    page = (LAYOUTS.parents[1] / "docs" / "cell_launch.md").read_text()
+    _, script = re.findall(r"sed -E '(.*)'", page)
+    before = (LAYOUTS / file).read_text()
+    done = subprocess.run(
+        ["sed", "-E", script, LAYOUTS / file], capture_output=True, text=True, check=True
+    )
+    for name, msgtype in TYPES.items():
+        assert done.stdout.count(f'"{recorded_name(name, msgtype)}') == before.count(f'"{name}')
 
 
 @pytest.mark.parametrize("path", PATHS)

@@ -1,6 +1,8 @@
 """The recorder, live: what is offered late, latched or best effort, a kill, a second recording."""
 
 import os
+import shutil
+import socket
 from typing import Any
 
 import pytest
@@ -19,11 +21,21 @@ from robocal_ros.nodes.recorder_node import AGAIN_S, LOOK_S, TOPICS, RecorderNod
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.nodes.thermal_node import ThermalNode
+from robocal_ros.storage.bag_recording import BagRecording
+from robocal_ros.storage.bag_types import encode
 from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.recording_folders import KEEP, MB, Maker, recordings, size_bytes
+from robocal_ros.storage.recording_folders import (
+    KEEP,
+    MB,
+    Maker,
+    new_folder,
+    recordings,
+    size_bytes,
+)
 
 NODE = "recorder_node"
 WARN, ERROR = DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+TEXT, ALL = "std_msgs/msg/String", 10**9
 LEFT_OUT = {"/image"}  # large
 WIRED = {"/kinematic_model": "/thermal_node/model", "/tool": "/tcf_node/tool"}
 MOTION = {  # by what moves a robot
@@ -152,6 +164,64 @@ def test_messages_that_were_lost_are_told_also_when_it_records_again(graph, monk
     assert f"{health.values['messages not recorded']} messages since 20" in health.message
 
 
+def test_a_recording_whose_folder_is_removed_is_told_and_begun_anew(graph, monkeypatch):
+    """Also what was recorded before, and the room is kept meanwhile."""
+    monkeypatch.setattr(recorder_node, "AGAIN_S", 0.2)
+    folder = graph.state / "rec"
+    node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(folder)})
+    publisher = graph.publisher(String, "/words")
+
+    def told(level: int, words: str) -> bool:
+        said(graph, publisher, String, "words")
+        health = node.health()
+        return health.level == level and words in health.message
+
+    graph.spin_until(lambda: told(DiagnosticStatus.OK, ""), "it records")
+    (removed,) = recordings(folder)
+    shutil.rmtree(folder)
+    graph.spin_until(lambda: told(ERROR, "removed, moved or replaced"), "it is told")
+    graph.spin_until(lambda: told(WARN, f"{removed.folder}: removed"), "it records again")
+    (again,) = recordings(folder)
+    assert node.health().values["folder"] == again.folder
+    node.trigger_deactivate()
+    assert set(words(again.folder, "/words")) == {"words"}
+
+
+def test_what_another_of_its_name_may_have_made_stays_while_that_one_writes(graph, monkeypatch):
+    """A second robot's recorder with all defaults; one of another domain is never it."""
+    monkeypatch.setattr(recorder_node, "ROOM_S", 0.1)
+    folder = graph.state / "rec"
+
+    def begun(domain: int, run: str) -> BagRecording:
+        maker = Maker(f"/{NODE}", "", f"{socket.gethostname()}, domain {domain}", run)
+        recording = BagRecording(new_folder(folder, maker), latched=(), file_bytes=ALL)
+        for _ in range(20):
+            data = bytes(encode(TEXT, {"data": os.urandom(50_000).hex()}))
+            recording.write("/words", TEXT, data, 1)
+        return recording
+
+    other, earlier, rival = begun(graph.domain + 1, "0"), begun(graph.domain, "1"), None
+    other.close()
+    earlier.close()
+    rival = begun(graph.domain, "2")
+    node = graph.add(RecorderNode, {"topics": ["words"], "folder": str(folder), "keep_mb": 1.0})
+    publisher = graph.publisher(String, "/words")
+
+    def records() -> bool:
+        said(graph, publisher, String, "words")
+        return bool(node.health().values["messages"])
+
+    graph.spin_until(records, "it records")
+    graph.spin_until(lambda: str(rival.folder) in node.health().message, "the other is told")
+    assert node.health().level == WARN
+    graph.spin_for(0.5)  # five looks
+    assert all(one.folder.exists() for one in (other, earlier, rival))
+    rival.close()
+    graph.spin_until(lambda: not earlier.folder.exists(), "room is made")
+    graph.spin_until(lambda: node.health().level == DiagnosticStatus.OK, "nothing is told any more")
+    assert other.folder.exists()
+
+
 @pytest.mark.parametrize("less", [qos.SENSOR, qos.RELIABLE])
 def test_what_comes_back_with_less_than_before_is_recorded(graph, less):
     """A driver is started anew: best effort instead of reliable, or no longer latched."""
@@ -179,7 +249,7 @@ def test_all_recordings_together_stay_in_their_room(graph, monkeypatch):
     """Two robots' recorders of one folder, each with more than it may keep: 4 MB a second."""
 
     def of(name: str) -> list[Any]:
-        return [one.folder for one in recordings(folder, Maker(f"/{name}/{NODE}"))]
+        return [one.folder for one in recordings(folder) if one.maker.node == f"/{name}/{NODE}"]
 
     monkeypatch.setattr(recorder_node, "ROOM_S", 0.1)
     folder = graph.state / "rec"

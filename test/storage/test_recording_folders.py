@@ -4,6 +4,7 @@ import errno
 import fcntl
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,16 +14,17 @@ import pytest
 from robocal_ros.core.errors import StorageError
 from robocal_ros.storage.bag_recording import BagRecording
 from robocal_ros.storage.bag_types import encode
+from robocal_ros.storage.bags import BagReader
 from robocal_ros.storage.recording_folders import (
     MARKER,
     Maker,
-    is_open,
     keep,
     make_room,
     new_folder,
     recordings,
     size_bytes,
 )
+from robocal_ros.storage.recording_locks import is_open
 
 TEXT = "std_msgs/msg/String"
 MINE, OTHER = Maker("/recorder_node", "R1"), Maker("/left/recorder_node", "R1")
@@ -152,15 +154,76 @@ def test_a_full_disk_is_relieved_by_what_the_recorder_made_alone(small_disk: Pat
     made(small_disk, 300)  # it goes on
 
 
-def test_a_disk_that_others_fill_is_told_and_the_newest_recording_stays(small_disk: Path) -> None:
+def test_a_disk_that_others_fill_is_told_and_every_recording_stays(small_disk: Path) -> None:
     folders = [made(small_disk, 100 + i, kilobytes=100) for i in range(3)]
     free = os.statvfs(small_disk)
     (small_disk / "theirs").write_bytes(bytes(free.f_bavail * free.f_frsize - 50_000))
+    before = [size_bytes(folder) for folder in folders]
     room = make_room(small_disk, MINE, ALL, 1_000_000)
-    assert room.deleted == tuple(folders[:2])
+    assert room.deleted == ()
     assert 0 < room.short_bytes < 1_000_000
-    assert folders[2].exists()
     assert (small_disk / "theirs").exists()
+    assert [size_bytes(folder) for folder in folders] == before
+
+
+def test_for_a_floor_that_cannot_be_reached_nothing_is_deleted(tmp_path: Path) -> None:
+    folders = [made(tmp_path, 100 + i) for i in range(5)]
+    room = make_room(tmp_path, MINE, ALL, 10**18)
+    assert room.deleted == ()
+    assert room.short_bytes > 10**17
+    most = sum(size_bytes(folder) for folder in folders[3:])
+    room = make_room(tmp_path, MINE, most, 10**18)  # what all may take together still holds
+    assert room.deleted == tuple(folders[:3])
+    assert all(folder.exists() for folder in folders[3:])
+
+
+def test_while_another_of_the_name_writes_what_earlier_runs_made_stays(tmp_path: Path) -> None:
+    """Two robots' recorders with all defaults, in one folder."""
+    theirs = Maker(MINE.node, MINE.serial)
+    earlier = [made(tmp_path, 100 + i, Maker(MINE.node, MINE.serial)) for i in range(2)]
+    complete = made(tmp_path, 200, theirs)
+    written = new_folder(tmp_path, theirs, 300 * SECOND_NS)
+    with BagRecording(written, latched=(), file_bytes=10_000):
+        own = [made(tmp_path, 400 + i) for i in range(2)]
+        room = make_room(tmp_path, MINE, 0, 0)
+        assert (room.deleted, room.rivals) == ((own[0],), (written,))
+    room = make_room(tmp_path, MINE, 0, 0)
+    assert (room.deleted, room.rivals) == ((*earlier, complete, written), ())
+    assert own[1].exists()
+
+
+def test_without_a_serial_host_and_domain_tell_recorders_apart(tmp_path: Path) -> None:
+    left, right = (Maker(MINE.node, "", f"host, domain {domain}") for domain in (1, 2))
+    kept = [made(tmp_path, 100 + i, left) for i in range(3)]
+    gone, newest = made(tmp_path, 200, right), made(tmp_path, 300, right)
+    assert make_room(tmp_path, right, 0, 0).deleted == (gone,)
+    assert all(folder.exists() for folder in (*kept, newest))
+
+
+@pytest.mark.parametrize("fate", ["removed", "moved", "replaced", "file"])
+def test_a_recording_that_is_taken_away_while_it_is_written_is_noticed(
+    tmp_path: Path, fate: str
+) -> None:
+    folder, elsewhere = new_folder(tmp_path, MINE, 100 * SECOND_NS), tmp_path / "elsewhere"
+    recording = BagRecording(folder, latched=(), file_bytes=10_000)
+    recording.look()
+    for i in range(10):
+        recording.write("/words", TEXT, bytes(encode(TEXT, {"data": f"{i}"})), i)
+        recording.look()
+    if fate == "removed":
+        shutil.rmtree(folder)
+    elif fate == "file":
+        (folder / f"{folder.name}_0.mcap").unlink()
+    else:
+        folder.rename(elsewhere)
+        if fate == "replaced":
+            shutil.copytree(elsewhere, folder)
+    with pytest.raises(StorageError, match="removed, moved or replaced"):
+        recording.look()
+    if elsewhere.exists():
+        with BagReader(elsewhere) as bag:
+            assert [m.message.data for m in bag.messages()] == [f"{i}" for i in range(10)]
+            assert not bag.info.truncated
 
 
 def test_no_folder_is_left_behind_where_the_disk_takes_no_marker(small_disk: Path) -> None:
