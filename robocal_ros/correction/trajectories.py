@@ -208,7 +208,11 @@ class TrajectoryCorrector:
             h = np.diff(times[later], prepend=0.0)[:, None]
             _add_derivatives(rows, withheld, h)
             rows[1:], withheld = rows[1:] * active, withheld * active
-            over = _over(rows, withheld, h, speed[later] > STILL, limits)
+            moves = speed[later] > STILL
+            over = _over(rows, withheld, h, moves, limits)
+            # a controller without accelerations of its own comes in by a cubic
+            lead = _over(rows[:2, :2], withheld[:2], h[:1], moves[:1], limits)
+            over = np.maximum(over, lead)
             if np.all(over <= 1.0 + SETTLED):
                 break
             share *= np.where(over > 1.0, np.maximum(0.9 / np.maximum(over, 1.0), 0.25), 1.0)
