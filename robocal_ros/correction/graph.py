@@ -51,8 +51,7 @@ def publishers(node: Node, topic: str, *, dds: bool = False) -> list[Endpoint]:
     found = node.get_publishers_info_by_topic(topic, no_mangle=dds)
     return [
         Endpoint(
-            bytes(info.endpoint_gid)[:PREFIX],
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+            bytes(info.endpoint_gid)[:PREFIX], f"{info.node_namespace.rstrip('/')}/{info.node_name}"
         )
         for info in found
     ]

@@ -24,11 +24,7 @@ from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.correction.status import CorrectionStatus
 from robocal_ros.nodes.base import NO_SERIAL
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
-from robocal_ros.nodes.history_settings import (
-    acknowledge_history,
-    history_notice,
-    open_history,
-)
+from robocal_ros.nodes.history_settings import acknowledge_history, history_notice, open_history
 from robocal_ros.storage.calibrations import CalibrationHistory
 
 TELL_S = 1.0  # the status goes out at least so often

@@ -108,14 +108,7 @@ SETTINGS = (
         low=0.0,
         high=20.0,
     ),
-    Setting(
-        "thermal_tcp_deg",
-        0.1,
-        "and in orientation",
-        unit="deg",
-        low=0.0,
-        high=5.0,
-    ),
+    Setting("thermal_tcp_deg", 0.1, "and in orientation", unit="deg", low=0.0, high=5.0),
     Setting(
         "thermal_joint_deg",
         0.3,
@@ -150,14 +143,7 @@ SETTINGS = (
         low=0.01,
         high=2.0,
     ),
-    Setting(
-        "offset_mm_s",
-        5.0,
-        "and to a sliding joint",
-        unit="mm/s",
-        low=0.01,
-        high=5.0,
-    ),
+    Setting("offset_mm_s", 5.0, "and to a sliding joint", unit="mm/s", low=0.01, high=5.0),
     Setting(
         "stream_gap_s",
         0.1,

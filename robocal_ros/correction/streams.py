@@ -195,13 +195,7 @@ class TargetStream:
         for _ in range(TRIES):
             desired = self._desired.at_one(q)
             share, tried = output.limiter.put_out(
-                q,
-                desired,
-                elapsed,
-                longest,
-                self._active,
-                limits,
-                (output.taught, output.out),
+                q, desired, elapsed, longest, self._active, limits, (output.taught, output.out)
             )
             if share < 0.0:
                 require_limits(tried[None], self._arm)

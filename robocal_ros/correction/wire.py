@@ -168,14 +168,7 @@ def _layout(data: bytes) -> _Layout | None:
         return None
     head = data[FRAME:names_end]
     return _Layout(
-        head,
-        frame_id,
-        names,
-        names_begin,
-        names_end,
-        tuple(counts),
-        tuple(places),
-        len(data),
+        head, frame_id, names, names_begin, names_end, tuple(counts), tuple(places), len(data)
     )
 
 
