@@ -79,16 +79,11 @@ class _Lease:
 
 @dataclass
 class Leases:
-    """Leases of this robot (``robocal_msgs/MotionLease``), and whose motions are the cell's own.
-
-    Attributes
-    ----------
-    others : holders that have spoken of another robot only.
-    """
+    """Leases of this robot (``robocal_msgs/MotionLease``), and whose motions are the cell's own."""
 
     robot: str
     serial: str
-    others: set[str] = field(default_factory=set)
+    others: set[str] = field(default_factory=set)  # holders that spoke of another robot only
     _held: dict[str, _Lease] = field(default_factory=dict)
 
     def hear(self, message: Any, now_s: float) -> None:
@@ -270,17 +265,11 @@ class CommandSources:
     while their topic has several publishers or on several topics, count as commands of several
     sources, and none of them is believed: the publishers that merely wait cannot be told apart.
 
-    Parameters
-    ----------
-    at_once_s : the short time.
-
-    Attributes
-    ----------
-    inputs : the subscriptions by topic.
+    The short time is ``at_once_s``.
     """
 
     def __init__(self, at_once_s: float) -> None:
-        self.inputs: dict[str, Subscription] = {}
+        self.inputs: dict[str, Subscription] = {}  # by topic
         self._at_once_s = at_once_s
         self._topic = ""
         self._heard_s = -math.inf

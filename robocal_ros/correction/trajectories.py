@@ -3,21 +3,23 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import TrajectoryCommand, require_few, require_finite
+from robocal_ros.correction.inputs import (
+    Array,
+    Index,
+    TrajectoryCommand,
+    require_few,
+    require_finite,
+)
 from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, STILL
 from robocal_ros.correction.output import Output, SentPath, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
 SPLINE_PEAK = 1.875
@@ -46,11 +48,9 @@ class TrajectoryCorrector:
     ) -> tuple[TrajectoryCommand, SentPath]:
         """Correct a trajectory of taught joints ``q`` (m, n), of which ``index`` go out.
 
-        Raises
-        ------
-        RefusedError
-            When it cannot be corrected, its begin is elsewhere, its end would not be reached with
-            the correction that belongs there, or a limit is exceeded. Nothing has changed then.
+        Raises `RefusedError` when it cannot be corrected, its begin is elsewhere, its end would not
+        be reached with the correction that belongs there, or a limit is exceeded. Nothing has
+        changed then.
         """
         output, limiter = self._output, self._output.limiter
         kept = limiter.state.copy()
@@ -226,8 +226,24 @@ class TrajectoryCorrector:
         t = np.linspace(0.0, lasts, STOP_POINTS)[:, None]
         position = begin + speed * (t - 0.5 * t * t / lasts)
         velocity = speed * (1.0 - t / lasts)
+        times, rows = ahead_s + t[:, 0], (STOP_POINTS, self._arm.n)
+        self._output.path = SentPath(
+            index=path.index,
+            begin_s=now_s,
+            times=times,
+            out=position,
+            velocity=velocity,
+            known_times=times,
+            offsets=np.broadcast_to(path.at(path.offsets, now_s), rows),
+            rates=np.zeros(rows),
+            withheld=np.broadcast_to(path.at(path.withheld, now_s), rows),
+            stage=path.stage,
+            led_from=path.place(now_s),
+            put_s=now_s,
+            at_once=True,
+        )
         names = tuple(self._arm.joint_names[i] for i in path.index)
-        return TrajectoryCommand(names, position, ahead_s + t[:, 0], velocity, mark=CORRECTED)
+        return TrajectoryCommand(names, position, times, velocity, mark=CORRECTED)
 
 
 def require_times(command: TrajectoryCommand) -> None:

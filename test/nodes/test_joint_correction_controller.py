@@ -46,7 +46,7 @@ def test_a_command_begins_where_the_controller_is_though_the_robot_lags(graph: A
 
 
 def path_time(line: Line) -> float:
-    path = line.node._session.path
+    path = line.node._session.output.path
     assert path is not None
     return float(path.time(time.monotonic()))
 

@@ -238,7 +238,7 @@ def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
     again.trajectory.header.frame_id = CORRECTED
     result = Sent(cell, again).ends(GoalStatus.STATUS_ABORTED)
     assert "comes from a joint correction already" in result.error_string
-    cell.node.correct_goal = lambda message: 1 / 0
+    cell.node._proxy._correct = lambda message: 1 / 0
     result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
     assert "a defect of this software" in result.error_string
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
