@@ -236,15 +236,15 @@ class Settled:
             self.read()
             self.at = self.session.target(JointCommand(self.names, home), self.now).position
 
-    def read(self) -> None:
+    def read(self, later_s: float = 0.002) -> None:
         """Hear where the robot is, a little later."""
-        self.now += 0.002
+        self.now += later_s
         self.session.reading(JointCommand(self.names, self.at), self.now)
 
     def rest(self) -> None:
         """Nothing is commanded, and the robot stands."""
-        for _ in range(250):
-            self.read()
+        for _ in range(20):
+            self.read(0.02)
         self.session.look(self.now, 0)
 
     def run(self, trajectory: TrajectoryCommand) -> TrajectoryCommand:
@@ -264,6 +264,8 @@ def trajectory_table() -> Table:
     q, qd = home + reach * np.sin(angle), reach * speed * np.cos(angle)
     qdd = -reach * speed**2 * np.sin(angle)
     settled = Settled(case, home)
+    little = case.reference.mdh + 0.12 * (case.actual.mdh - case.reference.mdh)
+    less = Settled(replace(case, actual=case.reference.with_mdh(little)), home)
     plain = TrajectoryCommand(settled.names, q, t)
     rated = replace(plain, velocity=qd, acceleration=qdd)
     models = pack_model(case.reference), pack_model(case.actual)
@@ -274,6 +276,7 @@ def trajectory_table() -> Table:
         return lambda: stage.rates(q, qd, qdd, stage.correct(q))
 
     tasks: dict[str, Callable[[], object]] = {
+        "positions, drift of 0.12 mm": lambda: less.run(plain),
         "positions": lambda: settled.run(plain),
         "positions, velocities, accelerations": lambda: settled.run(rated),
         "the same with a changed tool, without the session": staged(free_axis=False),
@@ -289,7 +292,7 @@ def trajectory_table() -> Table:
     )
     for index, (name, seconds) in enumerate(found.items()):
         ms = seconds * 1e3
-        table.add(name, ms, Goal(ms, 10.0) if index == 0 else None)
+        table.add(name, ms, Goal(ms, 10.0) if index < 2 else None)
     return table
 
 
@@ -388,6 +391,7 @@ CROSSED = {"wrist": 4, "elbow": 2, "shoulder": 1}  # the joint that crosses it
 BENT = ((0.0, 0.0), (2e-3, 0.5), (9e-3, 3.5))  # m, deg
 CROSSINGS, CROSSING_S, CROSSING_SPEED, PERIOD_S = 100, 0.6, np.radians(60.0), 0.002
 BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])  # of a drift and of a tool, as in the node
+OFF_MM = 5.0  # more than uncorrected
 
 
 def crossing_table() -> Table:
@@ -397,12 +401,14 @@ def crossing_table() -> Table:
         "Singularities that are crossed at 60 deg/s",
         (
             "robot", "crossed", "tool", "crossings", "solved", "wanted, deg/s", "goal",
-            "median, mm left", "most, mm left", "goal ", "withheld, mm", "out, deg/s", "goal  ",
+            "median, mm left", "most, mm left", "goal ", "off, mm", "goal  ",
+            "out, deg/s", "goal   ",
         ),
         f"All joints move, the fastest at 60 deg/s for {CROSSING_S:g} s; {1 / PERIOD_S:g} Hz; "
         "drifts of 0.004 to 0.12 mm at the flange. Wanted: the fastest change of a joint's "
         "offset. Left: position error at the tool; of all crossings the worst instant of each. "
-        "Withheld: what the limiter keeps back more, at most; out: the fastest change after it.",
+        "Off: the tool's distance from where it was taught, after the limiter, at most; "
+        "uncorrected it is what the tool is bent by. Out: the fastest change after the limiter.",
     )  # fmt: skip
     for name in ROBOTS:
         for crossed, joint in CROSSED.items():
@@ -439,7 +445,7 @@ def _cross(
     name: str, joint: int, shift_m: float, turn_deg: float, drift_alone: bool
 ) -> Sequence[Cell | Goal]:
     rng = np.random.default_rng(2)
-    case, wanted, out, left, withheld, solved = make_case(name, 0.0, 0.0), 0.0, 0.0, [], 0.0, 0
+    case, wanted, out, left, off, solved = make_case(name, 0.0, 0.0), 0.0, 0.0, [], 0.0, 0
     taught, turning = case.reference, np.zeros(6, dtype=np.bool_)
     t = np.arange(-CROSSING_S / 2, CROSSING_S / 2, PERIOD_S)
     for _ in range(CROSSINGS):
@@ -462,14 +468,14 @@ def _cross(
         goal = (taught.fk(q) @ TOOL)[:, :3, 3]
         tip, limited = ((actual.fk(q + o) @ actual.T_flange_tool)[:, :3, 3] for o in (offset, made))
         left.append(float(np.linalg.norm(tip - goal, axis=1).max()))
-        withheld = max(withheld, float(np.linalg.norm(limited - tip, axis=1).max()))
+        off = max(off, float(np.linalg.norm(limited - goal, axis=1).max()))
         rates = (float(np.abs(np.diff(o, axis=0)).max()) / PERIOD_S for o in (offset, made))
         wanted, out = (max(a, b) for a, b in zip((wanted, out), rates, strict=True))
     rate, most, fastest = np.degrees(wanted), max(left) * 1e3, np.degrees(out)
     return (
         CROSSINGS, solved, rate, Goal(rate, 2.0) if drift_alone else None,
         float(np.median(left)) * 1e3, most, Goal(most, 0.04) if drift_alone else None,
-        withheld * 1e3, fastest, Goal(fastest, 10.0 + 1e-6),
+        off * 1e3, Goal(off * 1e3, shift_m * 1e3 + OFF_MM), fastest, Goal(fastest, 10.0 + 1e-6),
     )  # fmt: skip
 
 

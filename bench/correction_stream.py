@@ -158,17 +158,20 @@ def _correct(probe: "Probe", stream: "Stream", arm: Any) -> None:
     from robocal_msgs.msg import KinematicModel
 
     from bench.stream_probe import drifted, offered, path
-    from robocal_ros.correction.joint_correction import JointCorrection
+    from robocal_ros.correction.bounds import CorrectionConfig
+    from robocal_ros.correction.clamping import correction_between
+    from robocal_ros.correction.joint_correction import pack_model
 
     actual = drifted(arm, DRIFT_M)
     models = probe.model_publisher(stream.subject)
     models.publish(offered(arm, actual, 1, KinematicModel.ACCEPTED))
     probe.enable(stream.subject)
-    correction = JointCorrection.between(arm, actual)
+    models = pack_model(arm), pack_model(actual)
+    correction = correction_between(*models, arm, CorrectionConfig())
     for _ in range(10):
         probe.stream(stream, 250, 0.5)
         probe.drain()
-        wanted = correction.correct(path(stream.t)[0]).q
+        wanted = correction.correct(path(stream.t)[0][None]).q[0]
         if np.allclose(stream.robot, wanted, rtol=0.0, atol=1e-9):
             return
     raise TimeoutError("the correction did not come in force: see the node's diagnostics")

@@ -21,7 +21,8 @@ from bench.stream_probe import STATES, TARGETS, Probe, Stream, Subject, drifted,
 from bench.tables import Goal, Table
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
-from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.clamping import correction_between
+from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
@@ -52,14 +53,15 @@ class Watch:
 
     def __init__(self, arm: SerialArm) -> None:
         self._arm, self._rate_rad_s = arm, CorrectionConfig().turning.motion
-        self._model = JointCorrection.between(arm, arm)
+        self.change(arm)
         self._last: tuple[float, Array] | None = None
         self._since_s = self._clear_s = time.monotonic()
         self.worst, self.stale, self.checked = 0.0, 0, 0
 
     def change(self, model: SerialArm) -> None:
         """From now on another model is wanted."""
-        self._model = JointCorrection.between(self._arm, model)
+        models = pack_model(self._arm), pack_model(model)
+        self._model = correction_between(*models, self._arm, CorrectionConfig())
         self._since_s = time.monotonic()
 
     def look(self, taught: Array, corrected: Array) -> None:
@@ -77,7 +79,7 @@ class Watch:
         self._last = now_s, shift
         if now_s - self._since_s > SETTLED_S:
             self.checked += 1
-            wanted = self._model.correct(taught).joint_shift
+            wanted = self._model.correct(taught[None]).q[0] - taught
             self.stale += bool(np.max(np.abs(wanted - shift)) > EXACT_RAD)
 
 

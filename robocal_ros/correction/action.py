@@ -60,7 +60,8 @@ class TrajectoryProxy:
     """Serves the action ``name`` with a controller's action, from `open` to `close`.
 
     ``correct`` makes a corrected trajectory of a taught one, and its path, or raises
-    `RefusedError`; ``sent`` is called when it has gone out.
+    `RefusedError`; ``sent`` is called when it has gone out, ``lost`` when nothing more is heard of
+    it, and the robot may still follow it.
 
     Both ends stay until `destroy`, which must not be called while the node spins: rclpy's events
     executor reads freed memory when an action goes that something waits for. When closed, goals
@@ -73,8 +74,9 @@ class TrajectoryProxy:
         name: str,
         correct: Callable[[Any], tuple[Any, SentPath | None]],
         sent: Callable[[], None],
+        lost: Callable[[str], None],
     ) -> None:
-        self._node, self._correct, self._sent = node, correct, sent
+        self._node, self._correct, self._sent, self._lost = node, correct, sent, lost
         self._goals: list[_Goal] = []
         self._clients: dict[str, ActionClient] = {}
         self.controller = ""  # resolved name of the controller's action; empty when closed
@@ -142,11 +144,11 @@ class TrajectoryProxy:
     def stop(self, message: Any, why: str) -> bool:
         """Send a trajectory that stops the robot; it preempts the goals, which end for ``why``.
 
-        False when no controller is there to take it. A goal is cancelled only where the controller
-        rejects the stop: a cancel is a dead stop from any speed.
+        False when no controller is configured. A goal is cancelled only where the controller
+        rejects the stop, or is not all there: a cancel is a dead stop from any speed.
         """
         client = self._clients.get(self.controller)
-        if client is None or not client.server_is_ready():
+        if client is None:
             return False
         goals = list(self._goals)
         for goal in goals:
@@ -165,6 +167,9 @@ class TrajectoryProxy:
                 self._forward_cancel(goal)
 
         future.add_done_callback(self._safe(answered))
+        if not client.server_is_ready():  # it may drive on all the same, and may never answer
+            for goal in goals:
+                self._forward_cancel(goal)
         return True
 
     def cancel(self, why: str) -> None:
@@ -202,7 +207,7 @@ class TrajectoryProxy:
             self._fail(goal, str(error), code)
         except Exception as error:
             if goal.path is not None:  # it never went out
-                self._session.output.reject(goal.path)
+                self._session.reject(goal.path)
             self._node.get_logger().error(traceback.format_exc())
             self._fail(goal, f"a defect of this software, please report it: {error!r}")
 
@@ -248,7 +253,7 @@ class TrajectoryProxy:
         goal.asked_s = None
         if not accepted.accepted:
             if goal.path is not None:
-                self._session.output.reject(goal.path)
+                self._session.reject(goal.path)
             self._fail(goal, f"{self.controller} rejected the goal, its log says why")
             return
         goal.accepted = accepted
@@ -323,7 +328,11 @@ class TrajectoryProxy:
             if not goal.servers <= servers:
                 if goal.result is not None:
                     goal.result.cancel()  # rclpy would keep it for ever
-                self._fail(goal, f"the controller that offered {self.controller} vanished")
+                why = f"the controller that offered {self.controller} vanished"
+                goal.stopped = why  # its path ends when the robot is seen to stand
+                self._lost(why)
+                self._forward_cancel(goal)
+                self._fail(goal, f"{why}; the robot may still move")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
                 what = "cancel, the robot may still move" if goal.cancel else "goal"
                 self._fail(

@@ -5,9 +5,8 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction import solution
+from robocal_ros.correction import rates, solution
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, require_solved, require_within
 from robocal_ros.correction.clamping import ClampedResult, correction_between
 from robocal_ros.correction.joint_correction import pack_model
@@ -17,21 +16,6 @@ from robocal_ros.correction.staged import StagedCorrection, StagedResult
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-12  # of packed models that are the same
-
-
-@lean
-def _within(q: Array, out: Array, bounds: Array, tcp: Array, offset: Array) -> bool:
-    """Whether a point (n,) is solved within all bounds, by ``out`` (k, n + 7); its offset (n,)."""
-    n, stages = q.shape[0], out.shape[0]
-    fine = out[0, n + solution.TCP_SHIFT] <= tcp[0] and out[0, n + solution.TCP_ROTATION] <= tcp[1]
-    for stage in range(stages):
-        fine = fine and out[stage, n + solution.CONVERGED] > 0.5
-        for j in range(n):
-            before = q[j] if stage == 0 else out[stage - 1, j]
-            fine = fine and abs(out[stage, j] - before) <= bounds[stage, j]
-    for j in range(n):
-        offset[j] = out[stages - 1, j] - q[j]
-    return fine
 
 
 class DesiredOffset:
@@ -109,7 +93,7 @@ class DesiredOffset:
             return np.asarray(self.at(q[None])[0][0])
         out, offset = self._out[: stage.stages], np.empty(n)
         stage.correct_one(q, out)
-        if not _within(q, out, self._bounds, self._tcp, offset):
+        if not rates.within(q, out, self._bounds, self._tcp, offset):
             return np.asarray(self.at(q[None])[0][0])
         report = out[:, n:]
         self.reduced += int(report[:, solution.WEAK].any())

@@ -6,14 +6,19 @@ Given taught joints q, the corrected joints q' satisfy
 
 by Newton steps with the geometric Jacobian at the tool.
 
-Near a singularity the exact q' leaves every bound. There the weak direction alone is given up:
-with e the twist (m, rad) that is left at the tool, J the Jacobian at q and J J^T = U S U^T,
+Near a singularity the exact q' leaves every bound. There the weak directions alone are given up,
+and of the tool's turn before its position. With e the twist that is left at the tool (lengths in
+units of 0.3 m), J the Jacobian at q, and (A, B; B^T, C) the blocks of J J^T for position and turn,
 
-    q' = q + J^T y,   e(q') = D y,   D = U diag(d(s)) U^T,                                (2)
+    q' = q + J^T y,   e(q') = D y,   D = (P, 0; 0, R),                                    (2)
+    P = d(A),  R = d(C - B^T (A + P)^-1 B),  d(U S U^T) = U diag(d(s)) U^T,
     d(s) = l^2 (1 - s / (3 l^2))^3 below s = 3 l^2, else exactly 0.
 
-To first order the shift is sigma / (sigma^2 + d) times the error along each singular direction.
-Directions with d = 0 are corrected exactly. The damping is as strong as the error asks for:
+C - B^T A^-1 B is how the joints turn the tool without moving it. So at a wrist singularity the
+position stays exact (P = 0), and of the turn one direction is left. To first order the shift is
+sigma / (sigma^2 + d) times the error along each singular direction. Directions with d = 0 are
+corrected exactly. The damping is as strong as the error asks for, that of the position (in P), or
+all of it (in R):
 
     l^2 = |e| hypot(1 / slope, 0.3 |e| / b^2),   |e|^2 = e(q)^2 + (1 um)^2               (3)
 
@@ -41,9 +46,10 @@ from robocal_ros.correction.room import work_size
 Array = NDArray[np.float64]
 
 LARGEST_SHIFT = 1.0
-# Of the shift per unit of a singular value: at 60 deg/s of the joints a drift's correction moves
-# by less than 2 deg/s; a tool's, which is larger, keeps the map from taught joints one to one.
-DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 25.0, 1.0 / 2.0
+# Of the shift per unit of a singular value: at 60 deg/s of the joints through a wrist singularity
+# a drift's correction moves by less than 2 deg/s; a tool's, which is larger, by more, so that in
+# most postures its turn is corrected too.
+DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 60.0, 1.0 / 10.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 
 

@@ -78,7 +78,7 @@ def product(A: Array, B: Array, out: Array) -> None:
 
 @lean
 def lambda_square(error_square: float, steepness: float, per_error: float) -> float:
-    """Square of the damping for an error at the tool, see `joint_correction` (3)."""
+    """Square l^2 of the damping for an error at the tool, see `joint_correction` (3)."""
     size = np.sqrt(error_square + LEAST_ERROR * LEAST_ERROR)
     bent = per_error * size
     return float(size * np.sqrt(steepness * steepness + bent * bent))
@@ -101,23 +101,20 @@ def inverse_norm(M: Array, L: Array, column: Array) -> float:
 
 @lean
 def eigen(A: Array, U: Array) -> None:
-    """Eigenvalues of a symmetric matrix (6, 6), onto its diagonal, and its vectors as columns.
+    """Eigenvalues of a symmetric matrix (3, 3), onto its diagonal, and its vectors as columns.
 
     By Jacobi's rotations.
     """
-    for r in range(6):
-        for c in range(6):
+    for r in range(3):
+        for c in range(3):
             U[r, c] = 1.0 if r == c else 0.0
     for _ in range(MOST_SWEEPS):
-        off, on = 0.0, 0.0
-        for r in range(6):
-            on += A[r, r] * A[r, r]
-            for c in range(r):
-                off += A[r, c] * A[r, c]
+        off = A[1, 0] * A[1, 0] + A[2, 0] * A[2, 0] + A[2, 1] * A[2, 1]
+        on = A[0, 0] * A[0, 0] + A[1, 1] * A[1, 1] + A[2, 2] * A[2, 2]
         if off <= 1e-34 * on:
             return
-        for p in range(5):
-            for q in range(p + 1, 6):
+        for p in range(2):
+            for q in range(p + 1, 3):
                 if A[p, q] == 0.0:
                     continue
                 ratio = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
@@ -125,10 +122,10 @@ def eigen(A: Array, U: Array) -> None:
                 t = t if ratio >= 0.0 else -t
                 cosine = 1.0 / np.sqrt(t * t + 1.0)
                 sine = t * cosine
-                for k in range(6):
+                for k in range(3):
                     x, y = A[k, p], A[k, q]
                     A[k, p], A[k, q] = cosine * x - sine * y, sine * x + cosine * y
-                for k in range(6):
+                for k in range(3):
                     x, y = A[p, k], A[q, k]
                     A[p, k], A[q, k] = cosine * x - sine * y, sine * x + cosine * y
                     x, y = U[k, p], U[k, q]
@@ -136,19 +133,44 @@ def eigen(A: Array, U: Array) -> None:
 
 
 @lean
-def damping(A: Array, U: Array, square: float, out: Array) -> int:
-    """Damping matrix (6, 6) of J J^T, of which `eigen` gave the values; how many are damped."""
+def damped(A: Array, square: float, out: Array, inverse: Array, U: Array) -> int:
+    """Damping (3, 3) of a symmetric matrix ``A``, and (A + damping)^-1; how many are damped.
+
+    ``A`` is used up.
+    """
+    eigen(A, U)
     count = 0
-    for k in range(6):
+    for r in range(3):
+        for c in range(3):
+            out[r, c], inverse[r, c] = 0.0, 0.0
+    for k in range(3):
         rest = 1.0 - A[k, k] / (WINDOW * square)
-        A[k, k] = square * rest * rest * rest if rest > 0.0 else 0.0
+        d = square * rest * rest * rest if rest > 0.0 else 0.0
         count += 1 if rest > 0.0 else 0
-    for r in range(6):
-        for c in range(6):
-            value = 0.0
-            for k in range(6):
-                value += U[r, k] * A[k, k] * U[c, k]
-            out[r, c] = value
+        one = 1.0 / (A[k, k] + d)
+        for r in range(3):
+            for c in range(3):
+                out[r, c] += U[r, k] * d * U[c, k]
+                inverse[r, c] += U[r, k] * one * U[c, k]
+    return count
+
+
+@lean
+def damping(M: Array, position: float, rotation: float, D: Array, U: Array) -> int:
+    """Damping D (6, 6) of M = J J^T, see `joint_correction` (2); how many directions are damped.
+
+    ``position`` and ``rotation`` are the squares l^2 of the two. ``M`` is used up.
+    """
+    count = damped(M[:3, :3], position, D[:3, :3], D[3:, 3:], U)
+    for r in range(3):
+        for c in range(3):
+            for i in range(3):
+                for k in range(3):
+                    M[3 + r, 3 + c] -= M[i, 3 + r] * D[3 + i, 3 + k] * M[k, 3 + c]
+    count += damped(M[3:, 3:], rotation, D[3:, 3:], D[:3, 3:], U)
+    for r in range(3):
+        for c in range(3):
+            D[r, 3 + c], D[3 + r, c] = 0.0, 0.0
     return count
 
 

@@ -6,14 +6,22 @@ offset's rate and acceleration stay within limits over the time that really elap
 limits are low, as what changes then is the correction itself; in motion they are higher, as the
 correction follows the posture.
 
-With the offset o, its rate v, the desired offset d and the withheld part e = o - d, each step of
-dt follows the desired rate w = d' and takes e back along its own direction,
+Near a singularity the desired offset d may change faster than its limits allow, in several joints
+that cancel at the tool: held back one by one they would take it far off. So a share s of d is
+aimed at, one for all joints, which leaves the tool between where it would be uncorrected and where
+it is wanted. With the desired rate w = d', where two steps agree on it (what one step alone does is
+another correction, no motion of the posture), the limits r of the rates, and the offset o,
 
-    v = w - e / T,   T = max_j |e_j| / u_j,   u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (1)
+    s = min(1, 0.5 / max_j |w_j| / r_j),   by no more than dt / 0.5 s larger than before,       (1)
+    f = s w + (s - s_before) d_before / dt,   e = o + f dt - s d.
+
+Each step of dt follows the rate f and takes e back along its own direction,
+
+    v = f - e / T,   T = max_j |e_j| / u_j,   u_j = (a / 2) (sqrt(dt^2 + 4 |e_j| / a) - dt)     (2)
 
 where u_j is the fastest rate that half of the acceleration a still brings to rest within |e_j| in
 steps of dt, and no more than the limit at rest. Then each joint's v is held to its limits, and a
-joint that may reach d and stay with it does so exactly.
+joint that may reach s d and stay with it does so exactly.
 """
 
 from dataclasses import dataclass
@@ -25,9 +33,12 @@ from robocal_ros.core.compiled import kernel, lean
 
 Array = NDArray[np.float64]
 
-# rows of the limits (4, n) and of a limiter's state (3, n)
+# rows of the limits (4, n) and of a limiter's state (5, n)
 REST_RATE, REST_ACCELERATION, RATE, ACCELERATION = range(4)
-OFFSET, OFFSET_RATE, DESIRED = range(3)
+OFFSET, OFFSET_RATE, DESIRED, DESIRED_RATE, SHARE = STATE = range(5)
+# A desired rate may have so much of its limit before less of the offset is aimed at; all of it
+# comes back in so long, s.
+FULL_RATE, WHOLE_S = 0.5, 0.5
 # Time steps of a path are divided until they are at most so long, s.
 LONGEST_STEP_S = 0.02
 MOST_STEPS = 10_000
@@ -89,18 +100,41 @@ def _range(
 
 
 @lean
+def _agreed(rate: float, before: float) -> float:
+    """Smaller of two rates, 0 where they differ in direction."""
+    if rate * before <= 0.0:
+        return 0.0
+    return rate if abs(rate) < abs(before) else before
+
+
+@lean
+def _aim(
+    state: Array, desired: Array, dt: float, share: float, j: int
+) -> tuple[float, float, float]:
+    """What joint ``j`` aims at, the rate that it follows, and what is left to aim at then."""
+    d, before = desired[j], state[DESIRED, j]
+    follows = share * _agreed((d - before) / dt, state[DESIRED_RATE, j])
+    follows += (share - state[SHARE, j]) * before / dt
+    return share * d, follows, share * d - state[OFFSET, j] - follows * dt
+
+
+@lean
 def advance(
     state: Array, desired: Array, dt: float, moves: bool, limits: Array, active: Array
 ) -> None:
     """One step of ``dt`` > 0 towards ``desired`` (n,), of the joints that are active (n,)."""
-    n, slowest = desired.shape[0], dt
+    n, slowest, share, fastest = desired.shape[0], dt, 1.0, FULL_RATE
+    for j in range(n):
+        if active[j] != 0.0:
+            rate = _agreed((desired[j] - state[DESIRED, j]) / dt, state[DESIRED_RATE, j])
+            fastest = max(fastest, abs(rate) / limits[RATE, j])
+            share = min(share, state[SHARE, j] + dt / WHOLE_S)
+    share = min(share, FULL_RATE / fastest)
     for j in range(n):
         if active[j] == 0.0:
             continue
-        least, most, acceleration = _range(state[OFFSET_RATE, j], dt, moves, limits, j)
-        if abs(desired[j] - state[DESIRED, j]) > limits[RATE, j] * dt:
-            state[DESIRED, j] = desired[j]  # no motion of the posture: another correction
-        size = abs(state[OFFSET, j] - state[DESIRED, j])
+        acceleration = _range(state[OFFSET_RATE, j], dt, moves, limits, j)[2]
+        size = abs(_aim(state, desired, dt, share, j)[2])
         if size > 0.0:
             half = 0.5 * acceleration
             u = half * (np.sqrt(dt * dt + 2.0 * size / half) - dt)
@@ -111,16 +145,15 @@ def advance(
             continue
         rate, offset = state[OFFSET_RATE, j], state[OFFSET, j]
         least, most, acceleration = _range(rate, dt, moves, limits, j)
-        follows = (desired[j] - state[DESIRED, j]) / dt
-        reaches = (desired[j] - offset) / dt
-        stays = abs(reaches - follows) <= acceleration * dt
-        if stays and least <= reaches <= most:
-            state[OFFSET, j], state[OFFSET_RATE, j] = desired[j], reaches
+        aim, follows, left = _aim(state, desired, dt, share, j)
+        reaches = (aim - offset) / dt
+        if abs(reaches - follows) <= acceleration * dt and least <= reaches <= most:
+            state[OFFSET, j], state[OFFSET_RATE, j] = aim, reaches
         else:
-            v = follows - (offset - state[DESIRED, j]) / slowest
-            v = min(max(v, least), most)
+            v = min(max(follows + left / slowest, least), most)
             state[OFFSET, j], state[OFFSET_RATE, j] = offset + v * dt, v
-        state[DESIRED, j] = desired[j]
+        state[DESIRED_RATE, j] = (desired[j] - state[DESIRED, j]) / dt
+        state[DESIRED, j], state[SHARE, j] = desired[j], share
 
 
 @kernel
@@ -145,7 +178,7 @@ def put_out(
     active : (n,) 1 for the joints that go out.
     fastest, lower, upper : (n,) speeds and limits of the joints.
     taught, out, most : (n,) of the last output, and most that was withheld: renewed.
-    tried : (4, n) scratch; its last row is what would go out.
+    tried : (6, n) scratch; its last row is what would go out.
 
     Returns
     -------
@@ -155,28 +188,28 @@ def put_out(
     """
     n, fast, share, inside = goal.shape[0], 0.0, 0.0, True
     for j in range(n):
-        for row in range(3):
+        for row in range(SHARE + 1):
             tried[row, j] = state[row, j]
         if active[j] != 0.0:
             fast = max(fast, abs(goal[j] - taught[j]))
     if longest > 0.0:
         moves = fast > STILL * elapsed
-        advance(tried[:3], desired, min(longest, LONGEST_STEP_S), moves, limits, active)
+        advance(tried[: SHARE + 1], desired, min(longest, LONGEST_STEP_S), moves, limits, active)
     for j in range(n):
         tried[DESIRED, j] = desired[j]
-        tried[3, j] = goal[j] + tried[OFFSET, j]
+        tried[-1, j] = goal[j] + tried[OFFSET, j]
         if active[j] != 0.0:
-            inside &= lower[j] - ROUNDING <= tried[3, j] <= upper[j] + ROUNDING
-            step = abs(tried[3, j] - out[j])
+            inside &= lower[j] - ROUNDING <= tried[-1, j] <= upper[j] + ROUNDING
+            step = abs(tried[-1, j] - out[j])
             if step > ROUNDING:
                 share = max(share, step / (fastest[j] * longest) if longest > 0.0 else np.inf)
     if not (inside and share <= 1.0 + ROUNDING):
         return share if inside else -1.0
     for j in range(n):
-        for row in range(3):
+        for row in range(SHARE + 1):
             state[row, j] = tried[row, j]
         if active[j] != 0.0:
-            taught[j], out[j] = goal[j], tried[3, j]
+            taught[j], out[j] = goal[j], tried[-1, j]
             most[j] = max(most[j], abs(state[OFFSET, j] - state[DESIRED, j]))
     return share
 
@@ -204,7 +237,7 @@ def follow(
             for j in range(n):
                 before[j] = state[DESIRED, j]
                 # another correction than before comes at once, not as the posture moves
-                if abs(desired[k, j] - before[j]) > limits[RATE, j] * dt:
+                if at == 0.0 and abs(desired[k, j] - before[j]) > limits[RATE, j] * dt:
                     before[j] = desired[k, j]
             for i in range(steps):
                 part = (i + 1) / steps
@@ -223,7 +256,8 @@ class OffsetLimiter:
 
     Attributes
     ----------
-    state : (3, n) offset, its rate and the desired offset, at the last step.
+    state : (5, n) offset, its rate, the desired offset, its rate and the share of it that is aimed
+        at, at the last step.
     limits : (4, n).
     most : (n,) most that was withheld of a target.
     """
@@ -233,15 +267,17 @@ class OffsetLimiter:
         self.limits = np.ascontiguousarray(
             np.where(prismatic, np.array(sliding.row())[:, None], np.array(turning.row())[:, None])
         )
-        self.state = np.zeros((3, n))
+        self.state = np.zeros((len(STATE), n))
+        self.state[SHARE] = 1.0
         self.most = np.zeros(n)
-        self._tried = np.empty((4, n))
+        self._tried = np.empty((len(STATE) + 1, n))
 
     def begin(self, index: NDArray[np.int64], offset: Array, desired: Array) -> None:
         """Joints ``index`` (k,) stand with an offset (k,), at rest."""
         self.state[OFFSET, index] = offset
         self.state[OFFSET_RATE, index] = 0.0
         self.state[DESIRED, index] = desired
+        self.state[DESIRED_RATE, index], self.state[SHARE, index] = 0.0, 1.0
 
     @property
     def withheld(self) -> Array:
@@ -271,7 +307,7 @@ class OffsetLimiter:
             self.state, goal, desired, *times, self.limits, active, *arm, *sent, self.most,
             self._tried,
         )  # fmt: skip
-        return share, self._tried[3]
+        return share, self._tried[-1]
 
     def follow(
         self, desired: Array, times: Array, speed: Array, active: Array

@@ -214,16 +214,16 @@ class PathMessage:
         return message
 
 
-def stop_message(names: Sequence[str], position: Array, after_s: float) -> JointTrajectory:
-    """To rest at ``position`` (k,) after a time, at once.
-
-    One point: a controller makes a cubic to it, from where and as fast as it is when the message
-    comes, so that nothing of the time on the way is a step.
-    """
-    ns = round(after_s * NS)
-    point = JointTrajectoryPoint(
-        positions=doubles(position),
-        velocities=doubles(np.zeros(len(position))),
-        time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
-    )
-    return JointTrajectory(joint_names=list(names), points=[point])
+def stop_message(names: Sequence[str], times: Array, q: Array, qd: Array) -> JointTrajectory:
+    """Points (m, k) to rest, at once: a controller begins with a cubic from where it is."""
+    message = JointTrajectory(joint_names=list(names))
+    for after_s, position, velocity in zip(times.tolist(), q, qd, strict=True):
+        ns = round(after_s * NS)
+        message.points.append(
+            JointTrajectoryPoint(
+                positions=doubles(position),
+                velocities=doubles(velocity),
+                time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
+            )
+        )
+    return message

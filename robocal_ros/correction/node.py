@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
 from sensor_msgs.msg import JointState
@@ -46,12 +47,15 @@ from robocal_ros.correction.settings import (
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import Health
 from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+
+Array = NDArray[np.float64]
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
@@ -71,11 +75,12 @@ KINDS = {
 }
 ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
 AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
-STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither hastens nor turns back
+# A stop's first point that is sent: the controller makes a cubic to it from where and as fast as it
+# is, which does not turn back where the message comes 60 ms late.
+FIRST_S = 0.12
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
-PERCENT = 0.01
 
 
 class JointCorrectionNode(HouseNode):
@@ -117,7 +122,8 @@ class JointCorrectionNode(HouseNode):
         self._violation: GraphViolation | None = None
         self._commanded = self._by_action = False
         self._stream = TARGETS
-        self._scalings: dict[str, float] = {}
+        self._astray: SentPath | None = None  # a path that the robot is being stopped beside
+        self._scalings, self._scaling = SpeedScaling(), 1.0
         self._open_topics()
         self._open_action()
         self._report = CorrectionReport(
@@ -164,7 +170,7 @@ class JointCorrectionNode(HouseNode):
         if self.settings[ACTION]:
             if self._proxy is None:
                 self._proxy = TrajectoryProxy(
-                    self, f"~/{ACTION}", self._correct_goal, self._goal_sent
+                    self, f"~/{ACTION}", self._correct_goal, self._goal_sent, self._goal_lost
                 )
             self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
@@ -195,9 +201,7 @@ class JointCorrectionNode(HouseNode):
         try:
             self._session.hold(Reason.STOPPED, why, time.monotonic())
             self._stop(why)
-            while time.monotonic() < until_s and (
-                self._emit_tail() or self._stopping.look(time.monotonic(), self._scaling)
-            ):
+            while time.monotonic() < until_s and (self._emit_tail() or self._is_stopping()):
                 time.sleep(self._tail_period_s())
                 self.take_waiting()  # where the robot is
             if self._proxy is not None:
@@ -314,6 +318,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_states(self, message: JointMessage) -> None:
         command, now = self._session.counted(message.command), time.monotonic()
+        self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         taught = self._session.reading(command, now, age)
         self._track.read(command, now)
@@ -374,13 +379,17 @@ class JointCorrectionNode(HouseNode):
             return trajectory if command is came else message.changed(command), path
         except Exception:
             if path is not None:  # it never goes out
-                self._session.output.reject(path)
+                self._session.reject(path)
             raise
 
     def _goal_sent(self) -> None:
         """Tell what a goal is corrected by."""
         self._by_action = True
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
+
+    def _goal_lost(self, why: str) -> None:
+        """The robot may still follow it, and is stopped by where it is."""
+        self._stop_by_readings(why, time.monotonic())
 
     # ---- stops, and what goes out without a message ---------------------------------------------
 
@@ -389,38 +398,61 @@ class JointCorrectionNode(HouseNode):
         now = time.monotonic()
         if self._shadow:
             return
-        planned = self._session.stop(now, AHEAD_S)
-        self._arm_tail()
-        sent = True
-        if planned is not None:
-            way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
-            after_s = way_s / STOP_SHARE
-            sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
-            self._stopping.watch(why, after_s, now)
+        self._rescale(now)
+        path, sent = self._session.output.path, True
+        if path is not None and path.live(now) and not self._track.follows(path, now):
+            self._session.stream.end(RefusedError(Reason.STOPPED, why), now)
+            sent = self._stop_by_readings(why, now)
+        elif (planned := self._session.stop(now, AHEAD_S)) is not None:
+            times, q, qd = planned.time_from_start_s, planned.position, planned.velocity
+            assert qd is not None
+            k = min(int(np.searchsorted(times, FIRST_S)), len(times) - 1)
+            sent = self._send_stop(planned.names, times[k:] - REACTION_S, q[k:], qd[k:], why)
+            self._stopping.watch(why, times, np.abs(qd).max(axis=1), now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
-            sent = self._stopping.begin(why, now)
+            sent = self._stop_by_readings(why, now)
+        self._arm_tail()
         if not sent and self._proxy is not None:
             self._proxy.cancel(why)
         if self._stopping.why:
             self._stop_timer.reset()
 
-    def _send_plan(self, plan: JointPlan) -> None:
-        self._send_stop(self._arm_names, plan.q[-1], plan.duration_s, self._stopping.why)
+    def _stop_by_readings(self, why: str, now_s: float) -> bool:
+        """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
+        self._astray = self._session.output.path
+        sent = self._stopping.begin(why, now_s)
+        if sent:
+            self._stop_timer.reset()
+        return sent
 
-    def _send_stop(self, names: Any, position: Any, after_s: float, why: str) -> bool:
-        message = stop_message(names, position, after_s)
+    def _send_plan(self, plan: JointPlan) -> None:
+        end = plan.time_s[-1:], plan.q[-1:], plan.qd[-1:]
+        self._send_stop(self._arm_names, *end, self._stopping.why)
+
+    def _send_stop(self, names: Any, times: Array, q: Array, qd: Array, why: str) -> bool:
+        message = stop_message(names, times, q, qd)
         if self._by_action and self._proxy is not None:
             return self._proxy.stop(message, why)
         self._outputs[TRAJECTORY].publish(message)
         return True
 
     def _watch_stop(self) -> None:
-        if not self._stopping.look(time.monotonic(), self._scaling):
+        if not self._is_stopping():
             self._stop_timer.cancel()
             if self._stopping.fault:
                 self.get_logger().error(self._stopping.fault)
             if self._proxy is not None:
                 self._proxy.end("stopped")
+
+    def _is_stopping(self) -> bool:
+        """Let a stop go on; whether one is under way."""
+        now = time.monotonic()
+        if self._stopping.look(now, self._scaling):
+            return True
+        if self._astray is not None and not self._stopping.fault:
+            self._astray.end(now)
+        self._astray = None
+        return False
 
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
@@ -447,30 +479,30 @@ class JointCorrectionNode(HouseNode):
 
     # ---- the controller -------------------------------------------------------------------------
 
-    @property
-    def _scaling(self) -> float:
-        """How fast the controller's clock runs, by who says least."""
-        return min(self._scalings.values(), default=1.0)
-
     def _on_controller(self, message: Any) -> None:
-        """Where the controller is. Older ones leave the scaling at 0, and so say nothing by it."""
-        self._scale(CONTROLLER, float(getattr(message, "speed_scaling_factor", math.nan)))
+        """Where the controller is, and how fast its clock runs."""
+        now = time.monotonic()
+        self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
+        self._rescale(now)
         position = np.array(message.reference.positions, dtype=np.float64)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
             self._scaling,
-            time.monotonic(),
+            now,
         )
 
     def _on_scaling(self, message: Any) -> None:
-        """In percent, as ur_robot_driver's speed_scaling_state_broadcaster publishes it."""
-        self._scale(SCALING, float(message.data) * PERCENT)
-        self._session.controller((), np.empty(0), self._scaling, time.monotonic())
+        now = time.monotonic()
+        self._scalings.slider(float(message.data), now)
+        self._rescale(now)
 
-    def _scale(self, topic: str, scaling: float) -> None:
-        if math.isfinite(scaling) and (scaling > 0.0 or topic in self._scalings):
-            self._scalings[topic] = min(max(scaling, 0.0), 1.0)
+    def _rescale(self, now_s: float) -> None:
+        """How fast the controller's clock runs now; as planned where nobody told it lately."""
+        scaling = self._scalings.at(now_s)
+        before, self._scaling = self._scaling, 1.0 if scaling is None else scaling
+        if self._scaling != before:
+            self._session.controller((), np.empty(0), self._scaling, now_s)
 
     # ---- who else commands ----------------------------------------------------------------------
 
@@ -486,8 +518,11 @@ class JointCorrectionNode(HouseNode):
 
     def _judge_graph(self) -> None:
         """Hold the program's commands while somebody else may move the robot."""
-        now, before = time.monotonic(), self._violation
-        found = self._violation = self._graph.look(now)
+        now, before, lost = time.monotonic(), self._violation, self._graph.lost
+        stood_s = self._track.stood_s(now) if self._scaling else 0.0  # one that pauses goes on
+        found = self._violation = self._graph.look(now, stood_s)
+        if self._graph.lost and not lost:
+            self.get_logger().error(self._graph.lost)
         for reason in (Reason.OTHER_COMMANDER, Reason.LEASED):
             if found is not None and found.reason is reason:
                 self._session.hold(reason, found.detail, now)
@@ -512,6 +547,7 @@ class JointCorrectionNode(HouseNode):
     def _look(self) -> None:
         """Let time pass, and tell what has changed."""
         now = time.monotonic()
+        self._rescale(now)
         self._session.look(now, self.now_ns())
         if self._commanded:
             self._tell_offset(JointOffset.PERIODIC, now)
@@ -536,7 +572,7 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        faults = [*self._faults(), *filter(None, [self._stopping.fault])]
+        faults = [*self._faults(), *filter(None, [self._stopping.fault, self._graph.lost])]
         return self._report.health(faults, self._rivals())
 
 

@@ -9,7 +9,14 @@ import numpy as np
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import Array, Index
-from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, OffsetLimiter
+from robocal_ros.correction.limiter import (
+    DESIRED,
+    DESIRED_RATE,
+    OFFSET,
+    OFFSET_RATE,
+    SHARE,
+    OffsetLimiter,
+)
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
@@ -97,6 +104,19 @@ class SentPath:
         t = self.time(now_s)
         return np.array([np.interp(t, self.known_times, column) for column in rows.T])
 
+    def offset(self, now_s: float) -> tuple[Array, Array]:
+        """Offset and its rate (n,) now, as the controller drives them between the points."""
+        t, times = self.time(now_s), self.known_times
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        if self.velocity is None or not 0 <= k < len(times) - 1:
+            return self.at(self.offsets, now_s), self.at(self.rates, now_s)
+        h = times[k + 1] - times[k]
+        s, v0, v1 = (t - times[k]) / h, self.rates[k], self.rates[k + 1]
+        way = (self.offsets[k + 1] - self.offsets[k]) / h
+        first, second = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
+        offset = self.offsets[k] + h * s * (v0 + s * (first + s * second))
+        return offset, v0 + s * (2.0 * first + 3.0 * s * second)
+
 
 class Output:
     """What was put out last for each joint."""
@@ -136,7 +156,8 @@ class Output:
         """Where the controller is (k,), and whether that is known better than by readings.
 
         Its reference where it tells it; else what it was sent, where the robot is there or on its
-        way; else where the robot stands. ``q`` (k,): joints without limits at the turn nearest.
+        way; else where the robot stands, joints without limits at the turn nearest to ``q`` (k,):
+        what reads them may count no turns, what drives them does.
 
         Raises `RefusedError` when readings are missing or old, or the robot moves and not by what
         was put out.
@@ -144,7 +165,7 @@ class Output:
         state = self._state
         known = state.reference(index, now_s)
         if known is not None:
-            return state.unwrapped(index, known, q), True
+            return known, True
         state.require_fresh(index, now_s)
         measured, near = state.measured[index], self._near[index]
         stands, sent = state.stands(index, now_s), self._sent(now_s)[index]
@@ -154,7 +175,7 @@ class Output:
             here = state.unwrapped(index, measured, sent)
             beside = np.maximum(places.min(axis=0) - here, here - places.max(axis=0))
             if np.all(beside <= near):  # it is there, or lags on its way
-                return state.unwrapped(index, sent, q), True
+                return sent, True
         if stands:
             return state.unwrapped(index, measured, q), False
         raise self.refuse("the robot moves, and where its controller is is not known")
@@ -228,7 +249,10 @@ class Output:
             return None, whole
         if not exact:
             return None
-        taught = self.uncorrected(place, now_s)
+        if self.path is not None and self.path.live(now_s):
+            taught = place - self.path.offset(now_s)[0]
+        else:
+            taught = self.uncorrected(place, now_s)
         return taught, place - taught
 
     def refuse(self, detail: str) -> RefusedError:
@@ -249,10 +273,11 @@ class Output:
         """The offset goes on from the path that was put out last."""
         if self.path is not None:
             state, path = self.limiter.state, self.path
-            state[OFFSET] = path.at(path.offsets, now_s)
+            state[OFFSET], rate = path.offset(now_s)
             moving = path.time(now_s) < path.times[-1] and path.live(now_s)
-            state[OFFSET_RATE] = path.at(path.rates, now_s) if moving else 0.0
+            state[OFFSET_RATE] = rate if moving else 0.0
             state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
+            state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
 
     def reject(self, path: SentPath) -> None:
         """The controller did not take a path: what it took the place of goes on there."""

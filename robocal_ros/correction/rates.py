@@ -1,4 +1,4 @@
-"""Compiled rates of the joint correction: by the chain rule, or by differences along the way."""
+"""Compiled work on corrected points: bounds, and rates by the chain rule or by differences."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction.room import Room, room_in
-from robocal_ros.correction.solution import correct_staged
+from robocal_ros.correction.solution import CONVERGED, TCP_ROTATION, TCP_SHIFT, correct_staged
 
 Array = NDArray[np.float64]
 
@@ -107,3 +107,27 @@ def taught_velocity_by_differences(
             out[j] += miss
         if not size > VELOCITY_EXACT:
             return
+
+
+@lean
+def within(q: Array, out: Array, bounds: Array, tcp: Array, offset: Array) -> bool:
+    """Whether a point (n,) is solved within all bounds, by ``out`` (k, n + 7); its offset (n,)."""
+    n, stages = q.shape[0], out.shape[0]
+    fine = out[0, n + TCP_SHIFT] <= tcp[0] and out[0, n + TCP_ROTATION] <= tcp[1]
+    for stage in range(stages):
+        fine = fine and out[stage, n + CONVERGED] > 0.5
+        for j in range(n):
+            before = q[j] if stage == 0 else out[stage - 1, j]
+            fine = fine and abs(out[stage, j] - before) <= bounds[stage, j]
+    for j in range(n):
+        offset[j] = out[stages - 1, j] - q[j]
+    return fine
+
+
+@lean
+def ordinary(position: Array, most: Array, index: NDArray[np.int64]) -> bool:
+    """Whether positions (k,) of joints ``index`` are finite, and none beyond ``most`` (n,)."""
+    fine = True
+    for i in range(position.shape[0]):
+        fine = fine and abs(position[i]) <= most[index[i]]
+    return fine

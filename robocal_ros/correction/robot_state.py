@@ -5,10 +5,10 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.inputs import JointCommand, require_finite
 from robocal_ros.correction.joint_correction import plain
+from robocal_ros.correction.rates import ordinary
 from robocal_ros.correction.refusals import Reason, RefusedError
 
 Array = NDArray[np.float64]
@@ -20,16 +20,8 @@ TRACK_S = 0.01  # between two places that are kept, s
 REFERENCE_AGE_S = 0.1  # a controller's reference that is older is none, s
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
-AHEAD_S = 0.5
+AHEAD_S = 0.1
 MOST_LAYOUTS = 16  # of readings, by their joints' names, that are remembered
-
-
-@lean
-def _ordinary(position: Array, doubtful: Array, index: Index) -> bool:
-    fine = True
-    for i in range(position.shape[0]):
-        fine = fine and abs(position[i]) <= doubtful[index[i]]
-    return fine
 
 
 class RobotState:
@@ -83,7 +75,7 @@ class RobotState:
         if position.shape[1] != len(names):
             detail = f"{len(names)} names but {position.shape[1]} positions"
             raise RefusedError(Reason.WRONG_SIZE, detail)
-        if len(position) == 1 and _ordinary(plain(position[0]), self._doubtful, index):
+        if len(position) == 1 and ordinary(plain(position[0]), self._doubtful, index):
             return
         require_finite(names, position)
         size = np.abs(position)

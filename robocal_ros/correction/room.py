@@ -17,7 +17,7 @@ from robocal_ros.correction import straight_kinematics as six
 
 Array = NDArray[np.float64]
 
-POSES, SQUARES, TWISTS = 6, 4, 5
+POSES, SQUARES, TWISTS = 6, 3, 5
 STEEPNESS, PER_ERROR, IS_STRAIGHT, SETTINGS = 0, 1, 2, 3
 
 
@@ -32,11 +32,12 @@ class Room(NamedTuple):
         poses have the axes of the flange, their origin is the tool's.
     turns, frames : scratch of `walk`.
     J, there : (n, 6) Jacobian at the taught joints, and at those tried last.
-    M, U, D, B : (6, 6) J J^T, its vectors, the damping, and the matrix of a step.
+    M, D, B : (6, 6) J J^T, the damping, and the matrix of a step.
+    U : (3, 3) vectors of a part of M.
     e, y, step, spare, order : (6,) residual, multipliers, their step, and scratch.
     x : (n,) shift of the joints.
     settings : steepness and its rise, and whether `straight` serves; see `joint_correction` (3).
-    constants, came, goes : of `straight`, for sixteen points.
+    constants, came, goes, late : of `straight` and `straight_damped`, for sixteen points.
     """
 
     taught_links: Array
@@ -65,12 +66,13 @@ class Room(NamedTuple):
     constants: Array
     came: Array
     goes: Array
+    late: Array
 
 
 def work_size(n: int) -> int:
     """How many scratch numbers a solution for n joints needs."""
-    many = six.CONSTANTS + straight.LANES * (six.N + straight.ROWS)
-    small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 6 * TWISTS + SETTINGS
+    many = six.CONSTANTS + straight.LANES * (six.N + straight.ROWS + 1)
+    small = 16 * POSES + 24 * (n // 8 + 1) + 36 * SQUARES + 9 + 6 * TWISTS + SETTINGS
     return 18 * n + 18 * n + n + small + many
 
 
@@ -83,16 +85,18 @@ def room_in(work: Array, n: int) -> Room:
     frames, at = work[at : at + 6 * n].reshape(n, 2, 3), at + 6 * n
     J, at = work[at : at + 12 * n].reshape(2, n, 6), at + 12 * n
     squares, at = work[at : at + 36 * SQUARES].reshape(SQUARES, 6, 6), at + 36 * SQUARES
+    U, at = work[at : at + 9].reshape(3, 3), at + 9
     twists, at = work[at : at + 6 * TWISTS].reshape(TWISTS, 6), at + 6 * TWISTS
     x, at = work[at : at + n], at + n
     settings, at = work[at : at + SETTINGS], at + SETTINGS
     constants, at = work[at : at + six.CONSTANTS], at + six.CONSTANTS
     came, at = work[at : at + straight.LANES * six.N], at + straight.LANES * six.N
+    goes, at = work[at : at + straight.LANES * straight.ROWS], at + straight.LANES * straight.ROWS
     return Room(
         links[0], links[1], poses[0], poses[1], poses[2], poses[3], poses[4], poses[5],
-        turns, frames, J[0], J[1], squares[0], squares[1], squares[2], squares[3],
+        turns, frames, J[0], J[1], squares[0], U, squares[1], squares[2],
         twists[0], twists[1], twists[2], twists[3], twists[4], x, settings,
-        constants, came, work[at : at + straight.LANES * straight.ROWS],
+        constants, came, goes, work[at : at + straight.LANES],
     )  # fmt: skip
 
 

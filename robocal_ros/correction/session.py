@@ -29,7 +29,7 @@ from robocal_ros.correction.inputs import (
     require_finite,
 )
 from robocal_ros.correction.offers import CorrectionGate
-from robocal_ros.correction.output import Output
+from robocal_ros.correction.output import Output, SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.status import CorrectionStatus, Offset
@@ -41,7 +41,10 @@ Answer = TypeVar("Answer")
 # A message this much older than the last one comes from a clock that was set back.
 CLOCK_RESET_NS = 1_000_000_000
 MOST_SOURCES = 64  # of so many drivers the order in time is watched one by one
-# What is dropped without ending a stream: it is not the stream's.
+AHEAD_S = 0.02  # a source's clock may run ahead by so much from one message to the next
+# What is dropped without ending a stream, as it is not the stream's: unless nothing came for so
+# many periods, and it is in the place of the next message.
+INSTEAD = 0.75
 DROPPED = {Reason.TIME_BACKWARDS, Reason.OWN_OUTPUT}
 
 
@@ -87,7 +90,9 @@ class CorrectionSession:
         self._taught = np.full(n, np.nan)  # readings, un-corrected
         self._goal = np.full(n, np.nan)  # taught joints that were commanded last
         self._held: dict[Reason, str] = {}
-        self._stamps: dict[tuple[str, tuple[str, ...]], int] = {}
+        self._interrupted: tuple[SentPath | None, Phase] = None, Phase.IDLE  # by the last path
+        # of each kind and source: the last stamp, ns, and when it came
+        self._stamps: dict[tuple[str, tuple[str, ...]], tuple[int, float]] = {}
         self._refused: Counter[Reason] = Counter()
         self._last_refusal = ""
         self._overtaken = 0
@@ -179,7 +184,7 @@ class CorrectionSession:
         A `RefusedError` ends a stream that runs: its `tail` slows the robot down.
         """
         try:
-            self._require_order("target", command.stamp_ns, command.mark, ())
+            self._require_order("target", command, (), now_s)
             self._require_released()
             index = self._state.index(command.names)
             self._state.require_positions(command.names, index, command.position[None])
@@ -192,7 +197,7 @@ class CorrectionSession:
             else:
                 corrected = self.stream.take(command, index, q, now_s)
         except RefusedError as error:
-            if error.reason not in DROPPED:
+            if error.reason not in DROPPED or self.stream.is_due(now_s, INSTEAD):
                 self.stream.end(error, now_s)
             raise self._count(error) from None
         self._goal[:] = q
@@ -214,7 +219,7 @@ class CorrectionSession:
         """
         waiting = self._gate.tools.waiting, self._gate.tools.in_use
         try:
-            self._require_order("trajectory", 0, command.mark, ())
+            self._require_order("trajectory", replace(command, stamp_ns=0), (), now_s)
             self._require_released()
             require_times(command)
             index = self._state.index(command.names)
@@ -227,6 +232,7 @@ class CorrectionSession:
                 return command
             if self.output.mismatch:
                 raise RefusedError(Reason.START_MISMATCH, self.output.mismatch)
+            self.stream.come_to_rest(now_s)
             corrected, path = self._paths.correct(command, index, q, now_s, starts_in_s)
         except RefusedError as error:
             if self._gate.tools.waiting is not waiting[0]:
@@ -236,19 +242,34 @@ class CorrectionSession:
         path.replaced = self.output.path if may_be_rejected else None
         path.scale(self._state.scaling, now_s)
         self.output.path = path
+        self._interrupted = path, self.stream.phase
         self.stream.phase = Phase.IDLE
         self._goal[:] = q[-1]
         most = self.output.limiter.most
         np.maximum(most, np.abs(path.withheld).max(axis=0), out=most)
         return corrected
 
+    def reject(self, path: SentPath) -> None:
+        """The controller did not take a trajectory: what it took the place of goes on there."""
+        self.output.reject(path)
+        rejected, phase = self._interrupted
+        if path is rejected and self.output.path is None and self.stream.phase is Phase.IDLE:
+            self.stream.phase = phase
+
     def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:
         """A trajectory that stops what was put out last, as a controller takes it; None: it stands.
 
         Its first point lies ``ahead_s`` ahead. A stream ends by its `tail`.
         """
-        self.stream.end(RefusedError(Reason.STOPPED, "a stop was asked for"), now_s)
-        return self._paths.stop(now_s, ahead_s)
+        stream = RefusedError(Reason.STOPPED, "a stop was asked for")
+        self.stream.end(stream, now_s)
+        stopped = self._paths.stop(now_s, ahead_s)
+        if stopped is None:
+            return None
+        command, path = stopped
+        path.scale(self._state.scaling, now_s)
+        self.output.path = path
+        return command
 
     def _shadow(self, q: Array) -> None:
         with contextlib.suppress(RefusedError):  # counted, and in the status
@@ -270,7 +291,7 @@ class CorrectionSession:
         return self.counted(lambda: self._read(state, now_s, age_s))
 
     def _read(self, state: JointCommand, now_s: float, age_s: float) -> JointCommand:
-        self._require_order("reading", state.stamp_ns, state.mark, state.names)
+        self._require_order("reading", state, state.names, now_s)
         index, column = self._state.find(state)
         self._state.read(index, state.position[column], now_s, age_s)
         self.output.note_place(now_s)
@@ -371,23 +392,32 @@ class CorrectionSession:
         self._last_refusal = str(refusal)
         return refusal
 
-    def _require_order(self, kind: str, stamp: int, mark: str, names: tuple[str, ...]) -> None:
+    def _require_order(
+        self,
+        kind: str,
+        came: JointCommand | TrajectoryCommand,
+        names: tuple[str, ...],
+        now_s: float,
+    ) -> None:
         """Refuse what carries a mark of a correction, or was overtaken by a newer one.
 
-        Readings have one order in time for each driver, by its joints.
+        Readings have one order in time for each driver, by its joints. A stamp that went ahead by
+        more than the time that passed does not bar those after it.
         """
-        if mark == CORRECTED or (mark == TAUGHT and kind == "reading"):
-            raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{mark}'")
+        if came.mark == CORRECTED or (came.mark == TAUGHT and kind == "reading"):
+            raise RefusedError(Reason.OWN_OUTPUT, f"{kind} with frame_id '{came.mark}'")
+        stamp = came.stamp_ns
         if not stamp:
             return
         key = kind, tuple(sorted(names))
         if key not in self._stamps and len(self._stamps) >= MOST_SOURCES:
             key = kind, ()
-        last = self._stamps.get(key, 0)
+        last, came_s = self._stamps.get(key, (stamp, now_s))
         if stamp < last and last - stamp <= CLOCK_RESET_NS:
             detail = f"{kind} is {(last - stamp) * 1e-9:.6f} s older than the one before"
             raise RefusedError(Reason.TIME_BACKWARDS, detail)
-        self._stamps[key] = stamp
+        if stamp <= last + (now_s - came_s + AHEAD_S) * 1e9:
+            self._stamps[key] = stamp, now_s
 
     def status(self, now_s: float | None = None) -> CorrectionStatus:
         """What the session does; ``now_s``: while a trajectory is under way, at which instant."""

@@ -68,7 +68,7 @@ SETTINGS = (
         "policy",
         Policy.REFUSE.value,
         "What becomes of a command whose correction exceeds a bound or leads beyond a limit: "
-        "refuse it, clamp the correction, or pass it while the correction is blended out",
+        "refuse it, clamp the correction, or pass it while its offset goes to zero",
         choices=tuple(policy.value for policy in Policy),
     ),
     Setting(

@@ -1,6 +1,7 @@
 """Compiled solution of the joint correction: one point, a point through all stages, or many.
 
-Most points of six joints are solved by `straight`; the others, and all other arms, here. ``work``
+Nearly all points of six joints are solved by `straight` and, with weak directions, by
+`straight_damped`; the others, and all other arms, here. ``work``
 is that of `room`, with settled models. Equations: see `joint_correction`.
 """
 
@@ -11,7 +12,7 @@ from robocal_ros.core.compiled import lean
 from robocal_ros.core.kinematics import newton
 from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction import kernels as k
-from robocal_ros.correction import straight
+from robocal_ros.correction import straight, straight_damped
 from robocal_ros.correction import straight_kinematics as six
 from robocal_ros.correction.room import IS_STRAIGHT, PER_ERROR, STEEPNESS, Room, room_in, settle
 
@@ -62,12 +63,14 @@ def _jacobian(free: bool, room: Room, J: Array) -> None:
 @lean
 def _damp(free: bool, room: Room) -> bool:
     """Damping ``D`` for J and the residual at the taught joints; whether a direction is weak."""
-    n, M, D = room.x.shape[0], room.M, room.D
-    square = 0.0
-    for r in range(6):
-        weighed = room.e[r] * k.WEIGHT if r < 3 else room.e[r]
-        square += weighed * weighed
-    square = k.lambda_square(square, room.settings[STEEPNESS], room.settings[PER_ERROR])
+    n, M, D, settings = room.x.shape[0], room.M, room.D, room.settings
+    position, both = 0.0, 0.0
+    for r in range(3):
+        position += room.e[r] * k.WEIGHT * room.e[r] * k.WEIGHT
+        both += room.e[3 + r] * room.e[3 + r]
+    both += position
+    position = k.lambda_square(position, settings[STEEPNESS], settings[PER_ERROR])
+    rotation = k.lambda_square(both, settings[STEEPNESS], settings[PER_ERROR])
     k.product(room.J, room.J, M)
     absent = max(6 - n, 1 if free else 0)  # directions in which no joint moves the tool
     if n >= 6:
@@ -80,11 +83,10 @@ def _damp(free: bool, room: Room) -> bool:
                 for c in range(3):
                     D[3 + r, 3 + c] = z[r] * z[c]
                     M[3 + r, 3 + c] += z[r] * z[c]
-        if k.WINDOW * square * (k.inverse_norm(M, room.B, room.spare) - absent) <= 1.0:
+        if k.WINDOW * rotation * (k.inverse_norm(M, room.B, room.spare) - absent) <= 1.0:
             return False
         k.product(room.J, room.J, M)
-    k.eigen(M, room.U)
-    return k.damping(M, room.U, square, D) > absent
+    return k.damping(M, position, rotation, D, room.U) > absent
 
 
 @lean
@@ -176,7 +178,8 @@ def _take_over(room: Room, lane: int, lanes: int, out: Array) -> bool:
         out[i] = goes[i * lanes + lane]
     out[n + POSITION_ERROR] = goes[straight.POSITION_LEFT * lanes + lane]
     out[n + ROTATION_ERROR] = goes[straight.ROTATION_LEFT * lanes + lane]
-    out[n + ITERATIONS], out[n + WEAK] = straight.ITERATIONS, 0.0
+    out[n + ITERATIONS] = straight.ITERATIONS
+    out[n + WEAK] = goes[straight.WEAK * lanes + lane]
     out[n + CONVERGED] = goes[straight.FINE * lanes + lane]
     out[n + TCP_SHIFT] = goes[straight.TCP_SHIFT * lanes + lane]
     out[n + TCP_ROTATION] = goes[straight.TCP_ROTATION * lanes + lane]
@@ -190,7 +193,32 @@ def _correct_one(q: Array, largest: Array, free: bool, room: Room, out: Array) -
         straight.correct_one(room.constants, room.came, room.goes)
         if _take_over(room, 0, 1, out):
             return
+        straight_damped.correct_one(room.constants, room.came, room.goes)
+        if _take_over(room, 0, 1, out):
+            return
     _correct(q, largest, free, room, out)
+
+
+@lean
+def _correct_weak(q: Array, largest: Array, room: Room, out: Array) -> None:
+    """Those of the points (m, 6) of which ``out`` says that they are not solved."""
+    count, n = 0, six.N
+    for i in range(q.shape[0]):
+        if out[i, n + CONVERGED] > 0.5:
+            continue
+        _put(q[i], count, straight.LANES, room)
+        room.late[count] = i
+        count += 1
+        if count == straight.LANES:
+            straight_damped.correct_lanes(room.constants, room.came, room.goes)
+            for lane in range(count):
+                k = int(room.late[lane])
+                if not _take_over(room, lane, count, out[k]):
+                    _correct(q[k], largest, False, room, out[k])
+            count = 0
+    for lane in range(count):
+        k = int(room.late[lane])
+        _correct_one(q[k], largest, False, room, out[k])
 
 
 @lean
@@ -226,10 +254,9 @@ def correct_batch(q: Array, largest: Array, free: bool, work: Array, out: Array)
                 _put(q[first + lane], lane, straight.LANES, room)
             straight.correct_lanes(room.constants, room.came, room.goes)
             for lane in range(straight.LANES):
-                i = first + lane
-                if not _take_over(room, lane, straight.LANES, out[i]):
-                    _correct(q[i], largest, free, room, out[i])
+                _take_over(room, lane, straight.LANES, out[first + lane])
             first += straight.LANES
+        _correct_weak(q[:first], largest, room, out)
     for i in range(first, q.shape[0]):
         _correct_one(q[i], largest, free, room, out[i])
 

@@ -120,6 +120,7 @@ class ToldCorrection:
     waiting_tool_revision: int | None = None  # it waits for a standstill or a trajectory
     stale: str = ""
     mismatch: str = ""
+    commanders: str = ""  # who else commands the robot; nothing goes out in OTHER_COMMANDER
     last_refusal: str = ""
 
 
@@ -128,8 +129,8 @@ def uncorrected(
 ) -> str:
     """Why commands are not corrected with model and tool in force, and what to do; empty: they are.
 
-    Nominal model and taught tool need no correction. A blend that advances counts as done: it
-    advances with the commands alone, which the line would hold back until it is.
+    Nominal model and taught tool need no correction. An offset that is still on its way counts as
+    done. In the state LEASED the program's commands are refused: none goes out uncorrected.
 
     Parameters
     ----------
@@ -141,8 +142,8 @@ def uncorrected(
         return f"{NODE} is silent: start it, it corrects nothing" if needed else ""
     if needed and (why := _idle(told, thermal)):
         return f"{NODE} {why}"
-    corrects = told.enabled and not told.shadow and told.state is not CorrectionState.MISMATCH
-    if follows or not corrects:
+    silent = told.state in (CorrectionState.MISMATCH, CorrectionState.OTHER_COMMANDER)
+    if follows or not told.enabled or told.shadow or silent:
         return ""
     pairs = [
         _other("thermal model", "kinematic_model", told.model_revision, thermal, told),
@@ -161,6 +162,8 @@ def _idle(told: ToldCorrection, thermal: Head) -> str:
         return "is in shadow mode, nothing is corrected: start it with shadow false"
     if told.state is CorrectionState.MISMATCH:
         return f"puts nothing out, {told.mismatch}: see where the robot stands, call ~/acknowledge"
+    if told.state is CorrectionState.OTHER_COMMANDER:
+        return f"puts nothing out, {told.commanders}: end them"
     if not told.enabled:
         return "is OFF: call ~/enable"
     if told.state is CorrectionState.WITHOUT_MODEL:

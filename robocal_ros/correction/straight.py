@@ -3,7 +3,7 @@
 Newton's method as in `solution`, three factored matrices with two steps each, written with single
 numbers: the compiler works on several points at a time in vector registers. Each gets the
 bits that it gets alone. Where that does not do (a direction may be weak, or a shift is so large
-that it needs more steps) a point is left to `solution`.
+that it needs more steps) a point is left to `straight_damped`.
 """
 
 import numpy as np
@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 
 LANES = 16
 # what is written for each point
-ROWS = 11
-POSITION_LEFT, ROTATION_LEFT, FINE, TCP_SHIFT, TCP_ROTATION = range(N, ROWS)
+ROWS = 12
+POSITION_LEFT, ROTATION_LEFT, FINE, WEAK, TCP_SHIFT, TCP_ROTATION = range(N, ROWS)
 ITERATIONS = 3.0
 
 # A residual (m, rad) that is left alone.
@@ -46,12 +46,13 @@ FAR = 2.0  # a solution so many times beyond the bound is another posture
 
 
 @lean
-def _dot(a: Six, b: Six) -> float:
+def dot(a: Six, b: Six) -> float:
+    """Scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3] + a[4] * b[4] + a[5] * b[5]
 
 
 @lean
-def _more(a: Six, s: float, b: Six) -> Six:
+def more(a: Six, s: float, b: Six) -> Six:
     """A + s b."""
     return (
         a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2],
@@ -69,36 +70,36 @@ def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
     By the modified Gram-Schmidt process; False where singular.
     """
     s, e = ACTUAL + 7, f[6]
-    a0 = _weighed(column(c[s], f[0], e))
-    a1, a2 = _weighed(column(c[s + 9], f[1], e)), _weighed(column(c[s + 18], f[2], e))
-    a3, a4 = _weighed(column(c[s + 27], f[3], e)), _weighed(column(c[s + 36], f[4], e))
-    a5 = _weighed(column(c[s + 45], f[5], e))
-    n0 = _dot(a0, a0)
+    a0 = weighed(column(c[s], f[0], e))
+    a1, a2 = weighed(column(c[s + 9], f[1], e)), weighed(column(c[s + 18], f[2], e))
+    a3, a4 = weighed(column(c[s + 27], f[3], e)), weighed(column(c[s + 36], f[4], e))
+    a5 = weighed(column(c[s + 45], f[5], e))
+    n0 = dot(a0, a0)
     i0 = 1.0 / n0
-    r01, r02, r03 = _dot(a0, a1) * i0, _dot(a0, a2) * i0, _dot(a0, a3) * i0
-    r04, r05 = _dot(a0, a4) * i0, _dot(a0, a5) * i0
-    a1, a2, a3 = _more(a1, -r01, a0), _more(a2, -r02, a0), _more(a3, -r03, a0)
-    a4, a5 = _more(a4, -r04, a0), _more(a5, -r05, a0)
-    n1 = _dot(a1, a1)
+    r01, r02, r03 = dot(a0, a1) * i0, dot(a0, a2) * i0, dot(a0, a3) * i0
+    r04, r05 = dot(a0, a4) * i0, dot(a0, a5) * i0
+    a1, a2, a3 = more(a1, -r01, a0), more(a2, -r02, a0), more(a3, -r03, a0)
+    a4, a5 = more(a4, -r04, a0), more(a5, -r05, a0)
+    n1 = dot(a1, a1)
     i1 = 1.0 / n1
     r12, r13, r14, r15 = (
-        _dot(a1, a2) * i1, _dot(a1, a3) * i1, _dot(a1, a4) * i1, _dot(a1, a5) * i1
+        dot(a1, a2) * i1, dot(a1, a3) * i1, dot(a1, a4) * i1, dot(a1, a5) * i1
     )  # fmt: skip
-    a2, a3 = _more(a2, -r12, a1), _more(a3, -r13, a1)
-    a4, a5 = _more(a4, -r14, a1), _more(a5, -r15, a1)
-    n2 = _dot(a2, a2)
+    a2, a3 = more(a2, -r12, a1), more(a3, -r13, a1)
+    a4, a5 = more(a4, -r14, a1), more(a5, -r15, a1)
+    n2 = dot(a2, a2)
     i2 = 1.0 / n2
-    r23, r24, r25 = _dot(a2, a3) * i2, _dot(a2, a4) * i2, _dot(a2, a5) * i2
-    a3, a4, a5 = _more(a3, -r23, a2), _more(a4, -r24, a2), _more(a5, -r25, a2)
-    n3 = _dot(a3, a3)
+    r23, r24, r25 = dot(a2, a3) * i2, dot(a2, a4) * i2, dot(a2, a5) * i2
+    a3, a4, a5 = more(a3, -r23, a2), more(a4, -r24, a2), more(a5, -r25, a2)
+    n3 = dot(a3, a3)
     i3 = 1.0 / n3
-    r34, r35 = _dot(a3, a4) * i3, _dot(a3, a5) * i3
-    a4, a5 = _more(a4, -r34, a3), _more(a5, -r35, a3)
-    n4 = _dot(a4, a4)
+    r34, r35 = dot(a3, a4) * i3, dot(a3, a5) * i3
+    a4, a5 = more(a4, -r34, a3), more(a5, -r35, a3)
+    n4 = dot(a4, a4)
     i4 = 1.0 / n4
-    r45 = _dot(a4, a5) * i4
-    a5 = _more(a5, -r45, a4)
-    n5 = _dot(a5, a5)
+    r45 = dot(a4, a5) * i4
+    a5 = more(a5, -r45, a4)
+    n5 = dot(a5, a5)
     least = SINGULAR * n0
     regular = (n1 > least) & (n2 > least) & (n3 > least) & (n4 > least) & (n5 > least)
     i, r = (i0, i1, i2, i3, i4, 1.0 / n5), (r01, r02, r03, r04, r05, r12)
@@ -107,7 +108,7 @@ def _factor(c: Array, f: Frames) -> tuple[Factor, bool]:
 
 
 @lean
-def _weighed(e: Six) -> Six:
+def weighed(e: Six) -> Six:
     """A twist with lengths in units of `kernels.LENGTH`."""
     return WEIGHT * e[0], WEIGHT * e[1], WEIGHT * e[2], e[3], e[4], e[5]
 
@@ -142,13 +143,13 @@ def _inverse_norm(factor: Factor) -> float:
 def _step(factor: Factor, e: Six) -> Six:
     """Joint step for a twist."""
     a0, a1, a2, a3, a4, a5, i, r, t, u = factor
-    e = _weighed(e)
-    y0 = _dot(a0, e) * i[0]
-    y1 = _dot(a1, e) * i[1]
-    y2 = _dot(a2, e) * i[2]
-    y3 = _dot(a3, e) * i[3]
-    y4 = _dot(a4, e) * i[4]
-    x5 = _dot(a5, e) * i[5]
+    e = weighed(e)
+    y0 = dot(a0, e) * i[0]
+    y1 = dot(a1, e) * i[1]
+    y2 = dot(a2, e) * i[2]
+    y3 = dot(a3, e) * i[3]
+    y4 = dot(a4, e) * i[4]
+    x5 = dot(a5, e) * i[5]
     x4 = y4 - u[2] * x5
     x3 = y3 - (u[0] * x4 + u[1] * x5)
     x2 = y2 - (t[3] * x3 + t[4] * x4 + t[5] * x5)
@@ -158,7 +159,7 @@ def _step(factor: Factor, e: Six) -> Six:
 
 
 @lean
-def _within(c: Array, x: Six, times: float) -> bool:
+def within(c: Array, x: Six, times: float) -> bool:
     """Whether no joint is shifted by more than so many times its bound."""
     b = LARGEST
     return bool(
@@ -172,7 +173,7 @@ def _within(c: Array, x: Six, times: float) -> bool:
 
 
 @lean
-def _turns_little(c: Array, at: int, q: Six) -> bool:
+def turns_little(c: Array, at: int, q: Six) -> bool:
     """Whether all angles are within the reach of their sines; False for NaN."""
     return bool(
         (abs(c[at + 1] + c[at + 7] * q[0]) <= LARGEST_ANGLE)
@@ -187,14 +188,14 @@ def _turns_little(c: Array, at: int, q: Six) -> bool:
 @lean
 def _two_steps(c: Array, q: Six, aim: Frame, x: Six) -> tuple[Six, Six, float, float, bool]:
     """Shift after two steps with one matrix, the residual before the last, the steps' squares."""
-    frames = walk(c, ACTUAL, _more(q, 1.0, x))
+    frames = walk(c, ACTUAL, more(q, 1.0, x))
     e, near = residual(aim, frames[6])
     factor, regular = _factor(c, frames)
     step = _step(factor, e)
-    x, before = _more(x, 1.0, step), _dot(step, step)
-    last, still_near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
+    x, before = more(x, 1.0, step), dot(step, step)
+    last, still_near = residual(aim, walk(c, ACTUAL, more(q, 1.0, x))[6])
     step = _step(factor, last)
-    return _more(x, 1.0, step), last, before, _dot(step, step), near & regular & still_near
+    return more(x, 1.0, step), last, before, dot(step, step), near & regular & still_near
 
 
 @lean
@@ -203,28 +204,43 @@ def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool]:
     aim = goal(c, q)
     frames = walk(c, ACTUAL, q)
     first, near = residual(aim, frames[6])
-    fine = near & _turns_little(c, 0, q) & _turns_little(c, ACTUAL, q)
+    fine = near & turns_little(c, 0, q) & turns_little(c, ACTUAL, q)
     # of no more than this nothing is left to do, and nothing is done
-    fine &= _dot(first, first) > AT_GOAL * AT_GOAL * N
+    fine &= dot(first, first) > AT_GOAL * AT_GOAL * N
     factor, regular = _factor(c, frames)
     x = _step(factor, first)
-    weighed = _weighed(first)
-    square = lambda_square(_dot(weighed, weighed), c[DAMPING], c[DAMPING + 1])
+    e = weighed(first)
+    square = lambda_square(dot(e, e), c[DAMPING], c[DAMPING + 1])
     fine &= regular & (WINDOW * square * _inverse_norm(factor) <= 1.0)
-    e, near = residual(aim, walk(c, ACTUAL, _more(q, 1.0, x))[6])
+    e, near = residual(aim, walk(c, ACTUAL, more(q, 1.0, x))[6])
     step = _step(factor, e)
-    length, along = _dot(x, x), _dot(x, step)
-    fine &= near & (along <= AHEAD * length) & (_dot(step, step) <= BESIDE * BESIDE * length)
-    x, _, _, _, good = _two_steps(c, q, aim, _more(x, 1.0, step))
+    length, along = dot(x, x), dot(x, step)
+    fine &= near & (along <= AHEAD * length) & (dot(step, step) <= BESIDE * BESIDE * length)
+    x, _, _, _, good = _two_steps(c, q, aim, more(x, 1.0, step))
     fine &= good
     x, last, before, size, good = _two_steps(c, q, aim, x)
-    fine &= good & (before <= NEAR * NEAR) & (size <= SHORT * SHORT) & _within(c, x, FAR)
+    fine &= good & (before <= NEAR * NEAR) & (size <= SHORT * SHORT) & within(c, x, FAR)
     return x, first, last, fine
 
 
 @lean
 def _length(x: float, y: float, z: float) -> float:
     return float(np.sqrt(x * x + y * y + z * z))
+
+
+@lean
+def write(
+    x: Six, first: Six, last: Six, fine: bool, weak: bool, k: int, lanes: int, out: Array
+) -> None:
+    """Corrected joints of point ``k`` of ``lanes``, with their report."""
+    out[k], out[lanes + k], out[2 * lanes + k] = x[0], x[1], x[2]
+    out[3 * lanes + k], out[4 * lanes + k], out[5 * lanes + k] = x[3], x[4], x[5]
+    out[POSITION_LEFT * lanes + k] = _length(last[0], last[1], last[2])
+    out[ROTATION_LEFT * lanes + k] = _length(last[3], last[4], last[5])
+    out[FINE * lanes + k] = 1.0 if fine else 0.0
+    out[WEAK * lanes + k] = 1.0 if weak else 0.0
+    out[TCP_SHIFT * lanes + k] = _length(first[0], first[1], first[2])
+    out[TCP_ROTATION * lanes + k] = _length(first[3], first[4], first[5])
 
 
 @lean
@@ -235,24 +251,17 @@ def _correct(c: Array, q: Array, k: int, lanes: int, out: Array) -> None:
         q[3 * lanes + k], q[4 * lanes + k], q[5 * lanes + k],
     )  # fmt: skip
     x, first, last, fine = _solve(c, at)
-    out[k], out[lanes + k] = at[0] + x[0], at[1] + x[1]
-    out[2 * lanes + k], out[3 * lanes + k] = at[2] + x[2], at[3] + x[3]
-    out[4 * lanes + k], out[5 * lanes + k] = at[4] + x[4], at[5] + x[5]
-    out[POSITION_LEFT * lanes + k] = _length(last[0], last[1], last[2])
-    out[ROTATION_LEFT * lanes + k] = _length(last[3], last[4], last[5])
-    out[FINE * lanes + k] = 1.0 if fine else 0.0
-    out[TCP_SHIFT * lanes + k] = _length(first[0], first[1], first[2])
-    out[TCP_ROTATION * lanes + k] = _length(first[3], first[4], first[5])
+    write(more(at, 1.0, x), first, last, fine, False, k, lanes, out)
 
 
 @kernel
 def correct_one(c: Array, q: Array, out: Array) -> None:
-    """Corrected joints of one point (6,) and its report: ``out`` (11,)."""
+    """Corrected joints of one point (6,) and its report: ``out`` (12,)."""
     _correct(c, q, 0, 1, out)
 
 
 @kernel
 def correct_lanes(c: Array, q: Array, out: Array) -> None:
-    """`correct_one` for sixteen points: ``q`` (96,) and ``out`` (176,), joint by joint."""
+    """`correct_one` for sixteen points: ``q`` (96,) and ``out`` (192,), joint by joint."""
     for k in range(LANES):
         _correct(c, q, k, LANES, out)

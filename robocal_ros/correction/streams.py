@@ -97,6 +97,10 @@ class TargetStream:
         period = self.period_s
         return period if period > 0.0 else LONGEST_STEP_S
 
+    def is_due(self, now_s: float, periods: float) -> bool:
+        """Whether its last message came so long ago."""
+        return now_s - self._came_s > periods * self._step_period_s()
+
     def _holds(self, elapsed_s: float) -> bool:
         """Whether the robot stands, as nothing went out for so long: the controller holds."""
         return elapsed_s > HELD_PERIODS * self._step_period_s()
@@ -149,15 +153,20 @@ class TargetStream:
         self._index = index
 
     def _look_after_pause(self, q: Array, pause_s: float, now_s: float) -> None:
-        """Go on after a pause only where the robot can be there soon; else a new begin."""
+        """Go on after a pause only where the robot is where it was left, and can be there soon.
+
+        Else it is a new begin.
+        """
         chosen = self._active > 0.0
         self._state.require_fresh(np.flatnonzero(chosen), now_s)
+        output, near = self._output, self._config.start_near(self._arm)[chosen]
+        place, _ = output.place(np.flatnonzero(chosen), output.out[chosen], now_s)
         speed = np.zeros(self._arm.n)
         if self._interval_s > 0.0:
             speed = np.abs(self._goal - self._last) / self._interval_s
         spare = np.maximum(self._fastest - speed, 0.0)[chosen] * CATCH_UP_S
-        ahead = np.abs(q - self._output.taught)[chosen]
-        if pause_s > RESUME_S or np.any(ahead > spare + self._config.start_near(self._arm)[chosen]):
+        ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
+        if pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):
             self.phase = Phase.IDLE
 
     def _begin(self, new: Index, q: Array, now_s: float) -> None:
@@ -172,9 +181,15 @@ class TargetStream:
         if self.phase is Phase.IDLE:
             output.out_s = now_s
 
+    def come_to_rest(self, now_s: float) -> None:
+        """The offset stands where nothing went out for so long that the controller holds."""
+        if self.phase is not Phase.ENDING and self._holds(now_s - self._output.out_s):
+            self._output.limiter.state[OFFSET_RATE] = 0.0
+
     def _advance(self, now_s: float) -> None:
         """Put out what came in last, or as much of the way there as the speeds allow."""
         output = self._output
+        self.come_to_rest(now_s)
         elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
         self._spare[:] = output.out
         limits = self._limits
@@ -311,8 +326,7 @@ class TargetStream:
             return None
         if self.phase is Phase.ENDING:
             return self._slowed(self._command, now_s)
-        late = now_s - self._came_s > 1.5 * self._step_period_s()
-        if self.phase is Phase.RUNNING and self.lag_s > 0.0 and late:
+        if self.phase is Phase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
             command = replace(self._command, position=self._goal[self._index], velocity=None)
             self._note_way(self._goal.copy(), now_s)
             self._advance(now_s)

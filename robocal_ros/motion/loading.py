@@ -1,5 +1,6 @@
 """Loads what a motion needs, so that the first one does not wait for it while a robot moves."""
 
+import inspect
 from contextlib import suppress
 
 import numpy as np
@@ -16,6 +17,8 @@ def load_motion(arm: SerialArm) -> None:
     """Call once what is compiled or imported at its first use: half a second."""
     import scipy.special  # noqa: F401
 
+    if (frame := inspect.currentframe()) is not None:
+        inspect.getframeinfo(frame)  # rclpy's logger does: its first line would take 60 ms
     q = np.full(arm.n, 0.3)
     time = np.linspace(0.0, 0.1, FEWEST_READINGS)
     JointPath(arm, time, np.tile(q, (len(time), 1))).at(np.array([0.05]))

@@ -71,6 +71,12 @@ class JointPlan:
         speed = np.maximum(np.max(np.abs(self.qd), axis=0), np.max(np.abs(vertex), axis=0))
         return speed, np.max(np.maximum(np.abs(first), np.abs(last)), axis=0)
 
+    def going_on(self, lead_s: float) -> "JointPlan":
+        """The same way after a time at the speed of its begin, and so much further on."""
+        further = np.concatenate([self.q[:1], self.q + lead_s * self.qd[0]])
+        rates = (np.concatenate([part[:1], part]) for part in (self.qd, self.qdd))
+        return JointPlan(np.concatenate([[0.0], self.time_s + lead_s]), further, *rates)
+
     def points(self, spacing_s: float = 0.0) -> tuple[Array, Array, Array]:
         """Times (k,), joints and velocities (k, n) that a controller is sent.
 

@@ -15,6 +15,7 @@ from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.measuring import start_near
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.silence import Silence
+from robocal_ros.motion.speed_scaling import TOLD_S
 
 Array = NDArray[np.float64]
 
@@ -25,11 +26,11 @@ BACK_S = 1.0  # stamps that go back by more began anew
 FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 AS_NEAR = 0.01  # of the allowed deviation: what no reading tells apart
 APART_S = 0.00375  # instants of the plan that a reading is compared with
-TOLD_S = 1.0  # a speed scaling that was not said again for so long is not known
 REFERENCE_S = 0.1  # a controller's place that is older is none
 JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
 UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
 PAUSED_S = 15.0  # a robot that stands on its path is waited for so long where no scaling is known
+LAG_S = 0.03  # of drives behind their controller; what is later began later
 NEARLY_S = 0.5  # before its end a plan may bend back to where it has been
 NEAR_REFERENCE_RAD = 1e-3  # a reference so near to the plan tells the plan's clock
 
@@ -65,7 +66,7 @@ class RobotWatch:
     Attributes
     ----------
     silence : how long no new reading came.
-    scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it.
+    scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it lately.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
@@ -90,6 +91,8 @@ class RobotWatch:
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,); ``stamp_s`` on their own clock."""
+        if self.scaling != 1.0 and not self.scaling_known(now_s):
+            self._driven_s, self._at_s, self.scaling = self.driven_s(now_s), now_s, 1.0
         if self._readings and stamp_s <= self._readings[-1][0]:
             if stamp_s > self._readings[-1][0] - BACK_S:
                 return  # a clock that stands still is heard as silence
@@ -294,6 +297,7 @@ class RobotWatch:
 
         The controller's, where it tells them; the plan's, where the robot keeps to it in time:
         readings lag behind what the controller commands; a stop from there would throw it back.
+        A motion that reached the controller late is ahead of it: from there it would be hurried.
         One that does not keep to its plan is where most of its last readings have it (Theil-Sen:
         the medians of the slopes of all pairs, and of where each reading puts it): a stop from a
         single wild reading would be a motion of its own. A robot that pauses is held where it is.
@@ -301,9 +305,9 @@ class RobotWatch:
         paused = self.scaling == 0.0
         if not paused and keeps and (reference := self.reference(now_s)) is not None:
             return reference
-        in_time = self.late_s(now_s) <= self._driving.late_s
-        if self._plan is not None and keeps and in_time and not paused:
-            return self._plan.at(self.driven_s(now_s))
+        late_s = self.late_s(now_s)
+        if self._plan is not None and keeps and late_s <= self._driving.late_s and not paused:
+            return self._plan.at(self.driven_s(now_s) - max(late_s - LAG_S, 0.0))
         times, q = self._latest()
         velocity = np.zeros(q.shape[1])
         if times[0] <= times[-1] - VELOCITY_S and not paused:

@@ -120,14 +120,16 @@ def require_limits(arm: SerialArm, config: DrivingConfig) -> None:
 
 
 def trajectory_message(
-    plan: JointPlan, names: Sequence[str], *, spacing_s: float = 0.0
+    plan: JointPlan, names: Sequence[str], *, spacing_s: float = 0.0, at_once: bool = False
 ) -> JointTrajectory:
     """A plan for a trajectory controller, which begins when it arrives.
 
-    ``spacing_s``: as `JointPlan.points`; then positions alone.
+    ``spacing_s``: as `JointPlan.points`; then positions alone. ``at_once``: from the plan's begin
+    on, for a message whose stamp says when that is.
     """
     message = JointTrajectory(joint_names=list(names))
-    for t, q, qd in zip(*(part.tolist() for part in plan.points(spacing_s)), strict=True):
+    parts = (plan.time_s, plan.q, plan.qd) if at_once else plan.points(spacing_s)
+    for t, q, qd in zip(*(part.tolist() for part in parts), strict=True):
         ns = round(t * NS)
         message.points.append(
             JointTrajectoryPoint(

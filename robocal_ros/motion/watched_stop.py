@@ -14,9 +14,10 @@ from robocal_ros.motion.robot_watch import REST_RAD, VELOCITY_S, RobotWatch
 from robocal_ros.motion.stopping import stop
 
 STANDS_S = 0.1  # a robot that has rested for so long stands
-# From a message to what the controller says of it (10 ms measured, a cycle), and to readings that
-# show it: drives lag by some 15 ms, and a speed is of readings that are half a span old.
-SEEN_S = {True: 0.02, False: 0.045}
+# From a message to what the controller says of it (10 ms measured, a cycle, 10 ms at the speed
+# before), and to readings that show it: drives lag by some 15 ms, and a speed is of readings that
+# are half a span old.
+SEEN_S = {True: 0.03, False: 0.045}
 SLOW = 2.0 * REST_RAD / VELOCITY_S  # rad/s (m/s); of a robot that rests readings may say so much
 SEEN = 0.08  # a planned loss of speed by this share must show, by half at least
 AGAIN_S = 0.02  # a stop that is rejected is not sent again sooner

@@ -67,5 +67,6 @@ def told_correction(message: Any) -> ToldCorrection:
         waiting_tool_revision=message.waiting_tool_revision if message.tool_waits else None,
         stale=message.stale,
         mismatch=message.mismatch,
+        commanders=message.commanders,
         last_refusal=message.last_refusal,
     )

@@ -33,8 +33,9 @@ def drifted(size: float, seed: int = 0) -> SerialArm:
     return NOMINAL.with_mdh(chosen.add(NOMINAL.mdh, size * change))
 
 
-def bent(arm: SerialArm) -> SerialArm:
-    change = frames.transform(frames.exp_rotation([0.0, np.radians(1.0), 0.0]), [3e-3, 0.0, 0.0])
+def bent(arm: SerialArm, shift_m: float = 3e-3, turn_deg: float = 1.0) -> SerialArm:
+    turn = frames.exp_rotation([0.0, np.radians(turn_deg), 0.0])
+    change = frames.transform(turn, [shift_m, 0.0, 0.0])
     return replace(arm, T_flange_tool=arm.T_flange_tool @ change)
 
 
@@ -135,7 +136,7 @@ def test_what_bounds_it_is_named() -> None:
 
 def test_where_no_bound_is_near_it_is_the_whole_correction() -> None:
     q = path_through(HOME, m=50)
-    arm = bent(drifted(1.0))
+    arm = bent(drifted(1.0), 0.5e-3, 0.1)
     config = replace(CONFIG, policy=Policy.REFUSE)
     packed = pack_model(arm)
     plain = correction_between(pack_model(NOMINAL), packed, NOMINAL, config)

@@ -1,6 +1,7 @@
 """Whatever happens in whatever order: offset and commands move within their limits in time."""
 
 import numpy as np
+import pytest
 from correction_robot import (
     DT,
     FASTEST,
@@ -108,7 +109,7 @@ def happen(robot: Robot, watch: Watch, what: str, seed: int, revision: int, q: n
     elif what == "pause":
         robot.rest(0.3 + 0.3 * seed)
     elif what == "backwards":
-        robot.session._stamps["target", ()] = 10**18
+        robot.session._stamps["target", ()] = 10**18, robot.now
         with np.testing.assert_raises(RefusedError):
             robot.stream(q, stamp_ns=10**18 - 10**6)
         robot.session._stamps.clear()
@@ -401,6 +402,19 @@ def test_jitter_moves_nothing_faster() -> None:
         robot.stream(q, dt=float(DT + late[i + 1] - late[i]))
         watch.out(NAMES, robot.at)
         assert robot.session.status().lag_s <= 2.0 * DT
+
+
+@pytest.mark.parametrize("period_s", [DT, 0.2])
+def test_a_stream_that_hardly_moves_is_followed(period_s: float) -> None:
+    """Its targets lie nearer to what went out before than any tolerance could tell."""
+    robot = large()
+    robot.settle()
+    q = HOME.copy()
+    for _ in range(300):
+        q = q + 1e-7
+        offset = robot.stream(q, dt=period_s) - q
+        assert np.all(offset != 0.0)
+    assert robot.session.status().refused == {}
 
 
 def test_a_last_message_that_came_late_is_still_reached() -> None:

@@ -81,6 +81,17 @@ def test_a_cell_without_a_correction_says_so(graph):
     Line(graph, correction_silent_s=0.0).reads(AccuracyState.OK)
 
 
+def test_who_commands_past_the_correction_is_named_to_the_line(graph):
+    in_force(graph)
+    line = Line(graph)
+    mine = {"robot": ARM.name, "serial": "K7", "enabled": True, "model_revision": 1}
+    other = CorrectionStatus(
+        **mine, state=CorrectionStatus.OTHER_COMMANDER, commanders="planner publishes targets"
+    )
+    graph.publisher(CorrectionStatus, CORRECTION, qos.LATCHED).publish(other)
+    line.reads(AccuracyState.DEGRADED, "puts nothing out, planner publishes targets: end them")
+
+
 def test_what_cannot_be_of_this_correction_does_not_count(graph):
     line = Line(graph)
     correction = graph.publisher(CorrectionStatus, CORRECTION, qos.LATCHED)

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from maintenance_live import HOME_DEG, ROBOT, SERIAL, LiveCell
@@ -46,7 +45,6 @@ def test_two_maintenance_nodes_of_two_hosts_refuse_until_one_is_gone(
     graph.spin_until(lambda: plc.run("c2").success, "the one that is left works")
 
 
-@pytest.mark.cell
 def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -> None:
     cell = LiveCell(graph, tmp_path)
     graph.probe.destroy_publisher(cell.drive)

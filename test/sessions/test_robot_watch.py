@@ -5,11 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.housing import Housing, ToolBody
 from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.plan import LEAD_S
 from robocal_ros.motion.robot_watch import LEAST, RobotWatch
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
+from robocal_ros.motion.travel import joint_way
 from robocal_ros.storage.robots import load_robot
 
 ARM = load_robot("kr150_r3100")
@@ -85,3 +88,37 @@ def test_a_span_that_rounding_ends_before_the_first_reading_is_not_there_yet():
     assert not watch.tells_speed(1.0)
     watch.reading(0.05, HOME, 0.05)
     assert watch.resting(span_s) == pytest.approx(HOME, abs=0.0)
+
+
+@given(late_s=st.floats(0.0, 0.12), lag_s=st.floats(0.0, 0.03), drives_s=st.floats(0.5, 0.9))
+def test_a_stop_of_a_motion_that_began_late_hurries_no_joint(
+    late_s: float, lag_s: float, drives_s: float
+) -> None:
+    """Nothing but readings; drives that lag by no more than usual are not thrown back either."""
+    limits = MotionLimits(tcp_speed_m_s=0.25)
+    cell = MotionCell(
+        ARM, ToolBody(np.eye(4), 0.1, 0.008, 0.05), np.eye(4), DRIVING.housing, limits
+    )
+    plan = joint_way(cell, HOME, HOME + 0.1 * np.array([1.0, -0.3, 0.2, 0.5, -0.4, 0.1]))
+    now_s = drives_s * plan.duration_s + late_s
+    watch = RobotWatch(ARM, DRIVING)
+    watch.follow(plan, cell, 0.0)
+    for at_s in np.arange(-0.2, now_s, 0.004):
+        watch.reading(at_s, plan.at(max(at_s - late_s - lag_s, 0.0))[0], at_s)
+        watch.away()
+    found, velocity = watch.state(now_s, keeps=True)
+    command, _ = plan.at(now_s - late_s)
+    ahead_s = (found - command)[0] / velocity[0]
+    # of the first line of the stop, which goes on so much faster
+    assert -lag_s - 0.01 < ahead_s < 0.8 * LEAD_S
+
+
+def test_a_scaling_that_is_not_told_again_is_as_planned():
+    """Finding: one that had died at 0 was believed for ever."""
+    watch = seen(*steady(0.008, 0.0 * FASTEST))
+    begin_s = watch.newest[0]
+    watch.scaled(0.0, begin_s)
+    for count in range(1, 400):
+        watch.reading(begin_s + 0.008 * count, HOME, begin_s + 0.008 * count)
+        assert watch.scaling == float(0.008 * count > 1.0)
+    assert watch.driven_s(begin_s + 3.2) - watch.driven_s(begin_s + 2.2) == pytest.approx(1.0)

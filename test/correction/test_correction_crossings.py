@@ -1,0 +1,172 @@
+"""A bent tool near singular postures: never much further off than it is bent, exact elsewhere."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from correction_robot import FASTEST, LARGEST_A, ROUNDING
+
+from robocal_ros.core import frames
+from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.correction.joint_correction import JointCorrection, pack_model
+from robocal_ros.correction.kernels import LENGTH
+from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimiter
+from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.correction.straight import ITERATIONS
+from robocal_ros.storage.robots import load_robot
+
+TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
+BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])
+DT = 0.004
+CROSSED = {"wrist": 4, "elbow": 2, "shoulder": 1}  # the joint that crosses it
+SHIFT_M, TURN_DEG = 2e-3, 0.5
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
+
+
+def jacobian(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    """At the tool, with the units of the damping."""
+    J = arm.jacobian(q)
+    lever = (arm.fk(q)[:, :3, :3] @ arm.T_flange_tool[:3, 3])[..., None]
+    J[:, :3] = (J[:, :3] + np.cross(J[:, 3:], lever, axis=1)) / LENGTH
+    return np.asarray(J)
+
+
+def bent(arm: SerialArm, rng: np.random.Generator, shift_m: float, turn_deg: float) -> SerialArm:
+    direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
+    change = frames.transform(frames.exp_rotation(axis * np.radians(turn_deg)), shift_m * direction)
+    return replace(arm, T_flange_tool=arm.T_flange_tool @ change)
+
+
+def staged(taught: SerialArm, actual: SerialArm) -> StagedCorrection:
+    return StagedCorrection(pack_model(taught), pack_model(actual), *BOUNDS)
+
+
+def place(arm: SerialArm, q: np.ndarray) -> np.ndarray:
+    return np.asarray((arm.fk(q) @ arm.T_flange_tool)[:, :3, 3])
+
+
+def ways(
+    arm: SerialArm, joint: int, speed: float, rng: np.random.Generator
+) -> Iterator[np.ndarray]:
+    """Random ones of all joints, ``joint`` the fastest, through a singularity in their middle."""
+    t = np.arange(-round(np.pi / 8.0 / speed / DT), round(np.pi / 4.0 / speed / DT)) * DT
+    while True:
+        q = np.tile(rng.uniform(-2.0, 2.0, arm.n), (2001, 1))
+        q[:, 4] = np.where(joint == 4, 0.0, np.pi / 3.0)
+        if joint != 4:
+            q[:, joint] = np.linspace(-2.0, 2.0, len(q))
+            sign = np.sign(np.linalg.det(jacobian(arm, q)))
+            q = q[:-1][sign[1:] != sign[:-1]]
+        if len(q) and np.linalg.svd(jacobian(arm, q[:1]), compute_uv=False)[0, 4] > 0.25:
+            way = rng.uniform(-1.0, 1.0, arm.n)
+            way[joint] = rng.choice([-1.0, 1.0])
+            yield q[0] + speed * t[:, None] * way
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "turn_deg", "speed_deg_s", "most_m"),
+    [
+        (SHIFT_M, TURN_DEG, 60.0, 7e-3),
+        (SHIFT_M, TURN_DEG, 150.0, 7e-3),
+        (9e-3, 3.5, 60.0, 14e-3),
+        (9e-3, 3.5, 150.0, 27e-3),  # nearly as much as may be corrected, and as fast as it can
+    ],
+)
+@pytest.mark.parametrize("crossed", CROSSED)
+def test_no_crossing_takes_a_bent_tool_much_further_off_than_it_is_bent(
+    crossed: str, shift_m: float, turn_deg: float, speed_deg_s: float, most_m: float
+) -> None:
+    rng, taught = np.random.default_rng(1), replace(load_robot("kr150_r3100"), T_flange_tool=TOOL)
+    paths, worst, weak = ways(taught, CROSSED[crossed], np.radians(speed_deg_s), rng), 0.0, False
+    for _ in range(25):
+        q, actual = next(paths), bent(taught, rng, shift_m, turn_deg)
+        found = staged(taught, actual).correct(q)
+        assert found.tool is not None
+        assert found.tool.converged.all()
+        weak |= bool(found.weak.any())
+        wanted = found.q - q
+        limiter = OffsetLimiter(np.zeros(6, dtype=np.bool_), TURNING, SLIDING)
+        limiter.state[OFFSET] = wanted[0]
+        speed = np.full(len(q), np.radians(speed_deg_s))
+        offset, _ = limiter.follow(wanted, np.arange(len(q)) * DT, speed, np.ones(6))
+        rate = np.diff(offset, axis=0) / DT
+        assert np.abs(rate).max() <= FASTEST + ROUNDING
+        assert np.abs(np.diff(rate[1:], axis=0)).max() <= LARGEST_A * DT + ROUNDING
+        off = np.linalg.norm(place(actual, q + offset) - place(taught, q), axis=1)
+        worst = max(worst, float(off.max()))
+    assert weak
+    assert worst <= most_m
+
+
+def test_in_ordinary_postures_a_bent_tool_is_where_it_was_taught() -> None:
+    """Some 12 deg from a wrist singularity, and where the position alone is not singular."""
+    rng, taught = np.random.default_rng(2), replace(load_robot("kr150_r3100"), T_flange_tool=TOOL)
+    q = rng.uniform(-2.0, 2.0, (4000, 6))
+    J = jacobian(taught, q)
+    least, of_position = (np.linalg.svd(x, compute_uv=False)[:, -1] for x in (J, J[:, :3]))
+    q = q[(least > 0.2) & (of_position > 0.5)]
+    assert len(q) > 2000
+    for _ in range(5):
+        actual = bent(taught, rng, SHIFT_M, TURN_DEG)
+        found = staged(taught, actual).correct(q)
+        off = np.linalg.norm(place(actual, found.q) - place(taught, q), axis=1)
+        assert off.max() < 1e-9
+        assert found.tool is not None
+        assert np.median(found.tool.rotation_error_rad) < 0.01 * np.radians(TURN_DEG)
+
+
+def test_another_model_in_motion_takes_nothing_back_of_what_is_corrected() -> None:
+    """What the desired offset does in one step is no motion that is too fast to follow."""
+    limiter, small = OffsetLimiter(np.zeros(1, dtype=np.bool_), TURNING, SLIDING), np.radians(0.05)
+    t = np.arange(0.0, 1.0, DT)
+    wanted = np.radians(0.2) * (1.0 + 0.2 * np.sin(2.0 * t))
+    wanted[100:] += small
+    limiter.state[OFFSET] = wanted[0]
+    offset, _ = limiter.follow(wanted[:, None], t, np.ones(len(t)), np.ones(1))
+    assert np.abs(offset[:100, 0] - wanted[:100]).max() < 1e-3 * small
+    assert np.all(wanted[100:] - offset[100:, 0] <= small * 1.001)
+    assert np.all(np.diff((wanted - offset[:, 0])[100:]) <= ROUNDING)
+    assert offset[-1, 0] == wanted[-1]
+
+
+def damping(M: np.ndarray, square: np.ndarray) -> np.ndarray:
+    """Of symmetric matrices (m, 3, 3): equation 2 of `joint_correction`."""
+    s, U = np.linalg.eigh(M)
+    rest = np.clip(1.0 - s / (3.0 * square[:, None]), 0.0, None)
+    return np.asarray((U * (square[:, None] * rest**3)[:, None, :]) @ np.swapaxes(U, 1, 2))
+
+
+def test_many_weak_points_are_solved_at_once_by_the_equations() -> None:
+    """All take the same steps, sixteen at a time; e(q') = D y holds to rounding."""
+    rng, taught = np.random.default_rng(3), replace(load_robot("kr150_r3100"), T_flange_tool=TOOL)
+    change = rng.standard_normal(taught.mdh.shape) * 3e-5 * (taught.mdh != 0.0)
+    actual, b, slope = taught.with_mdh(taught.mdh + change), np.radians(0.24), 1.0 / 60.0
+    q = rng.uniform(-2.0, 2.0, (3000, 6))
+    q[:300, 4] = rng.uniform(-0.02, 0.02, 300)
+    found = JointCorrection.between(taught, actual, b, slope=slope).correct(q)
+    assert found.converged.all()
+    assert 600 < np.count_nonzero(found.weak) < 2400
+    assert np.all(found.iterations == ITERATIONS)
+
+    def miss(at: np.ndarray) -> np.ndarray:
+        goal, T = taught.fk(q) @ TOOL, actual.fk(at) @ TOOL
+        turn = frames.log_rotation(goal[:, :3, :3] @ np.swapaxes(T[:, :3, :3], 1, 2))
+        return np.concatenate([(goal - T)[:, :3, 3] / LENGTH, turn], axis=1)
+
+    def square(e: np.ndarray) -> np.ndarray:
+        size = np.sqrt(np.sum(e**2, axis=1) + 1e-12)
+        return np.asarray(size * np.hypot(1.0 / slope, 0.3 * size / b**2))
+
+    e, J = miss(q), jacobian(actual, q)
+    M, D = J @ np.swapaxes(J, 1, 2), np.zeros((len(q), 6, 6))
+    D[:, :3, :3] = damping(M[:, :3, :3], square(e[:, :3]))
+    turns = np.linalg.solve(M[:, :3, :3] + D[:, :3, :3], M[:, :3, 3:])
+    D[:, 3:, 3:] = damping(M[:, 3:, 3:] - M[:, 3:, :3] @ turns, square(e))
+    assert np.array_equal(found.weak, np.abs(D).max(axis=(1, 2)) > 0.0)
+    regular = np.linalg.cond(J) < 1e4
+    y = np.linalg.solve(np.swapaxes(J, 1, 2), found.joint_shift[..., None])
+    left = (D @ y)[..., 0] - miss(found.q)
+    assert np.count_nonzero(regular & found.weak) > 600
+    assert np.abs(left[regular]).max() < 1e-9 * np.abs(e).max()

@@ -1,0 +1,155 @@
+"""What comes after a pause, another's motion, a wrong clock or a rejected goal: never a jump."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from correction_robot import (
+    DT,
+    HOME,
+    LIMITS,
+    NAMES,
+    NOMINAL,
+    REST,
+    REST_A,
+    ROUNDING,
+    Robot,
+    bent_tool,
+    drifted,
+    large,
+    offer,
+    refused,
+    still,
+    swing,
+)
+
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.session import CorrectionSession
+
+PAUSES_S = 0.2, 0.5, 0.8
+
+
+def left_in_motion() -> tuple[Robot, np.ndarray]:
+    """A stream that ended by silence while its offset moved, near a bent wrist."""
+    robot = Robot()
+    robot.session.offer_model(offer(drifted()))
+    robot.session.offer_tool(bent_tool())
+    robot.session.enable(True)
+    robot.settle()
+    q, speed = HOME.copy(), 0.0
+    while q[4] > 0.2:
+        speed = min(speed + 1.5 * DT, 1.5)
+        q = q + np.array([0.0, 0.0, 0.0, 1.0, -1.0, -0.5]) * speed * DT
+        robot.stream(q)
+    return robot, q
+
+
+@pytest.mark.parametrize("pause_s", PAUSES_S)
+@pytest.mark.parametrize("told", [False, True])
+def test_a_robot_that_was_moved_in_a_pause_is_not_thrown_back(pause_s: float, told: bool) -> None:
+    robot = large()
+    robot.settle()
+    moved, steps = np.radians(5.0), round(pause_s / 2 / 0.01)
+    for k in range(2 * steps):
+        robot.now += 0.01
+        robot.at = robot.at + (moved / steps if k < steps else 0.0)
+        robot.read(robot.at)
+        if told:
+            robot.session.controller(NAMES, robot.at, 1.0, robot.now)
+    refused(Reason.START_MISMATCH, robot.stream, HOME)
+
+
+@pytest.mark.parametrize("pause_s", PAUSES_S)
+def test_a_robot_that_stayed_goes_on_after_a_pause(pause_s: float) -> None:
+    robot = large()
+    robot.settle()
+    at = robot.at
+    robot.rest(pause_s)
+    assert np.array_equal(robot.stream(HOME), at)
+
+
+@pytest.mark.parametrize("rest_s", [0.3, 30.0])
+def test_a_trajectory_after_a_stream_begins_with_an_offset_at_rest(rest_s: float) -> None:
+    robot, q = left_in_motion()
+    robot.rest(rest_s)
+    times = np.linspace(0.0, 3.0, 301)
+    out = robot.session.trajectory(
+        TrajectoryCommand(NAMES, np.tile(q, (301, 1)), times), robot.now
+    ).position
+    rates = np.diff(out, axis=0) / times[1]
+    assert np.abs(rates).max() <= REST + ROUNDING
+    assert np.abs(rates[0]).max() <= REST_A * times[1] + ROUNDING
+    assert np.abs(np.diff(rates, axis=0)).max() <= REST_A * times[1] + 2 * ROUNDING / times[1]
+
+
+def test_a_stream_that_goes_on_begins_with_an_offset_at_rest() -> None:
+    robot, q = left_in_motion()
+    robot.rest(0.5)
+    before = robot.at
+    assert np.abs(robot.stream(q) - before).max() <= REST_A * DT * DT + ROUNDING
+
+
+def test_a_turn_that_the_controller_counts_is_no_start() -> None:
+    """What drives a joint without limits does not wrap: a whole turn is a whole turn."""
+    free = np.array([False] * 5 + [True])
+    arm = replace(
+        NOMINAL,
+        lower=np.where(free, -np.inf, NOMINAL.lower),
+        upper=np.where(free, np.inf, NOMINAL.upper),
+    )
+    session = CorrectionSession(arm, arm, "s1", CorrectionConfig(**LIMITS))
+    session.reading(JointCommand(NAMES, HOME), 100.0)
+    session.controller(NAMES, HOME, 1.0, 100.0)
+    turned = HOME + 4.0 * np.pi * free
+    refused(Reason.START_MISMATCH, session.target, JointCommand(NAMES, turned), 100.0)
+    session.acknowledge()
+    refused(Reason.START_MISMATCH, session.trajectory, still(turned), 100.0)
+
+
+def test_a_stamp_far_ahead_bars_no_message_after_it() -> None:
+    robot, q, stamp = Robot(), HOME.copy(), 10**18
+    for k in range(500):
+        q[0] += np.radians(60.0) * DT * min(k / 100.0, 1.0)
+        stamp += round(DT * 1e9)
+        robot.stream(q, stamp_ns=stamp + (900_000_000 if k == 250 else 0))
+    assert robot.session.status().refused == {}
+
+
+def test_a_clock_that_was_set_back_ends_a_stream_in_order() -> None:
+    robot, q, stamp = Robot(), HOME.copy(), 10**18
+    for k in range(200):
+        q[0] += np.radians(60.0) * DT * min(k / 100.0, 1.0)
+        stamp += round(DT * 1e9)
+        robot.stream(q, stamp_ns=stamp)
+    refused(Reason.TIME_BACKWARDS, robot.stream, q, stamp_ns=stamp - 500_000_000)
+    assert robot.session.stream.has_tail
+    speeds = [np.radians(60.0)]
+    while (command := robot.session.stream.tail(robot.now)) is not None:
+        speeds.append((command.position[0] - robot.at[0]) / DT)
+        robot.go(command)
+        robot.now += DT
+    slower = -np.diff(speeds[1:])
+    assert np.all(slower <= LIMITS["acceleration_limits"][0] * DT + 2 * ROUNDING / DT)
+    assert abs(speeds[-1]) <= LIMITS["acceleration_limits"][0] * DT
+
+
+def test_a_goal_that_was_rejected_breaks_no_stream() -> None:
+    robot = large()
+    robot.settle()
+    q = HOME.copy()
+    for _ in range(100):
+        q[0] += np.radians(20.0) * DT
+        before = robot.stream(q)
+    goal = swing()
+    goal = replace(
+        goal, position=goal.position + (q - HOME), time_from_start_s=goal.time_from_start_s
+    )
+    robot.session.trajectory(goal, robot.now, may_be_rejected=True)
+    path = robot.session.output.path
+    assert path is not None
+    robot.session.reject(path)
+    q[0] += np.radians(20.0) * DT
+    step = robot.stream(q) - before
+    assert step[0] == pytest.approx(np.radians(20.0) * DT, rel=0.01)

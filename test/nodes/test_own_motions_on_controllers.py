@@ -1,0 +1,289 @@
+"""Motions of our own nodes, judged by what a trajectory controller, real or simulated, commands.
+
+The real one is looked for in the environment; without it those tests are skipped.
+"""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from action_msgs.srv import CancelGoal
+from control_msgs.msg import JointTrajectoryControllerState
+from own_motions import DEEP
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_controllers import (
+    CONTROLLERS,
+    HOME,
+    NAMES,
+    NODE,
+    Controlled,
+    seconds,
+    trajectory,
+)
+from trajectory_msgs.msg import JointTrajectory
+
+STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
+ACTION = f"/{NODE}/follow_joint_trajectory"
+REST = np.zeros(6)
+SCRIPT = Path(__file__).with_name("own_motions.py")
+
+
+class Own:
+    """The node of `own_motions`, on a controller."""
+
+    def __init__(self, controller: Controlled, **more: Any) -> None:
+        self.controller, self.graph = controller, controller.graph
+        self.reports: list[dict[str, Any]] = []
+        take: Callable[[Any], None] = lambda message: self.reports.append(json.loads(message.data))  # noqa: E731
+        self.graph.probe.create_subscription(String, "own/reports", take, DEEP)
+        # A pause of a busy computer is not what is to be shown.
+        parameters = {
+            "follow_joint_trajectory": ACTION,
+            "motion_silence_s": 0.5,
+            "motion_late_s": 0.5,
+        } | more
+        self.graph.start(SCRIPT, parameters, {"controller_state": f"{NODE}/controller_state"})
+        self.orders = self.graph.publisher(String, "own/orders")
+        self.wait("ready")
+        self.graph.spin_for(0.3)
+
+    def wait(self, what: str, within_s: float = 6.0) -> dict[str, Any]:
+        """For a report since the last order."""
+
+        def found() -> list[dict[str, Any]]:
+            return [report for report in self.reports if report["what"] == what]
+
+        self.graph.spin_until(found, what, within_s)
+        return found()[0]
+
+    def order(self, **order: Any) -> None:
+        """Give an order."""
+        self.reports.clear()
+        self.orders.publish(String(data=json.dumps(order)))
+
+    def go(self, **how: Any) -> np.ndarray:
+        """Begin to drive to the other end of its way; the direction."""
+        start = self.controller.q
+        way = STEP if start[0] < HOME[0] + 0.5 else -STEP
+        self.order(go=(HOME + np.maximum(np.sign(way[0]), 0.0) * STEP).tolist(), **how)
+        return way
+
+    def at_speed(self, away: float = 0.45, **how: Any) -> np.ndarray:
+        """As `go`, and wait until it drives."""
+        start, way = self.controller.q, self.go(**how)
+        self.controller.moved(away, start)
+        return way
+
+    def stopped(self) -> dict[str, Any]:
+        """Wait until it has been stopped, and stands; the report, with how long that ``took``."""
+        stood, stops = self.wait("stood"), self.wait("stops")
+        self.controller.stands()
+        at_s, sent = self.controller.sent(stops["unix_s"] - 0.05)
+        moved = np.max(np.abs(np.diff(sent, axis=0)), axis=1) > 1e-6
+        last_s = at_s[1:][moved][-1] if np.any(moved) else stops["unix_s"]
+        return stood | {"took_s": float(last_s - stops["unix_s"])}
+
+    def arrive(self) -> None:
+        """Drive to one end, from anywhere: the node and the controller work on."""
+        self.go()
+        self.wait("arrived")
+        self.graph.spin_for(0.15)
+
+
+@pytest.fixture
+def own(request: Any, graph: Any, tmp_path: Path) -> Own:
+    """On a controller of a kind, with what it is given."""
+    kind, velocities, parameters = request.param
+    controller = CONTROLLERS[kind](graph, tmp_path, velocities, **parameters)
+    controller.wait()
+    return Own(controller)
+
+
+KINDS = [
+    pytest.param((kind, velocities, {}), id=f"{kind}-{'velocities' if velocities else 'positions'}")
+    for kind in CONTROLLERS
+    for velocities in (False, True)
+]
+LAGGING = pytest.param(("simulated", False, {"lag_ms": 14.0}), id="simulated-lagging")
+POSITIONS = KINDS[::2]
+
+
+@pytest.mark.parametrize("own", [*KINDS, LAGGING], indirect=True)
+def test_a_stop_slows_down_evenly_and_never_goes_back(own):
+    way = own.at_speed(slow=3.3)
+    begin_s = own.controller.now_s - 0.05
+    own.order(stop=True)
+    stood = own.stopped()
+    assert stood["sent"] == 1
+    assert stood["took_s"] < 1.5 * stood["planned_s"]
+    at_s, speed = own.controller.speeds(begin_s)
+    speed = speed * np.sign(way)
+    assert np.min(speed) > -1e-3
+    assert np.max(speed) < 1.05
+    # Planned: 3.3 rad/s^2. At once it would be 250, and 40 to 220 where the controller begins at
+    # the measured position.
+    harder = np.diff(speed, axis=0) / np.diff(at_s)[:, None]
+    assert np.max(np.abs(harder)) < 2.5 * 3.3
+
+
+@pytest.mark.parametrize("own", POSITIONS, indirect=True)
+def test_a_stop_that_is_lost_or_rejected_is_sent_again_in_time(own):
+    for slow, how, longest in (
+        (10.0, {"lost": 1}, 1.5),
+        (10.0, {"lost": 2}, 1.9),  # planned: 0.12 s
+        (3.3, {"lost": 2}, 1.5),
+        (2.0, {"lost": 2}, 1.5),
+        (1.0, {"lost": 2}, 1.5),
+        (3.3, {"rejected": 2}, 1.5),
+    ):
+        own.at_speed(0.3, slow=slow)
+        own.order(stop=True, **how)
+        stood = own.stopped()
+        assert stood["failed"] == ""
+        assert stood["sent"] == 1 + sum(how.values())
+        paused_s = stood["sent"] * max(stood["longest_tick_s"] - 0.02, 0.0)  # a busy computer
+        assert stood["took_s"] < longest * stood["planned_s"] + paused_s, (how, stood)
+        own.arrive()
+
+
+@pytest.mark.parametrize("own", POSITIONS, indirect=True)
+def test_a_motion_follows_the_speed_scaling_and_outlasts_a_pause(own):
+    controller = own.controller
+    way = own.at_speed(0.1)
+    begin_s, changes = controller.now_s, []
+    for factor, for_s in ((0.95, 0.2), (0.5, 0.4), (0.1, 1.5), (0.0, 10.0), (0.1, 0.5), (1.0, 0.0)):
+        controller.scale(factor)
+        changes.append((controller.now_s, factor))
+        own.graph.spin_for(for_s)
+    own.wait("arrived")
+    assert [report["what"] for report in own.reports] == ["moves", "arrived"]
+    assert controller.stands() == pytest.approx(HOME + STEP, abs=1e-6)
+    at_s, speed = controller.speeds(begin_s)
+    assert np.min(speed * np.sign(way)) > -1e-6
+    for (since_s, factor), (until_s, _) in zip(changes, [*changes[1:], (np.inf, 0.0)], strict=True):
+        inside = (at_s > since_s + 0.02) & (at_s < until_s - 0.02)
+        assert np.max(np.abs(speed[inside])) < 1.01 * factor + 1e-9
+
+
+@pytest.mark.parametrize("own", POSITIONS, indirect=True)
+def test_a_stop_of_a_scaled_or_paused_motion_stays_where_it_stops(own):
+    controller = own.controller
+    way = own.at_speed(0.3)
+    controller.scale(0.5)
+    own.graph.spin_for(0.1)
+    begin_s = controller.now_s
+    own.order(stop=True)
+    own.stopped()
+    _, speed = controller.speeds(begin_s)
+    assert np.min(speed * np.sign(way)) > -0.05
+    own.at_speed(0.2)
+    controller.scale(0.0)
+    own.graph.spin_for(0.1)
+    own.order(stop=True)
+    own.stopped()
+    paused = controller.q
+    controller.scale(1.0)
+    assert controller.stands() == pytest.approx(paused, abs=1e-3)
+    own.arrive()
+
+
+def _cancel(own: Own, way: np.ndarray) -> None:
+    assert own.graph.call(CancelGoal, f"{ACTION}/_action/cancel_goal").return_code == 0
+
+
+def _elsewhere(own: Own, way: np.ndarray) -> list[Any]:
+    ends = own.controller.q + 0.3 * way * np.array([0, 1, 1, 1, 1, 1])
+    return [(0.1, own.controller.q + 0.05 * way, 0.3 * way), (1.5, ends, REST)]
+
+
+def _preempt(own: Own, way: np.ndarray) -> None:
+    own.controller.goal(trajectory(_elsewhere(own, way)))
+
+
+def _replace(own: Own, way: np.ndarray) -> None:
+    own.controller.topic.publish(trajectory(_elsewhere(own, way)))
+
+
+def _no_number(own: Own, way: np.ndarray) -> None:
+    (at_s, q, _), end = _elsewhere(own, way)
+    own.controller.goal(trajectory([(at_s, q, np.full(6, np.nan)), end]))
+
+
+STRANGERS = {
+    _cancel: "the controller ended the motion (0)",
+    _preempt: "preempted by new incoming action",
+    _replace: "away from its plan",
+    _no_number: "preempted by new incoming action",
+}
+
+
+@pytest.mark.parametrize("own", POSITIONS, indirect=True)
+def test_what_strangers_and_the_network_do_to_a_motion_ends_in_a_stop_and_says_why(own):
+    for stranger, why in STRANGERS.items():
+        way = own.at_speed(0.3)
+        stranger(own, way)
+        stood = own.wait("stood")  # a controller that was sent NaN tells no command any more
+        assert why in stood["why"], stranger
+        assert stood["failed"] == "", stranger
+        own.arrive()
+    for how, why in (
+        ({"lost": 1}, "behind its controller"),
+        ({"rejected": 1}, "the controller rejected the motion"),
+    ):
+        start = own.controller.q
+        own.go(**how)
+        assert why in own.wait("stood")["why"]
+        assert own.controller.q == pytest.approx(start, abs=1e-9)
+        own.arrive()
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "scaling", "stamped"), [(0.0, 1.0, True), (10.0, 1.0, False), (0.0, 0.5, False)]
+)
+def test_a_stamp_is_trusted_of_a_steady_clock_at_full_speed(graph, ahead_s, scaling, stamped):
+    """A controller that says what it likes: every second state is stamped ``ahead_s`` of now."""
+    controller = Controlled(graph)
+    controller.states.append(JointTrajectoryControllerState())
+    own = Own(controller, follow_joint_trajectory="''")
+    said = graph.publisher(JointTrajectoryControllerState, f"{NODE}/controller_state")
+    readings = graph.publisher(JointState, "joint_states", subscribers=2)
+    sent = graph.collect(JointTrajectory, "own_motions/joint_trajectory")
+    number = 0
+
+    def say() -> None:
+        nonlocal number
+        number += 1
+        now_s = time.time()
+        message = trajectory([(0.0, HOME, 0.3 * STEP)], stamp_s=now_s + ahead_s * (number % 2))
+        said.publish(
+            JointTrajectoryControllerState(
+                header=message.header,
+                joint_names=NAMES,
+                reference=message.points[0],
+                speed_scaling_factor=scaling,
+            )
+        )
+        reading = JointState(name=NAMES, position=HOME.tolist())
+        reading.header = trajectory([], stamp_s=now_s).header
+        readings.publish(reading)
+        graph.spin_for(0.004)
+
+    def until(condition: Callable[[], object]) -> None:
+        graph.spin_until(lambda: say() or condition(), "it is sent")
+
+    until(lambda: len(controller.readings) > 40)
+    own.order(go=(HOME + STEP).tolist())
+    until(lambda: len(sent) == 1)
+    own.order(stop=True)
+    until(lambda: len(sent) > 1)
+    first = seconds(sent[1].points[0].time_from_start)
+    assert (seconds(sent[1].header.stamp) > 0.0) == stamped
+    assert first == pytest.approx(0.0 if stamped else 0.05)
+    if stamped:
+        assert time.time() - 0.3 < seconds(sent[1].header.stamp) < time.time()
+        assert sent[1].points[0].positions == pytest.approx(HOME, abs=0.3 * 0.05)
