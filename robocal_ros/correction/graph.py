@@ -58,8 +58,7 @@ def publishers(node: Node, topic: str, *, dds: bool = False) -> list[Endpoint]:
     found = node.get_publishers_info_by_topic(topic, no_mangle=dds)
     return [
         Endpoint(
-            bytes(info.endpoint_gid)[:PREFIX],
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+            bytes(info.endpoint_gid)[:PREFIX], f"{info.node_namespace.rstrip('/')}/{info.node_name}"
         )
         for info in found
     ]
@@ -87,16 +86,11 @@ class _Lease:
 
 @dataclass
 class Leases:
-    """Leases of this robot (``robocal_msgs/MotionLease``), and whose motions are the cell's own.
-
-    Attributes
-    ----------
-    others : holders that have spoken of another robot only.
-    """
+    """Leases of this robot (``robocal_msgs/MotionLease``), and whose motions are the cell's own."""
 
     robot: str
     serial: str
-    others: set[str] = field(default_factory=set)
+    others: set[str] = field(default_factory=set)  # holders that spoke of another robot only
     _held: dict[str, _Lease] = field(default_factory=dict)
 
     def hear(self, message: Any, now_s: float) -> None:
@@ -309,17 +303,11 @@ class CommandSources:
     while their topic has several publishers or on several topics, count as commands of several
     sources, and none of them is believed: the publishers that merely wait cannot be told apart.
 
-    Parameters
-    ----------
-    at_once_s : the short time.
-
-    Attributes
-    ----------
-    inputs : the subscriptions by topic.
+    The short time is ``at_once_s``.
     """
 
     def __init__(self, at_once_s: float) -> None:
-        self.inputs: dict[str, Subscription] = {}
+        self.inputs: dict[str, Subscription] = {}  # by topic
         self._at_once_s = at_once_s
         self._topic = ""
         self._heard_s = -math.inf

@@ -29,14 +29,12 @@ from robocal_ros.correction.messages import (
     ArrayMessage,
     JointMessage,
     PathMessage,
-    in_words,
     stop_message,
     tail_message,
 )
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
-from robocal_ros.correction.reported import CorrectionState
 from robocal_ros.correction.robot_stop import REACTION_S, RobotStop, RobotTrack
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
@@ -46,6 +44,7 @@ from robocal_ros.correction.settings import (
     joint_limits,
     session_config,
 )
+from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.speed_scaling import SpeedScaling
@@ -131,7 +130,7 @@ class JointCorrectionNode(HouseNode):
             self._session, self.settings, nominal, reference, self._offsets, self._statuses,
             self.now_ns,
         )  # fmt: skip
-        self._release.append(self._report.close)
+        self._release.append(self._report.log.close)
 
     def _open_topics(self) -> None:
         self._outputs = {
@@ -151,25 +150,12 @@ class JointCorrectionNode(HouseNode):
         else:
             self.add_input(ControllerState, CONTROLLER, self._on_controller, qos.NEWEST)
         states = partial(JointMessage, JointWire(is_reading=True), is_reading=True)
-        acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None], Any]] = {
-            STATES: (states, self._on_states, qos.SENSOR),
-            TARGETS: (
-                partial(JointMessage, JointWire()),
-                partial(self._on_target, TARGETS),
-                qos.HEARTBEAT,
-            ),
-            COMMANDS: (
-                partial(ArrayMessage, self._names),
-                partial(self._on_target, COMMANDS),
-                qos.HEARTBEAT,
-            ),
-            TRAJECTORY: (self._read_path, self._on_path, qos.RELIABLE),
-        }
-        for topic, (read, act, profile) in acts.items():
-            receive = self._guarded(topic, read, act)
-            opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
-            if topic in self._senders:
-                self._senders[topic].inputs[topic] = opened
+        targets, act = partial(JointMessage, JointWire()), self._on_target
+        self._listen(STATES, states, self._on_states, qos.SENSOR)
+        self._listen(TARGETS, targets, partial(act, TARGETS), qos.HEARTBEAT)
+        commands = partial(ArrayMessage, self._names)
+        self._listen(COMMANDS, commands, partial(act, COMMANDS), qos.HEARTBEAT)
+        self._listen(TRAJECTORY, self._read_path, self._on_path, qos.RELIABLE)
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_service(Trigger, "~/acknowledge", self._on_acknowledge)
         self.add_service(Trigger, "~/take_over", self._on_take_over)
@@ -183,8 +169,10 @@ class JointCorrectionNode(HouseNode):
     def _open_action(self) -> None:
         if self.settings[ACTION]:
             if self._proxy is None:
-                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", self)
-            self._proxy.open(self.settings[ACTION])
+                self._proxy = TrajectoryProxy(
+                    self, f"~/{ACTION}", self._correct_goal, self._goal_sent, self._goal_lost
+                )
+            self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
         self._graph = GraphWatch(
             self,
@@ -204,7 +192,7 @@ class JointCorrectionNode(HouseNode):
         """
         self._look_at_graph()
         self._tell()
-        self.get_logger().info(in_words(self._session.status(time.monotonic())))
+        self.get_logger().info(self._session.status(time.monotonic()).in_words())
 
     def deactivate(self) -> None:
         """Bring the robot to rest, for half a second at most; goals under way are stopped."""
@@ -254,7 +242,7 @@ class JointCorrectionNode(HouseNode):
         status = self._session.status(time.monotonic())
         wanted = CorrectionState.ON if request.data else CorrectionState.OFF
         response.success = status.state is wanted and not status.shadow
-        response.message = in_words(status)
+        response.message = status.in_words()
         self.get_logger().info(f"enable {request.data}: {response.message}")
         self._tell()
         return response
@@ -262,7 +250,7 @@ class JointCorrectionNode(HouseNode):
     def _on_acknowledge(self, _: Any, response: Any) -> Any:
         """End a START_MISMATCH, and take note of a damaged history."""
         self._session.acknowledge()
-        self._report.acknowledge()
+        self._report.log.acknowledge()
         return self._answer("acknowledge", "", response)
 
     def _on_take_over(self, _: Any, response: Any) -> Any:
@@ -273,7 +261,7 @@ class JointCorrectionNode(HouseNode):
         return self._answer("take_over", refused, response)
 
     def _answer(self, what: str, refused: str, response: Any) -> Any:
-        words = refused or in_words(self._session.status(time.monotonic()))
+        words = refused or self._session.status(time.monotonic()).in_words()
         response.success = not refused
         code = Code.CONFLICT if refused else Code.ACCEPT
         response.message = trigger_text(0, code, words)
@@ -283,10 +271,10 @@ class JointCorrectionNode(HouseNode):
 
     # ---- what is corrected ----------------------------------------------------------------------
 
-    def _guarded(
-        self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None]
-    ) -> Callable[[Any], None]:
-        """Refuse what a correction node publishes itself, and commands of several sources.
+    def _listen(
+        self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None], profile: Any
+    ) -> None:
+        """Act on an input; refuse what a correction node publishes itself, and several sources.
 
         In shadow mode a message goes out as it came before anything else is done with it.
         """
@@ -304,12 +292,14 @@ class JointCorrectionNode(HouseNode):
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message)
 
-        return receive
+        opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
+        if senders:
+            senders.inputs[topic] = opened
 
     def _refuse_message(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
         """Refuse a message; a stream that it is of is ended in order."""
         if topic in (TARGETS, COMMANDS):
-            self._session.end_stream(RefusedError(reason, detail), now_s)
+            self._session.stream.end(RefusedError(reason, detail), now_s)
             self._arm_tail()
         self._session.refuse(reason, detail)
 
@@ -343,8 +333,8 @@ class JointCorrectionNode(HouseNode):
             return
         self._put_out(TRAJECTORY, message, *self._corrected(message))
         self._by_action = False
-        if self._session.path is not None:
-            self._session.path.begin(time.monotonic())
+        if self._session.output.path is not None:
+            self._session.output.path.begin(time.monotonic())
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
 
     def _stop_for_no_points(self) -> None:
@@ -374,7 +364,7 @@ class JointCorrectionNode(HouseNode):
 
     # ---- goals of the action --------------------------------------------------------------------
 
-    def correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
+    def _correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
         """A goal's trajectory, corrected, and its path; as it came in shadow mode."""
         message = PathMessage(trajectory)
         try:
@@ -384,7 +374,7 @@ class JointCorrectionNode(HouseNode):
             if held_back or not self._shadow:
                 raise
             return trajectory, None
-        path = None if self._shadow else self._session.path
+        path = None if self._shadow else self._session.output.path
         try:
             return trajectory if command is came else message.changed(command), path
         except Exception:
@@ -392,22 +382,14 @@ class JointCorrectionNode(HouseNode):
                 self._session.reject(path)
             raise
 
-    def goal_sent(self) -> None:
+    def _goal_sent(self) -> None:
         """Tell what a goal is corrected by."""
         self._by_action = True
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
 
-    def goal_rejected(self, path: SentPath) -> None:
-        """What the goal took the place of goes on."""
-        self._session.reject(path)
-
-    def goal_lost(self, why: str) -> None:
+    def _goal_lost(self, why: str) -> None:
         """The robot may still follow it, and is stopped by where it is."""
         self._stop_by_readings(why, time.monotonic())
-
-    def uncorrect(self, names: Any, position: Any, velocity: Any) -> Any:
-        """As `CorrectionSession.taught`, now."""
-        return self._session.taught(names, position, velocity, time.monotonic())
 
     # ---- stops, and what goes out without a message ---------------------------------------------
 
@@ -417,9 +399,9 @@ class JointCorrectionNode(HouseNode):
         if self._shadow:
             return
         self._rescale(now)
-        path, sent = self._session.path, True
+        path, sent = self._session.output.path, True
         if path is not None and path.live(now) and not self._track.follows(path, now):
-            self._session.end_stream(RefusedError(Reason.STOPPED, why), now)
+            self._session.stream.end(RefusedError(Reason.STOPPED, why), now)
             sent = self._stop_by_readings(why, now)
         elif (planned := self._session.stop(now, AHEAD_S)) is not None:
             times, q, qd = planned.time_from_start_s, planned.position, planned.velocity
@@ -437,7 +419,7 @@ class JointCorrectionNode(HouseNode):
 
     def _stop_by_readings(self, why: str, now_s: float) -> bool:
         """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
-        self._astray = self._session.path
+        self._astray = self._session.output.path
         sent = self._stopping.begin(why, now_s)
         if sent:
             self._stop_timer.reset()
@@ -474,22 +456,22 @@ class JointCorrectionNode(HouseNode):
 
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
-        if self._session.has_tail and not self._shadow:
+        if self._session.stream.has_tail and not self._shadow:
             self._emit_tail()
             self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
             self._tail_timer.reset()
 
     def _tail_period_s(self) -> float:
-        period = self._session.stream_period_s
+        period = self._session.stream.period_s
         return min(max(period, 1e-3), 0.1) if math.isfinite(period) else TAIL_S
 
     def _on_tail(self) -> None:
-        if not self._emit_tail() and not self._session.has_tail:
+        if not self._emit_tail() and not self._session.stream.has_tail:
             self._tail_timer.cancel()
 
     def _emit_tail(self) -> bool:
         """Put out what must go out now although no message came; whether something did."""
-        command = self._session.tail(time.monotonic())
+        command = self._session.stream.tail(time.monotonic())
         if command is not None:
             kind = KINDS[self._stream]
             self._outputs[self._stream].publish(tail_message(command, kind, self.now_ns()))

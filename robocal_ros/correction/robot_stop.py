@@ -9,17 +9,14 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.inputs import Array, JointCommand
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.robot_state import RESPONSE_S
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
-
-Array = NDArray[np.float64]
 
 TRACK_S = 0.1  # readings of so long tell speed and standstill
 LEAST_TRACK_S = 0.02  # shorter ones tell no speed

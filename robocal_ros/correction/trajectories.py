@@ -9,7 +9,13 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import TrajectoryCommand, require_few, require_finite
+from robocal_ros.correction.inputs import (
+    Array,
+    Index,
+    TrajectoryCommand,
+    require_few,
+    require_finite,
+)
 from robocal_ros.correction.limiter import (
     ACCELERATION,
     DESIRED,
@@ -25,9 +31,6 @@ from robocal_ros.correction.output import Output, SentPath, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
 SPLINE_PEAK = 1.875
@@ -59,11 +62,9 @@ class TrajectoryCorrector:
     ) -> tuple[TrajectoryCommand, SentPath]:
         """Correct a trajectory of taught joints ``q`` (m, n), of which ``index`` go out.
 
-        Raises
-        ------
-        RefusedError
-            When it cannot be corrected, its begin is elsewhere, its end would not be reached with
-            the correction that belongs there, or a limit is exceeded. Nothing has changed then.
+        Raises `RefusedError` when it cannot be corrected, its begin is elsewhere, its end would not
+        be reached with the correction that belongs there, or a limit is exceeded. Nothing has
+        changed then.
         """
         output, limiter = self._output, self._output.limiter
         kept, limits = limiter.state.copy(), limiter.limits

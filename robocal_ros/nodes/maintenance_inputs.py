@@ -4,7 +4,7 @@ from typing import Any
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.correction.reported import CorrectionState, ToldCorrection
+from robocal_ros.correction.status import CorrectionState, ToldCorrection
 from robocal_ros.sessions.maintenance.accuracy import Drift
 
 MM = 1e-3

@@ -81,7 +81,7 @@ def shifted(command: TrajectoryCommand, first_s: float) -> TrajectoryCommand:
 
 def check(robot: Robot, command: TrajectoryCommand, begins: tuple[Motion, Motion], rest: bool):
     out = robot.session.trajectory(command, robot.now)
-    robot.session.path.begin(robot.now)
+    robot.session.output.path.begin(robot.now)
     own, mine = (Driven(c, b) for c, b in zip((command, out), begins, strict=True))
     rate, bend = mine.peaks(own)
     assert rate <= (REST if rest else FASTEST) * (1.0 + TOLERANCE)

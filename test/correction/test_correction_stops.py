@@ -49,7 +49,7 @@ def test_stops_anywhere(
     session, began_s = robot.session, robot.now
     session.controller((), np.empty(0), scaling, robot.now)
     session.trajectory(command, robot.now)
-    path = session.path
+    path = session.output.path
     path.begin(robot.now)
     lasts = command.time_from_start_s[-1]
     robot.now += when * lasts / scaling
@@ -100,7 +100,7 @@ def test_a_program_that_brakes_itself_is_not_driven_past(strength: float) -> Non
     robot.at = q[0]
     robot.rest()
     robot.session.trajectory(TrajectoryCommand(NAMES, q, t, v), robot.now)
-    robot.session.path.begin(robot.now)
+    robot.session.output.path.begin(robot.now)
     robot.now += steady + ramp - AHEAD_S
     stop = robot.session.stop(robot.now, AHEAD_S)
     assert stop.position[-1, 0] <= q[-1, 0] + 1e-9
@@ -113,10 +113,10 @@ def test_a_controller_that_is_halted_is_held() -> None:
     robot.at = command.position[0]
     robot.rest()
     robot.session.trajectory(command, robot.now)
-    robot.session.path.begin(robot.now)
+    robot.session.output.path.begin(robot.now)
     robot.now += 0.4 * command.time_from_start_s[-1]
     robot.session.controller((), np.empty(0), 0.0, robot.now)
-    here = robot.session.path.place(robot.now)
+    here = robot.session.output.path.place(robot.now)
     robot.now += 0.1
     stop = robot.session.stop(robot.now, AHEAD_S)
     assert np.array_equal(stop.position, here[None])
@@ -130,7 +130,7 @@ def test_readings_on_a_stop_are_uncorrected_with_what_the_path_had_there() -> No
     robot.at = command.position[0]
     robot.rest()
     out = robot.session.trajectory(command, robot.now)
-    robot.session.path.begin(robot.now)
+    robot.session.output.path.begin(robot.now)
     robot.now += 0.3 * command.time_from_start_s[-1]
     stop = robot.session.stop(robot.now, AHEAD_S)
     robot.now += stop.time_from_start_s[-1]

@@ -46,7 +46,7 @@ def test_a_command_begins_where_the_controller_is_though_the_robot_lags(graph: A
 
 
 def path_time(line: Line) -> float:
-    path = line.node._session.path
+    path = line.node._session.output.path
     assert path is not None
     return float(path.time(time.monotonic()))
 
@@ -116,7 +116,7 @@ def test_a_slider_that_dies_at_zero_is_forgotten(graph: Any) -> None:
         line.take(Float64(data=percent), slider, "speed_scaling")
     assert line.node._scaling == 0.0
     graph.spin_until(lambda: line.node._scaling == 1.0, "it is forgotten", 3.0)
-    path = line.node._session.path
+    path = line.node._session.output.path
     graph.spin_until(lambda: not path.live(time.monotonic()), "the path ends", 3.0)
 
 

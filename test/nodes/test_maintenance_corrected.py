@@ -11,7 +11,7 @@ from test_maintenance_calls import HOME_DEG, proposed
 
 from robocal_ros.core.documents import model_document
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.correction.reported import CorrectionState
+from robocal_ros.correction.status import CorrectionState
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.maintenance_node import ACCURACY, CORRECTION, MaintenanceNode
 from robocal_ros.storage.calibrations import CalibrationHistory

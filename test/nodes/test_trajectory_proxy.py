@@ -240,7 +240,7 @@ def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
     again.trajectory.header.frame_id = CORRECTED
     result = Sent(cell, again).ends(GoalStatus.STATUS_ABORTED)
     assert "comes from a joint correction already" in result.error_string
-    cell.node.correct_goal = lambda message: 1 / 0
+    cell.node._proxy._correct = lambda message: 1 / 0
     result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
     assert "a defect of this software" in result.error_string
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
@@ -423,7 +423,7 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
     cell.begin(settled=False)
     sent = cell.send(HOME, MOVED, lasts_s=20.0)
     graph.spin_until(lambda: robot.q[0] > HOME[0] + 0.01, "the robot moves")
-    path = node._session.path
+    path = node._session.output.path
     robot.destroy_publisher(robot.status)
     assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 5.0).error_string
     assert path.live(time.monotonic())  # it is not known to stand
