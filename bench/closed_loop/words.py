@@ -4,8 +4,8 @@ import numpy as np
 
 from bench.closed_loop import setting
 from robocal_ros.correction.inputs import OfferedModel, OfferedTool
-from robocal_ros.correction.reported import ToldCorrection
 from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.correction.status import ToldCorrection
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.requests import Answer

@@ -11,13 +11,12 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
 from control_msgs.action import FollowJointTrajectory
-from numpy.typing import NDArray
 from rclpy.action import ActionClient, CancelResponse, GoalResponse
 from rclpy.action.client import ClientGoalHandle
 from rclpy.action.server import ServerGoalHandle
@@ -27,10 +26,10 @@ from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.samples import TAUGHT
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.nodes.deferred_action import DeferredActionServer
 from robocal_ros.nodes.endpoints import EndpointNode
 
-Array = NDArray[np.float64]
 Result = FollowJointTrajectory.Result
 
 ANSWER_S = 5.0  # a controller that has not answered a goal or a cancel by then never will
@@ -44,57 +43,40 @@ class ControllerError(RobocalError):
 
 @dataclass(eq=False)
 class _Goal:
-    """A goal on its way.
-
-    Attributes
-    ----------
-    servers : who offered the controller's action when it was sent.
-    asked_s : since when the controller owes an answer; None when it owes none.
-    accepted : the goal at the controller.
-    result : what it will answer in the end.
-    path : its corrected trajectory; None in shadow mode.
-    stopped : why it was stopped here; empty when it was not.
-    """
+    """A goal on its way."""
 
     caller: ServerGoalHandle
-    servers: frozenset[bytes] = frozenset()
-    asked_s: float | None = None
-    accepted: ClientGoalHandle | None = None
-    result: Future | None = None
-    path: SentPath | None = None
-    stopped: str = ""
+    servers: frozenset[bytes] = frozenset()  # that offered the controller's action at its begin
+    asked_s: float | None = None  # since when the controller owes an answer
+    accepted: ClientGoalHandle | None = None  # the goal at the controller
+    result: Future | None = None  # what it will answer in the end
+    path: SentPath | None = None  # its corrected trajectory; None in shadow mode
+    stopped: str = ""  # why it was stopped here
     cancel: bool = False
     over: bool = False
 
 
-class GoalHandling(Protocol):
-    """What the node does for the goals."""
-
-    def correct_goal(self, trajectory: Any) -> tuple[Any, SentPath | None]:
-        """The corrected trajectory of a taught one, and its path; raises `RefusedError`."""
-
-    def goal_sent(self) -> None:
-        """A corrected goal has gone out."""
-
-    def goal_rejected(self, path: SentPath) -> None:
-        """The controller did not take it."""
-
-    def uncorrect(
-        self, names: tuple[str, ...], position: Array, velocity: Array | None
-    ) -> tuple[Array, Array | None]:
-        """Taught positions and velocities, (k,) each; raises `RefusedError`."""
-
-
 class TrajectoryProxy:
     """Serves the action ``name`` with a controller's action, from `open` to `close`.
+
+    ``correct`` makes a corrected trajectory of a taught one, and its path, or raises
+    `RefusedError`; ``sent`` is called when it has gone out, ``lost`` when nothing more is heard of
+    it, and the robot may still follow it.
 
     Both ends stay until `destroy`, which must not be called while the node spins: rclpy's events
     executor reads freed memory when an action goes that something waits for. When closed, goals
     are rejected.
     """
 
-    def __init__(self, node: EndpointNode, name: str, handling: GoalHandling) -> None:
-        self._node, self._handling = node, handling
+    def __init__(
+        self,
+        node: EndpointNode,
+        name: str,
+        correct: Callable[[Any], tuple[Any, SentPath | None]],
+        sent: Callable[[], None],
+        lost: Callable[[str], None],
+    ) -> None:
+        self._node, self._correct, self._sent, self._lost = node, correct, sent, lost
         self._goals: list[_Goal] = []
         self._clients: dict[str, ActionClient] = {}
         self.controller = ""  # resolved name of the controller's action; empty when closed
@@ -109,8 +91,9 @@ class TrajectoryProxy:
             cancel_callback=self._safe(self._cancelled, CancelResponse.REJECT),
         )
 
-    def open(self, controller: str) -> None:
+    def open(self, controller: str, session: CorrectionSession) -> None:
         """Take goals for the action ``controller``; `InputError` when it is this node's own."""
+        self._session = session
         name = self._node.resolve_topic_name(controller)
         if name == self._own_name:
             raise InputError(f"{name} is this node's own action: name the controller's")
@@ -161,11 +144,11 @@ class TrajectoryProxy:
     def stop(self, message: Any, why: str) -> bool:
         """Send a trajectory that stops the robot; it preempts the goals, which end for ``why``.
 
-        False when no controller is there to take it. A goal is cancelled only where the controller
-        rejects the stop: a cancel is a dead stop from any speed.
+        False when no controller is configured. A goal is cancelled only where the controller
+        rejects the stop, or is not all there: a cancel is a dead stop from any speed.
         """
         client = self._clients.get(self.controller)
-        if client is None or not client.server_is_ready():
+        if client is None:
             return False
         goals = list(self._goals)
         for goal in goals:
@@ -184,6 +167,9 @@ class TrajectoryProxy:
                 self._forward_cancel(goal)
 
         future.add_done_callback(self._safe(answered))
+        if not client.server_is_ready():  # it may drive on all the same, and may never answer
+            for goal in goals:
+                self._forward_cancel(goal)
         return True
 
     def cancel(self, why: str) -> None:
@@ -221,7 +207,7 @@ class TrajectoryProxy:
             self._fail(goal, str(error), code)
         except Exception as error:
             if goal.path is not None:  # it never went out
-                self._handling.goal_rejected(goal.path)
+                self._session.reject(goal.path)
             self._node.get_logger().error(traceback.format_exc())
             self._fail(goal, f"a defect of this software, please report it: {error!r}")
 
@@ -235,7 +221,7 @@ class TrajectoryProxy:
                 f"{len(goal.servers)} nodes offer {self.controller}: end all but one; one that was "
                 "killed counts until DDS gives it up"
             )
-        request.trajectory, goal.path = self._handling.correct_goal(request.trajectory)
+        request.trajectory, goal.path = self._correct(request.trajectory)
         self._goals.append(goal)
         future = client.send_goal_async(
             request,
@@ -245,7 +231,7 @@ class TrajectoryProxy:
         goal.asked_s = time.monotonic()
         if goal.path is not None:
             goal.path.begin(goal.asked_s)
-        self._handling.goal_sent()
+        self._sent()
         self._when_done(future, self._answered, goal)
 
     def _cancelled(self, caller: ServerGoalHandle) -> CancelResponse:
@@ -267,7 +253,7 @@ class TrajectoryProxy:
         goal.asked_s = None
         if not accepted.accepted:
             if goal.path is not None:
-                self._handling.goal_rejected(goal.path)
+                self._session.reject(goal.path)
             self._fail(goal, f"{self.controller} rejected the goal, its log says why")
             return
         goal.accepted = accepted
@@ -313,7 +299,9 @@ class TrajectoryProxy:
             point.velocities = []
             return
         velocity = np.array(point.velocities) if len(point.velocities) == count else None
-        position, velocity = self._handling.uncorrect(names, np.array(point.positions), velocity)
+        position, velocity = self._session.taught(
+            names, np.array(point.positions), velocity, time.monotonic()
+        )
         point.positions = position.tolist()
         point.velocities = [] if velocity is None else velocity.tolist()
 
@@ -340,7 +328,11 @@ class TrajectoryProxy:
             if not goal.servers <= servers:
                 if goal.result is not None:
                     goal.result.cancel()  # rclpy would keep it for ever
-                self._fail(goal, f"the controller that offered {self.controller} vanished")
+                why = f"the controller that offered {self.controller} vanished"
+                goal.stopped = why  # its path ends when the robot is seen to stand
+                self._lost(why)
+                self._forward_cancel(goal)
+                self._fail(goal, f"{why}; the robot may still move")
             elif goal.asked_s is not None and goal.asked_s < overdue_s:
                 what = "cancel, the robot may still move" if goal.cancel else "goal"
                 self._fail(

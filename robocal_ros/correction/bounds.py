@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 # What floating point adds to a value that lies on its bound.
 ROUNDING = 1e-9
+DEGREE = np.pi / 180.0
 # Weak directions are damped for this share of the bound: the solution may bend a little beyond
 # the first order.
 FADES_FROM = 0.8
@@ -44,10 +45,6 @@ class ShiftBounds:
         )
 
 
-def _degrees(value: float) -> float:
-    return float(np.radians(value))
-
-
 class Policy(StrEnum):
     """What is done with a command whose correction would exceed a bound or a limit."""
 
@@ -58,47 +55,30 @@ class Policy(StrEnum):
 
 @dataclass(frozen=True)
 class CorrectionConfig:
-    """Settings of a correction session.
+    """Settings of a correction session, SI."""
 
-    Attributes
-    ----------
-    thermal, tool : bounds of the arm's drift and of the tool's change. The tool's tilt is that of
-        a tip 10 mm aside by a bend 150 mm above it.
-    turning, sliding : fastest change of the offset of a joint, by its kind.
-    velocity_limits : (n,) rad/s (prismatic: m/s), infinite for none.
-    acceleration_limits : (n,) rad/s^2 (prismatic: m/s^2), with which a stream that ends slows down.
-    stream_gap_s : after a pause that is longer than this, and than two of its periods, a stream
-        goes on only where the robot can be there soon.
-    start_rad, start_m : how far from where a command begins the robot may stand.
-    joint_state_age_s : readings that are older do not tell where the robot is.
-    flange_frame, tool_frame : parent and child of an acceptable tool frame; an empty child: any.
-    policy : what is done with a command whose correction would exceed a bound or a limit.
-    model_age_s : a model with an older stamp is not corrected with; 0: any age.
-    free_axis : the tool may turn about its z.
-    robot_file_hash : of the robot file, where no serial tells robots of one model apart; a model
-        or tool must then have been made with the same file. Empty: the serial tells them apart.
-    shadow : commands and readings pass as they came; the correction is only shown.
-    """
-
-    thermal: ShiftBounds = field(
-        default_factory=lambda: ShiftBounds(1e-3, _degrees(0.1), _degrees(0.3))
-    )
-    tool: ShiftBounds = field(
-        default_factory=lambda: ShiftBounds(10e-3, _degrees(4.0), _degrees(5.0))
-    )
-    turning: OffsetLimits = TURNING
+    # Bounds of the arm's drift, and of the tool's change, whose tilt is that of a tip 10 mm aside
+    # by a bend 150 mm above it.
+    thermal: ShiftBounds = ShiftBounds(1e-3, 0.1 * DEGREE, 0.3 * DEGREE)
+    tool: ShiftBounds = ShiftBounds(10e-3, 4.0 * DEGREE, 5.0 * DEGREE)
+    turning: OffsetLimits = TURNING  # fastest change of the offset of a joint, by its kind
     sliding: OffsetLimits = SLIDING
+    # (n,) rad/s, rad/s^2 (prismatic: m); a stream that ends slows down with the accelerations
     velocity_limits: Array = field(default_factory=lambda: np.array([np.inf]), compare=False)
     acceleration_limits: Array = field(default_factory=lambda: np.array([np.inf]), compare=False)
+    # After a pause longer than this, and than two of its periods, a stream goes on only where the
+    # robot can be there soon.
     stream_gap_s: float = 0.1
-    start_rad: float = field(default_factory=lambda: _degrees(0.02))
+    start_rad: float = 0.02 * DEGREE  # how far from where a command begins the robot may stand
     start_m: float = 5e-5
-    joint_state_age_s: float = 0.2
+    joint_state_age_s: float = 0.2  # older readings do not tell where the robot is
     flange_frame: str = "tool0"
-    tool_frame: str = ""
+    tool_frame: str = ""  # child of an acceptable tool frame; empty: any
     policy: Policy = Policy.REFUSE
-    model_age_s: float = 0.0
-    free_axis: bool = False
+    model_age_s: float = 0.0  # a model with an older stamp is not corrected with; 0: any age
+    free_axis: bool = False  # the tool may turn about its z
+    # Where no serial tells robots of one model apart: of the file that a model or tool must have
+    # been made with.
     robot_file_hash: str = ""
     shadow: bool = False
 
@@ -109,15 +89,9 @@ class CorrectionConfig:
 
 @dataclass(frozen=True)
 class Survey:
-    """An arm's correction over postures that fill its joint range.
+    """An arm's correction at the tool over postures that fill its joint range."""
 
-    Attributes
-    ----------
-    beyond : share of postures in which it exceeds its bounds at the tool.
-    worst_m, worst_rad : largest correction at the tool.
-    """
-
-    beyond: float
+    beyond: float  # share of postures in which it exceeds its bounds
     worst_m: float
     worst_rad: float
 

@@ -24,7 +24,8 @@ from std_msgs.msg import Empty
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.wire import joint_names
 
-LEASE_S = 1.0  # a lease that was not renewed for so long is over
+LEASE_S = 1.0  # a lease that was not renewed for so long is lost: its holder died, or hangs
+STOOD_S = 1.0  # a lost one is over when the robot has stood for so long
 PREFIX = 12  # bytes of a gid
 MOST_TAKEN = 100  # joint states of a look
 STEPS_BACK = 2  # of message numbers within `MEMORY_S`: one comes of a driver that was restarted
@@ -45,14 +46,19 @@ class Endpoint(NamedTuple):
     participant: bytes
     name: str
 
+    def may_be_node_of(self, other: "Endpoint") -> bool:
+        """Whether it is of the same node, as far as the nodes' names are discovered."""
+        return self.participant == other.participant and (
+            self.name == other.name or any(one.name.endswith(UNKNOWN) for one in (self, other))
+        )
+
 
 def publishers(node: Node, topic: str, *, dds: bool = False) -> list[Endpoint]:
     """Who publishes a resolved ROS topic, or the DDS topic of that name."""
     found = node.get_publishers_info_by_topic(topic, no_mangle=dds)
     return [
         Endpoint(
-            bytes(info.endpoint_gid)[:PREFIX],
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}",
+            bytes(info.endpoint_gid)[:PREFIX], f"{info.node_namespace.rstrip('/')}/{info.node_name}"
         )
         for info in found
     ]
@@ -80,16 +86,11 @@ class _Lease:
 
 @dataclass
 class Leases:
-    """Leases of this robot (``robocal_msgs/MotionLease``), and whose motions are the cell's own.
-
-    Attributes
-    ----------
-    others : holders that have spoken of another robot only.
-    """
+    """Leases of this robot (``robocal_msgs/MotionLease``), and whose motions are the cell's own."""
 
     robot: str
     serial: str
-    others: set[str] = field(default_factory=set)
+    others: set[str] = field(default_factory=set)  # holders that spoke of another robot only
     _held: dict[str, _Lease] = field(default_factory=dict)
 
     def hear(self, message: Any, now_s: float) -> None:
@@ -102,12 +103,33 @@ class Leases:
         self.others.discard(holder)
         self._held[holder] = _Lease(bool(message.held), str(message.purpose), now_s)
 
+    def look(self, now_s: float, stood_s: float) -> None:
+        """End what was lost, for a robot that has stood for ``stood_s``.
+
+        What a holder that died sent is still driven: its lease lasts until the robot stands.
+        """
+        for lease in self._held.values():
+            lost_s = now_s - lease.heard_s - LEASE_S
+            if lease.held and min(lost_s, stood_s) >= STOOD_S:
+                lease.held = False
+
     def words(self, now_s: float) -> str:
         """Who holds one, and what for; empty when nobody does."""
-        return "; ".join(
+        held = [
             f"{holder}: {lease.purpose or 'no purpose told'}"
             for holder, lease in self._held.items()
             if lease.held and now_s - lease.heard_s <= LEASE_S
+        ]
+        return "; ".join([*held, *filter(None, [self.lost(now_s)])])
+
+    def lost(self, now_s: float) -> str:
+        """Whose lease ended by silence while the robot may still move by it; empty: nobody's."""
+        return "; ".join(
+            f"{holder}: {lease.purpose or 'no purpose told'}: it has not renewed its lease for "
+            f"{LEASE_S:g} s, it died or hangs, and the robot may still move by it: the lease "
+            f"lasts until the robot has stood for {STOOD_S:g} s"
+            for holder, lease in self._held.items()
+            if lease.held and now_s - lease.heard_s > LEASE_S
         )
 
 
@@ -201,7 +223,8 @@ class GraphWatch:
     commands : resolved topics that this node commands the robot by, and how many publishers of
         its own each has.
     actions : likewise resolved names of the controller's action, and its own clients.
-    leases : of this robot; whoever publishes on ``lease_topic`` moves the robot for the cell.
+    leases : of this robot; the nodes that publish on ``lease_topic`` move the robot for the cell,
+        with a lease; the others of their processes do not.
     """
 
     def __init__(
@@ -224,18 +247,23 @@ class GraphWatch:
         self._own = Endpoint(own_participant(node), node.get_fully_qualified_name())
         self.commanders = ""  # who else commands the robot, or publishes its joints
         self.lease = ""  # who holds one
+        self.lost = ""  # whose was not renewed while the robot may still move by it
 
-    def look(self, now_s: float) -> GraphViolation | None:
-        """Look at the graph (steady clock); why nothing may go out now, None when it may."""
+    def look(self, now_s: float, stood_s: float = 0.0) -> GraphViolation | None:
+        """Look at the graph (steady clock); why nothing may go out now, None when it may.
+
+        ``stood_s``: how long the robot has stood, as far as that is known.
+        """
         leasing = publishers(self._node, self._lease_topic)
-        cell = {one.participant for one in leasing if one.name not in self.leases.others}
+        cell = [one for one in leasing if one.name not in self.leases.others]
         found = []
         for subject, does, own, topic, dds in self._asked:
             who = publishers(self._node, topic, dds=dds)
             found += [f"{name} {does} {subject}" for name in self._strangers(who, own, cell)]
         joints = self._sources.look(now_s)
         self.commanders = "; ".join([*found, *filter(None, [joints])])
-        self.lease = self.leases.words(now_s)
+        self.leases.look(now_s, stood_s)
+        self.lease, self.lost = self.leases.words(now_s), self.leases.lost(now_s)
         if self.commanders:
             return GraphViolation(
                 Reason.OTHER_COMMANDER,
@@ -244,10 +272,14 @@ class GraphWatch:
             )
         return GraphViolation(Reason.LEASED, self.lease) if self.lease else None
 
-    def _strangers(self, who: list[Endpoint], own: int, cell: set[bytes]) -> list[str]:
+    def _strangers(self, who: list[Endpoint], own: int, cell: list[Endpoint]) -> list[str]:
         """Names of who neither is this node nor moves the robot for the cell."""
         ours = [one for one in who if one == self._own]
-        rest = [one for one in who if one != self._own and one.participant not in cell]
+        rest = [
+            one
+            for one in who
+            if one != self._own and not any(one.may_be_node_of(holder) for holder in cell)
+        ]
         names = [_name(one, self._own.name) for one in rest]
         if len(ours) > own:
             names.append(f"a second {self._own.name} in this process")
@@ -271,17 +303,11 @@ class CommandSources:
     while their topic has several publishers or on several topics, count as commands of several
     sources, and none of them is believed: the publishers that merely wait cannot be told apart.
 
-    Parameters
-    ----------
-    at_once_s : the short time.
-
-    Attributes
-    ----------
-    inputs : the subscriptions by topic.
+    The short time is ``at_once_s``.
     """
 
     def __init__(self, at_once_s: float) -> None:
-        self.inputs: dict[str, Subscription] = {}
+        self.inputs: dict[str, Subscription] = {}  # by topic
         self._at_once_s = at_once_s
         self._topic = ""
         self._heard_s = -math.inf

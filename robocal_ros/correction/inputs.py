@@ -15,6 +15,7 @@ from robocal_ros.core.samples import stamp_ns
 from robocal_ros.correction.refusals import Reason, RefusedError
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
 
 MOST_POINTS = 10_000  # of a trajectory: within 50 ms, so that nothing else waits longer
 TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
@@ -22,22 +23,13 @@ TAUGHT_TOOL = 0  # state of a robocal_msgs/ToolFrame: NONE
 
 @dataclass(frozen=True)
 class JointCommand:
-    """Joint targets or joint readings at one instant.
+    """Joint targets or joint readings at one instant."""
 
-    Attributes
-    ----------
-    names : the joints, in the message's order.
-    position : (k,) rad (prismatic: m).
-    velocity : (k,) or None when the message has none.
-    stamp_ns : source stamp; 0 when not set.
-    mark : ``frame_id`` of the message's header.
-    """
-
-    names: tuple[str, ...]
-    position: Array
-    velocity: Array | None = None
-    stamp_ns: int = 0
-    mark: str = ""
+    names: tuple[str, ...]  # in the message's order
+    position: Array  # (k,) rad (prismatic: m)
+    velocity: Array | None = None  # (k,)
+    stamp_ns: int = 0  # of the source; 0 when not set
+    mark: str = ""  # `frame_id` of the message's header
 
 
 @dataclass(frozen=True)
@@ -74,16 +66,10 @@ class OfferedModel:
 
 @dataclass(frozen=True)
 class OfferedTool:
-    """A measured tool that somebody published, absolute.
-
-    Attributes
-    ----------
-    parent, child : its frames' names.
-    T_flange_tool : (4, 4); None: the taught tool again.
-    """
+    """A measured tool that somebody published, absolute."""
 
     parent: str
-    T_flange_tool: Array | None
+    T_flange_tool: Array | None  # (4, 4); None: the taught tool again
     child: str
     robot: str
     serial: str
@@ -107,10 +93,7 @@ def _values(values: Any, names: tuple[str, ...], what: str) -> Array | None:
 def joint_command(message: Any) -> JointCommand:
     """Build from a ``sensor_msgs/JointState``.
 
-    Raises
-    ------
-    RefusedError
-        When names and values differ in number, or there are no positions.
+    Raises `RefusedError` when names and values differ in number, or there are no positions.
     """
     names = tuple(message.name)
     position = _values(message.position, names, "positions")
@@ -153,11 +136,8 @@ def require_few(points: int) -> None:
 def trajectory_command(message: Any) -> TrajectoryCommand:
     """Build from a ``trajectory_msgs/JointTrajectory``; one without points is a stop.
 
-    Raises
-    ------
-    RefusedError
-        When numbers differ, a point has no positions, only some points have a rate, or there are
-        too many points.
+    Raises `RefusedError` when numbers differ, a point has no positions, only some points have a
+    rate, or there are too many points.
     """
     names = tuple(message.joint_names)
     points = message.points
@@ -206,13 +186,7 @@ def _pose(translation: Any, rotation: Any, reason: Reason) -> Array:
 
 
 def offered_model(message: Any, accepted_state: int) -> OfferedModel:
-    """Build from a ``robocal_msgs/KinematicModel``.
-
-    Raises
-    ------
-    RefusedError
-        When numbers differ or are not finite.
-    """
+    """Build from a ``robocal_msgs/KinematicModel``; `RefusedError` for numbers that cannot be."""
     names = tuple(message.joint_names)
     columns = [message.d, message.theta, message.a, message.alpha, message.beta]
     if any(len(column) != len(names) for column in columns):
@@ -238,10 +212,7 @@ def offered_model(message: Any, accepted_state: int) -> OfferedModel:
 def offered_tool(message: Any, accepted_state: int) -> OfferedTool:
     """Build from a ``robocal_msgs/ToolFrame``; its state NONE says: the taught tool, as accepted.
 
-    Raises
-    ------
-    RefusedError
-        When a number is not finite or the quaternion is not of unit length.
+    Raises `RefusedError` for numbers that are no pose.
     """
     taught = int(message.state) == TAUGHT_TOOL
     pose = message.tool

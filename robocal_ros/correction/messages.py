@@ -6,37 +6,28 @@ way of a message, which is also what names their fault.
 
 import math
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration
-from numpy.typing import NDArray
 from rclpy.serialization import deserialize_message
-from robocal_msgs.msg import CorrectionStatus as StatusMessage
-from robocal_msgs.msg import JointOffset
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.inputs import (
+    Array,
     JointCommand,
     TrajectoryCommand,
     finite_command,
     joint_command,
-    require_few,
     require_finite,
     trajectory_command,
 )
-from robocal_ros.correction.refusals import Reason
-from robocal_ros.correction.serialized_path import SerializedPath, read_path
-from robocal_ros.correction.status import CorrectionStatus, Offset
-from robocal_ros.correction.wire import JointWire
-from robocal_ros.nodes.conversions import NS, header, transform_message
-
-Array = NDArray[np.float64]
+from robocal_ros.correction.wire import JointWire, SerializedPath, read_path
+from robocal_ros.nodes.conversions import NS, header
 
 POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
 POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = FIELDS = range(4)
@@ -48,13 +39,7 @@ def doubles(values: Array) -> "array[float]":
 
 
 def read_message(data: bytes, kind: type) -> Any:
-    """Build a message.
-
-    Raises
-    ------
-    InputError
-        When the bytes are no such message.
-    """
+    """Build a message; `InputError` when the bytes are none."""
     try:
         return deserialize_message(data, kind)
     except Exception as error:  # what the middleware says has no type of its own
@@ -72,16 +57,8 @@ def all_finite(*rows: Any) -> bool:
 class JointMessage:
     """A serialized ``JointState`` that came in, its command, and what goes out for it.
 
-    Parameters
-    ----------
-    wire : of its topic.
-    is_reading : velocities that are as many as joints, and efforts, go out empty where one is not
-        finite: many drivers have none.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
+    With ``is_reading`` velocities that are as many as joints, and efforts, go out empty where one
+    is not finite: many drivers have none. Raises `InputError` when it cannot be read.
     """
 
     def __init__(self, wire: JointWire, data: bytes, *, is_reading: bool = False) -> None:
@@ -169,27 +146,16 @@ def tail_message(command: JointCommand, kind: type, stamp_ns: int) -> Any:
 
 
 class PathMessage:
-    """A trajectory that came in, its command, and what goes out for it.
+    """A trajectory that ``came`` in, its command, and what goes out for it.
 
-    Parameters
-    ----------
-    came : serialized, or as a message.
-
-    Raises
-    ------
-    InputError
-        When it cannot be read.
-
-    Attributes
-    ----------
-    points : how many.
+    Raises `InputError` when it cannot be read.
     """
 
     def __init__(self, came: bytes | JointTrajectory) -> None:
         self._came = came
         self._path: SerializedPath | None = None
         if isinstance(came, bytes):
-            self._path = read_path(came, require_few)
+            self._path = read_path(came)
         self._read: Any = None
         self.points = len(self._message().points) if self._path is None else len(self._path)
 
@@ -208,13 +174,7 @@ class PathMessage:
         return all(bool(np.isfinite(values).all()) for values in rows if values is not None)
 
     def command(self) -> TrajectoryCommand:
-        """Build the session's command.
-
-        Raises
-        ------
-        RefusedError
-            As `trajectory_command`.
-        """
+        """Build the session's command; raises `RefusedError` as `trajectory_command`."""
         path = self._path
         if path is None:
             return trajectory_command(self._message())
@@ -254,125 +214,16 @@ class PathMessage:
         return message
 
 
-def stop_message(names: Sequence[str], position: Array, after_s: float) -> JointTrajectory:
-    """To rest at ``position`` (k,) after a time, at once.
-
-    One point: a controller makes a cubic to it, from where and as fast as it is when the message
-    comes, so that nothing of the time on the way is a step.
-    """
-    ns = round(after_s * NS)
-    point = JointTrajectoryPoint(
-        positions=doubles(position),
-        velocities=doubles(np.zeros(len(position))),
-        time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
-    )
-    return JointTrajectory(joint_names=list(names), points=[point])
-
-
-# ---- what the node tells ------------------------------------------------------------------------
-
-
-class CorrectionMessages:
-    """Status and offsets of one robot as messages.
-
-    Parameters
-    ----------
-    reference : with the taught tool.
-    name : the reference model's, as configured.
-    """
-
-    def __init__(
-        self, nominal: SerialArm, reference: SerialArm, name: str, serial: str, shadow: bool
-    ) -> None:
-        self._name = name
-        self._shadow = shadow
-        self._joint_names = list(nominal.joint_names)
-        self._own = {
-            "robot": nominal.name,
-            "serial": serial,
-            "model_hash": nominal.model_hash,
-            "taught_tool": transform_message(reference.T_flange_tool),
-            "shadow": shadow,
-        }
-
-    def offset(self, offset: Offset, cause: int, stamp_ns: int) -> JointOffset:
-        """What is added to the taught joints."""
-        return JointOffset(
-            header=header(stamp_ns, ""),
-            cause=cause,
-            joint_names=offset.names,
-            offset=doubles(offset.offset),
-            model_revision=offset.revision or 0,
-            tool_revision=offset.tool_revision or 0,
-            withheld=doubles(offset.withheld),
-            shadow=self._shadow,
+def stop_message(names: Sequence[str], times: Array, q: Array, qd: Array) -> JointTrajectory:
+    """Points (m, k) to rest, at once: a controller begins with a cubic from where it is."""
+    message = JointTrajectory(joint_names=list(names))
+    for after_s, position, velocity in zip(times.tolist(), q, qd, strict=True):
+        ns = round(after_s * NS)
+        message.points.append(
+            JointTrajectoryPoint(
+                positions=doubles(position),
+                velocities=doubles(velocity),
+                time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
+            )
         )
-
-    def status(
-        self, status: CorrectionStatus, commanders: str, lease: str, history: str, stamp_ns: int
-    ) -> StatusMessage:
-        """What the correction does.
-
-        ``commanders``: who else commands; ``lease``: who holds one; ``history``: what is wrong
-        with it; empty where all is well.
-        """
-        return StatusMessage(
-            header=header(stamp_ns, ""),
-            **self._own,
-            state=int(status.state),
-            reason=in_words(status),
-            reference=f"{self._name}: {status.reference}",
-            enabled=status.enabled,
-            policy=getattr(StatusMessage, status.policy.name),
-            model_revision=status.revision or 0,
-            tool_revision=status.tool_revision or 0,
-            model_waits=status.waiting_revision is not None,
-            waiting_model_revision=status.waiting_revision or 0,
-            tool_waits=status.waiting_tool is not None,
-            waiting_tool_revision=status.waiting_tool or 0,
-            stale=status.stale,
-            mismatch=status.mismatch,
-            commanders=commanders,
-            lease=lease,
-            history=history,
-            joint_names=self._joint_names,
-            withheld=doubles(status.withheld),
-            withheld_most=doubles(status.withheld_most),
-            withheld_mm=status.withheld_m * 1e3,
-            withheld_most_mm=status.withheld_most_m * 1e3,
-            lag_s=status.lag_s,
-            overtaken=status.overtaken,
-            tool_shift_mm=status.tcp_shift_m * 1e3,
-            remaining_mm=status.remaining_m * 1e3,
-            largest_offset=status.largest_shift,
-            reduced=status.reduced,
-            **_counts("refused", status.refused),
-            **_counts("clamped", status.clamped),
-            **_counts("passed", status.passed),
-            last_refusal=status.last_refusal,
-        )
-
-
-def _counts(what: str, counts: Mapping[Reason, int]) -> dict[str, Sequence[Any]]:
-    return {f"{what}_reasons": [r.value for r in counts], what: list(counts.values())}
-
-
-def in_words(status: CorrectionStatus) -> str:
-    """What the correction does now, in one line."""
-    said = _said(status)
-    return f"shadow, nothing is changed; it would be {said}" if status.shadow else said
-
-
-def _said(status: CorrectionStatus) -> str:
-    for reason, detail in status.held.items():
-        return f"nothing goes out, {reason.value}: {detail}"
-    if status.mismatch:
-        return f"nothing goes out, {Reason.START_MISMATCH.value}: {status.mismatch}"
-    if not status.enabled:
-        return "off, the offset goes to zero with the next commands" if status.active else "off"
-    parts = [] if status.revision is None else [f"model revision {status.revision}"]
-    parts += [f"tool revision {status.tool_revision}"] if status.new_tool else []
-    if not parts:
-        return "on, but there is no model and no tool yet: nothing is corrected"
-    settled = "on" if status.settled else "on, the offset changes with the next commands"
-    return f"{settled}: {' and '.join(parts)}"
+    return message

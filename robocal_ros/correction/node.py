@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease, ToolFrame
 from sensor_msgs.msg import JointState
@@ -28,14 +29,12 @@ from robocal_ros.correction.messages import (
     ArrayMessage,
     JointMessage,
     PathMessage,
-    in_words,
     stop_message,
     tail_message,
 )
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
-from robocal_ros.correction.reported import CorrectionState
 from robocal_ros.correction.robot_stop import REACTION_S, RobotStop, RobotTrack
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
@@ -45,14 +44,18 @@ from robocal_ros.correction.settings import (
     joint_limits,
     session_config,
 )
+from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
 from robocal_ros.nodes.diagnostics import Health
 from robocal_ros.nodes.endpoints import trigger_text
 from robocal_ros.nodes.run import run
 from robocal_ros.nodes.source_guard import SourceGuard
+
+Array = NDArray[np.float64]
 
 TRAJECTORY = "joint_trajectory"
 TARGETS = "joint_targets"
@@ -72,11 +75,12 @@ KINDS = {
 }
 ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
 AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
-STOP_SHARE = 0.55  # of its mean speed to its first one: a cubic then neither hastens nor turns back
+# A stop's first point that is sent: the controller makes a cubic to it from where and as fast as it
+# is, which does not turn back where the message comes 60 ms late.
+FIRST_S = 0.12
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
-PERCENT = 0.01
 
 
 class JointCorrectionNode(HouseNode):
@@ -118,14 +122,15 @@ class JointCorrectionNode(HouseNode):
         self._violation: GraphViolation | None = None
         self._commanded = self._by_action = False
         self._stream = TARGETS
-        self._scalings: dict[str, float] = {}
+        self._astray: SentPath | None = None  # a path that the robot is being stopped beside
+        self._scalings, self._scaling = SpeedScaling(), 1.0
         self._open_topics()
         self._open_action()
         self._report = CorrectionReport(
             self._session, self.settings, nominal, reference, self._offsets, self._statuses,
             self.now_ns,
         )  # fmt: skip
-        self._release.append(self._report.close)
+        self._release.append(self._report.log.close)
 
     def _open_topics(self) -> None:
         self._outputs = {
@@ -145,25 +150,12 @@ class JointCorrectionNode(HouseNode):
         else:
             self.add_input(ControllerState, CONTROLLER, self._on_controller, qos.NEWEST)
         states = partial(JointMessage, JointWire(is_reading=True), is_reading=True)
-        acts: dict[str, tuple[Callable[[Any], Any], Callable[[Any], None], Any]] = {
-            STATES: (states, self._on_states, qos.SENSOR),
-            TARGETS: (
-                partial(JointMessage, JointWire()),
-                partial(self._on_target, TARGETS),
-                qos.HEARTBEAT,
-            ),
-            COMMANDS: (
-                partial(ArrayMessage, self._names),
-                partial(self._on_target, COMMANDS),
-                qos.HEARTBEAT,
-            ),
-            TRAJECTORY: (self._read_path, self._on_path, qos.RELIABLE),
-        }
-        for topic, (read, act, profile) in acts.items():
-            receive = self._guarded(topic, read, act)
-            opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
-            if topic in self._senders:
-                self._senders[topic].inputs[topic] = opened
+        targets, act = partial(JointMessage, JointWire()), self._on_target
+        self._listen(STATES, states, self._on_states, qos.SENSOR)
+        self._listen(TARGETS, targets, partial(act, TARGETS), qos.HEARTBEAT)
+        commands = partial(ArrayMessage, self._names)
+        self._listen(COMMANDS, commands, partial(act, COMMANDS), qos.HEARTBEAT)
+        self._listen(TRAJECTORY, self._read_path, self._on_path, qos.RELIABLE)
         self.add_service(SetBool, "~/enable", self._on_enable)
         self.add_service(Trigger, "~/acknowledge", self._on_acknowledge)
         self.add_service(Trigger, "~/take_over", self._on_take_over)
@@ -177,8 +169,10 @@ class JointCorrectionNode(HouseNode):
     def _open_action(self) -> None:
         if self.settings[ACTION]:
             if self._proxy is None:
-                self._proxy = TrajectoryProxy(self, f"~/{ACTION}", self)
-            self._proxy.open(self.settings[ACTION])
+                self._proxy = TrajectoryProxy(
+                    self, f"~/{ACTION}", self._correct_goal, self._goal_sent, self._goal_lost
+                )
+            self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
         self._graph = GraphWatch(
             self,
@@ -198,7 +192,7 @@ class JointCorrectionNode(HouseNode):
         """
         self._look_at_graph()
         self._tell()
-        self.get_logger().info(in_words(self._session.status(time.monotonic())))
+        self.get_logger().info(self._session.status(time.monotonic()).in_words())
 
     def deactivate(self) -> None:
         """Bring the robot to rest, for half a second at most; goals under way are stopped."""
@@ -207,9 +201,7 @@ class JointCorrectionNode(HouseNode):
         try:
             self._session.hold(Reason.STOPPED, why, time.monotonic())
             self._stop(why)
-            while time.monotonic() < until_s and (
-                self._emit_tail() or self._stopping.look(time.monotonic(), self._scaling)
-            ):
+            while time.monotonic() < until_s and (self._emit_tail() or self._is_stopping()):
                 time.sleep(self._tail_period_s())
                 self.take_waiting()  # where the robot is
             if self._proxy is not None:
@@ -250,7 +242,7 @@ class JointCorrectionNode(HouseNode):
         status = self._session.status(time.monotonic())
         wanted = CorrectionState.ON if request.data else CorrectionState.OFF
         response.success = status.state is wanted and not status.shadow
-        response.message = in_words(status)
+        response.message = status.in_words()
         self.get_logger().info(f"enable {request.data}: {response.message}")
         self._tell()
         return response
@@ -258,7 +250,7 @@ class JointCorrectionNode(HouseNode):
     def _on_acknowledge(self, _: Any, response: Any) -> Any:
         """End a START_MISMATCH, and take note of a damaged history."""
         self._session.acknowledge()
-        self._report.acknowledge()
+        self._report.log.acknowledge()
         return self._answer("acknowledge", "", response)
 
     def _on_take_over(self, _: Any, response: Any) -> Any:
@@ -269,7 +261,7 @@ class JointCorrectionNode(HouseNode):
         return self._answer("take_over", refused, response)
 
     def _answer(self, what: str, refused: str, response: Any) -> Any:
-        words = refused or in_words(self._session.status(time.monotonic()))
+        words = refused or self._session.status(time.monotonic()).in_words()
         response.success = not refused
         code = Code.CONFLICT if refused else Code.ACCEPT
         response.message = trigger_text(0, code, words)
@@ -279,10 +271,10 @@ class JointCorrectionNode(HouseNode):
 
     # ---- what is corrected ----------------------------------------------------------------------
 
-    def _guarded(
-        self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None]
-    ) -> Callable[[Any], None]:
-        """Refuse what a correction node publishes itself, and commands of several sources.
+    def _listen(
+        self, topic: str, read: Callable[[Any], Any], act: Callable[[Any], None], profile: Any
+    ) -> None:
+        """Act on an input; refuse what a correction node publishes itself, and several sources.
 
         In shadow mode a message goes out as it came before anything else is done with it.
         """
@@ -300,12 +292,14 @@ class JointCorrectionNode(HouseNode):
                 self._refuse_message(topic, Reason.TWO_SOURCES, rivals, now)
             act(message)
 
-        return receive
+        opened = self.add_input(KINDS[topic], topic, receive, profile, raw=topic != COMMANDS)
+        if senders:
+            senders.inputs[topic] = opened
 
     def _refuse_message(self, topic: str, reason: Reason, detail: str, now_s: float) -> NoReturn:
         """Refuse a message; a stream that it is of is ended in order."""
         if topic in (TARGETS, COMMANDS):
-            self._session.end_stream(RefusedError(reason, detail), now_s)
+            self._session.stream.end(RefusedError(reason, detail), now_s)
             self._arm_tail()
         self._session.refuse(reason, detail)
 
@@ -324,6 +318,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_states(self, message: JointMessage) -> None:
         command, now = self._session.counted(message.command), time.monotonic()
+        self._rescale(now)
         age = (self.now_ns() - command.stamp_ns) * 1e-9 if command.stamp_ns else 0.0
         taught = self._session.reading(command, now, age)
         self._track.read(command, now)
@@ -338,8 +333,8 @@ class JointCorrectionNode(HouseNode):
             return
         self._put_out(TRAJECTORY, message, *self._corrected(message))
         self._by_action = False
-        if self._session.path is not None:
-            self._session.path.begin(time.monotonic())
+        if self._session.output.path is not None:
+            self._session.output.path.begin(time.monotonic())
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
 
     def _stop_for_no_points(self) -> None:
@@ -369,7 +364,7 @@ class JointCorrectionNode(HouseNode):
 
     # ---- goals of the action --------------------------------------------------------------------
 
-    def correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
+    def _correct_goal(self, trajectory: JointTrajectory) -> tuple[JointTrajectory, SentPath | None]:
         """A goal's trajectory, corrected, and its path; as it came in shadow mode."""
         message = PathMessage(trajectory)
         try:
@@ -379,7 +374,7 @@ class JointCorrectionNode(HouseNode):
             if held_back or not self._shadow:
                 raise
             return trajectory, None
-        path = None if self._shadow else self._session.path
+        path = None if self._shadow else self._session.output.path
         try:
             return trajectory if command is came else message.changed(command), path
         except Exception:
@@ -387,18 +382,14 @@ class JointCorrectionNode(HouseNode):
                 self._session.reject(path)
             raise
 
-    def goal_sent(self) -> None:
+    def _goal_sent(self) -> None:
         """Tell what a goal is corrected by."""
         self._by_action = True
         self._tell_offset(JointOffset.TRAJECTORY, time.monotonic())
 
-    def goal_rejected(self, path: SentPath) -> None:
-        """What the goal took the place of goes on."""
-        self._session.reject(path)
-
-    def uncorrect(self, names: Any, position: Any, velocity: Any) -> Any:
-        """As `CorrectionSession.taught`, now."""
-        return self._session.taught(names, position, velocity, time.monotonic())
+    def _goal_lost(self, why: str) -> None:
+        """The robot may still follow it, and is stopped by where it is."""
+        self._stop_by_readings(why, time.monotonic())
 
     # ---- stops, and what goes out without a message ---------------------------------------------
 
@@ -407,57 +398,80 @@ class JointCorrectionNode(HouseNode):
         now = time.monotonic()
         if self._shadow:
             return
-        planned = self._session.stop(now, AHEAD_S)
-        self._arm_tail()
-        sent = True
-        if planned is not None:
-            way_s = AHEAD_S - REACTION_S + 0.5 * float(planned.time_from_start_s[-1] - AHEAD_S)
-            after_s = way_s / STOP_SHARE
-            sent = self._send_stop(planned.names, planned.position[-1], after_s, why)
-            self._stopping.watch(why, after_s, now)
+        self._rescale(now)
+        path, sent = self._session.output.path, True
+        if path is not None and path.live(now) and not self._track.follows(path, now):
+            self._session.stream.end(RefusedError(Reason.STOPPED, why), now)
+            sent = self._stop_by_readings(why, now)
+        elif (planned := self._session.stop(now, AHEAD_S)) is not None:
+            times, q, qd = planned.time_from_start_s, planned.position, planned.velocity
+            assert qd is not None
+            k = min(int(np.searchsorted(times, FIRST_S)), len(times) - 1)
+            sent = self._send_stop(planned.names, times[k:] - REACTION_S, q[k:], qd[k:], why)
+            self._stopping.watch(why, times, np.abs(qd).max(axis=1), now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
-            sent = self._stopping.begin(why, now)
+            sent = self._stop_by_readings(why, now)
+        self._arm_tail()
         if not sent and self._proxy is not None:
             self._proxy.cancel(why)
         if self._stopping.why:
             self._stop_timer.reset()
 
-    def _send_plan(self, plan: JointPlan) -> None:
-        self._send_stop(self._arm_names, plan.q[-1], plan.duration_s, self._stopping.why)
+    def _stop_by_readings(self, why: str, now_s: float) -> bool:
+        """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
+        self._astray = self._session.output.path
+        sent = self._stopping.begin(why, now_s)
+        if sent:
+            self._stop_timer.reset()
+        return sent
 
-    def _send_stop(self, names: Any, position: Any, after_s: float, why: str) -> bool:
-        message = stop_message(names, position, after_s)
+    def _send_plan(self, plan: JointPlan) -> None:
+        end = plan.time_s[-1:], plan.q[-1:], plan.qd[-1:]
+        self._send_stop(self._arm_names, *end, self._stopping.why)
+
+    def _send_stop(self, names: Any, times: Array, q: Array, qd: Array, why: str) -> bool:
+        message = stop_message(names, times, q, qd)
         if self._by_action and self._proxy is not None:
             return self._proxy.stop(message, why)
         self._outputs[TRAJECTORY].publish(message)
         return True
 
     def _watch_stop(self) -> None:
-        if not self._stopping.look(time.monotonic(), self._scaling):
+        if not self._is_stopping():
             self._stop_timer.cancel()
             if self._stopping.fault:
                 self.get_logger().error(self._stopping.fault)
             if self._proxy is not None:
                 self._proxy.end("stopped")
 
+    def _is_stopping(self) -> bool:
+        """Let a stop go on; whether one is under way."""
+        now = time.monotonic()
+        if self._stopping.look(now, self._scaling):
+            return True
+        if self._astray is not None and not self._stopping.fault:
+            self._astray.end(now)
+        self._astray = None
+        return False
+
     def _arm_tail(self) -> None:
         """Put out what must go out without a message, now and after each period of the stream."""
-        if self._session.has_tail and not self._shadow:
+        if self._session.stream.has_tail and not self._shadow:
             self._emit_tail()
             self._tail_timer.timer_period_ns = round(self._tail_period_s() * 1e9)
             self._tail_timer.reset()
 
     def _tail_period_s(self) -> float:
-        period = self._session.stream_period_s
+        period = self._session.stream.period_s
         return min(max(period, 1e-3), 0.1) if math.isfinite(period) else TAIL_S
 
     def _on_tail(self) -> None:
-        if not self._emit_tail() and not self._session.has_tail:
+        if not self._emit_tail() and not self._session.stream.has_tail:
             self._tail_timer.cancel()
 
     def _emit_tail(self) -> bool:
         """Put out what must go out now although no message came; whether something did."""
-        command = self._session.tail(time.monotonic())
+        command = self._session.stream.tail(time.monotonic())
         if command is not None:
             kind = KINDS[self._stream]
             self._outputs[self._stream].publish(tail_message(command, kind, self.now_ns()))
@@ -465,30 +479,30 @@ class JointCorrectionNode(HouseNode):
 
     # ---- the controller -------------------------------------------------------------------------
 
-    @property
-    def _scaling(self) -> float:
-        """How fast the controller's clock runs, by who says least."""
-        return min(self._scalings.values(), default=1.0)
-
     def _on_controller(self, message: Any) -> None:
-        """Where the controller is. Older ones leave the scaling at 0, and so say nothing by it."""
-        self._scale(CONTROLLER, float(getattr(message, "speed_scaling_factor", math.nan)))
+        """Where the controller is, and how fast its clock runs."""
+        now = time.monotonic()
+        self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
+        self._rescale(now)
         position = np.array(message.reference.positions, dtype=np.float64)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
             self._scaling,
-            time.monotonic(),
+            now,
         )
 
     def _on_scaling(self, message: Any) -> None:
-        """In percent, as ur_robot_driver's speed_scaling_state_broadcaster publishes it."""
-        self._scale(SCALING, float(message.data) * PERCENT)
-        self._session.controller((), np.empty(0), self._scaling, time.monotonic())
+        now = time.monotonic()
+        self._scalings.slider(float(message.data), now)
+        self._rescale(now)
 
-    def _scale(self, topic: str, scaling: float) -> None:
-        if math.isfinite(scaling) and (scaling > 0.0 or topic in self._scalings):
-            self._scalings[topic] = min(max(scaling, 0.0), 1.0)
+    def _rescale(self, now_s: float) -> None:
+        """How fast the controller's clock runs now; as planned where nobody told it lately."""
+        scaling = self._scalings.at(now_s)
+        before, self._scaling = self._scaling, 1.0 if scaling is None else scaling
+        if self._scaling != before:
+            self._session.controller((), np.empty(0), self._scaling, now_s)
 
     # ---- who else commands ----------------------------------------------------------------------
 
@@ -504,8 +518,11 @@ class JointCorrectionNode(HouseNode):
 
     def _judge_graph(self) -> None:
         """Hold the program's commands while somebody else may move the robot."""
-        now, before = time.monotonic(), self._violation
-        found = self._violation = self._graph.look(now)
+        now, before, lost = time.monotonic(), self._violation, self._graph.lost
+        stood_s = self._track.stood_s(now) if self._scaling else 0.0  # one that pauses goes on
+        found = self._violation = self._graph.look(now, stood_s)
+        if self._graph.lost and not lost:
+            self.get_logger().error(self._graph.lost)
         for reason in (Reason.OTHER_COMMANDER, Reason.LEASED):
             if found is not None and found.reason is reason:
                 self._session.hold(reason, found.detail, now)
@@ -530,6 +547,7 @@ class JointCorrectionNode(HouseNode):
     def _look(self) -> None:
         """Let time pass, and tell what has changed."""
         now = time.monotonic()
+        self._rescale(now)
         self._session.look(now, self.now_ns())
         if self._commanded:
             self._tell_offset(JointOffset.PERIODIC, now)
@@ -554,7 +572,7 @@ class JointCorrectionNode(HouseNode):
 
     def health(self) -> Health:
         """Tell what is corrected, and what was refused and why."""
-        faults = [*self._faults(), *filter(None, [self._stopping.fault])]
+        faults = [*self._faults(), *filter(None, [self._stopping.fault, self._graph.lost])]
         return self._report.health(faults, self._rivals())
 
 

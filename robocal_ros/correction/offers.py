@@ -1,31 +1,19 @@
-"""Which models and tools the correction takes over."""
+"""Which models and tools the correction takes over, and when."""
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction.bounds import CorrectionConfig, Survey, survey
-from robocal_ros.correction.inputs import OfferedModel, OfferedTool
+from robocal_ros.correction.bounds import ROUNDING, CorrectionConfig, Survey, survey
+from robocal_ros.correction.inputs import Array, OfferedModel, OfferedTool
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.refusals import Reason, RefusedError
-from robocal_ros.correction.tools import ToolGate
-
-Array = NDArray[np.float64]
 
 
 class CorrectionGate:
-    """Judges offered models and tools, and keeps the last good ones.
-
-    Attributes
-    ----------
-    revision : of the model taken over, None before the first.
-    survey : its correction over the joint range.
-    waiting : a model that was refused but may be taken over when it is looked at again.
-    stale : why the model is too old to be used, in words; empty when it is not.
-    tools : the measured tools.
-    """
+    """Judges offered models and tools, and keeps the last good ones."""
 
     def __init__(
         self, nominal: SerialArm, reference: SerialArm, serial: str, config: CorrectionConfig
@@ -39,10 +27,10 @@ class CorrectionGate:
         self._serial = serial
         self._config = config
         self._model: OfferedModel | None = None
-        self.revision: int | None = None
-        self.survey = Survey(0.0, 0.0, 0.0)
-        self.waiting: OfferedModel | None = None
-        self.stale = ""
+        self.revision: int | None = None  # of the model taken over
+        self.survey = Survey(0.0, 0.0, 0.0)  # its correction over the joint range
+        self.waiting: OfferedModel | None = None  # refused, and to be taken over if looked at again
+        self.stale = ""  # why the model is too old to be used
         self.tools = ToolGate(reference.T_flange_tool, config)
 
     @property
@@ -61,11 +49,8 @@ class CorrectionGate:
         newer by its stamp, or be looked at (``again``). One that is refused for this, or for its
         size here, waits for `look_again`.
 
-        Raises
-        ------
-        RefusedError
-            When it is not accepted, made for another robot, older than the one in use, or would
-            move the tool beyond the bounds where the robot is or goes.
+        Raises `RefusedError` when it is not accepted, made for another robot, older than the one
+        in use, or would move the tool beyond the bounds where the robot is or goes.
         """
         if not model.accepted:
             raise RefusedError(Reason.NOT_ACCEPTED, f"revision {model.revision}")
@@ -156,15 +141,86 @@ class CorrectionGate:
             )
 
     def take_tool(self, tool: OfferedTool) -> None:
-        """Let a tool wait for its adoption.
-
-        Raises
-        ------
-        RefusedError
-            When it was made for another robot; else as `ToolGate.take`.
-        """
+        """As `ToolGate.take`; raises `RefusedError` also when it was made for another robot."""
         self._require_robot(tool)
         self.tools.take(tool)
+
+
+class ToolGate:
+    """Judges the measured tools of this robot, and keeps the last good one until it may be used.
+
+    One that is ``waiting`` is adopted when the robot stands or a trajectory begins; one that was
+    ``refused`` is older than the one before by revision and stamp, and is to be looked at again.
+    """
+
+    def __init__(self, taught: Array, config: CorrectionConfig) -> None:
+        self._taught = taught
+        self._config = config
+        self.in_use: OfferedTool | None = None
+        self.waiting: OfferedTool | None = None
+        self.refused: OfferedTool | None = None
+
+    @property
+    def T_flange_tool(self) -> Array | None:
+        """The tool in use; None: the taught one."""
+        return None if self.in_use is None else self.in_use.T_flange_tool
+
+    def take(self, tool: OfferedTool, *, again: bool = False) -> None:
+        """Let a tool wait for its adoption; one that is in use already only ends the wait.
+
+        A revision that is not newer than the last one must be newer by its stamp, or be looked
+        at (``again``).
+
+        Raises `RefusedError` when it is not accepted, its frames are not the configured ones, it
+        is older than the last one, or too far from the taught tool.
+        """
+        if not tool.accepted:
+            raise RefusedError(Reason.NOT_ACCEPTED, f"tool revision {tool.revision}")
+        self._require_frames(tool)
+        if tool.T_flange_tool is not None:
+            self._require_small(tool.T_flange_tool)
+        self.refused = None
+        last = self.waiting or self.in_use
+        known = last is not None and _same_tool(tool, last)
+        later = last is None or _later(tool, last)
+        if not (known or later or again):
+            self.refused = tool
+            raise RefusedError(
+                Reason.OLD_REVISION,
+                f"tool revision {tool.revision} is another tool than the last one and not newer "
+                "by its stamp; ~/take_over takes it over",
+            )
+        if self.in_use is not None and _same_tool(tool, self.in_use):
+            self.in_use, self.waiting = tool, None
+        else:
+            self.waiting = tool
+
+    def look_again(self) -> None:
+        """Take the tool that was refused for its revision, if there is one."""
+        if self.refused is not None:
+            self.take(self.refused, again=True)
+
+    def adopt(self) -> None:
+        """Use the tool that waits, if there is one."""
+        self.in_use, self.waiting = self.waiting or self.in_use, None
+
+    def _require_frames(self, tool: OfferedTool) -> None:
+        parent, child = self._config.flange_frame, self._config.tool_frame
+        if child and tool.child != child:
+            raise RefusedError(Reason.BAD_TOOL, f"child '{tool.child}', expected '{child}'")
+        if tool.parent != parent:
+            raise RefusedError(Reason.BAD_TOOL, f"parent '{tool.parent}', expected '{parent}'")
+
+    def _require_small(self, T_flange_tool: Array) -> None:
+        taught, bound = self._taught, self._config.tool
+        shift = float(np.linalg.norm(T_flange_tool[:3, 3] - taught[:3, 3]))
+        turn = float(np.linalg.norm(frames.log_rotation(T_flange_tool[:3, :3] @ taught[:3, :3].T)))
+        if shift > bound.tcp_m + ROUNDING or turn > bound.tcp_rad + ROUNDING:
+            raise RefusedError(
+                Reason.TOOL_BOUND,
+                f"{shift * 1e3:.3f} mm and {np.degrees(turn):.3f} deg from the taught tool, "
+                f"allowed {bound.tcp_m * 1e3:g} mm and {np.degrees(bound.tcp_rad):g} deg",
+            )
 
 
 def _same(a: OfferedModel, b: OfferedModel) -> bool:
@@ -175,5 +231,11 @@ def _same(a: OfferedModel, b: OfferedModel) -> bool:
     )
 
 
-def _later(a: OfferedModel, b: OfferedModel) -> bool:
+def _same_tool(a: OfferedTool, b: OfferedTool) -> bool:
+    if a.T_flange_tool is None or b.T_flange_tool is None:
+        return a.revision == b.revision and a.T_flange_tool is b.T_flange_tool
+    return a.revision == b.revision and np.array_equal(a.T_flange_tool, b.T_flange_tool)
+
+
+def _later(a: OfferedModel | OfferedTool, b: OfferedModel | OfferedTool) -> bool:
     return a.revision > b.revision or a.stamp_ns > b.stamp_ns

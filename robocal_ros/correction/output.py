@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.inputs import Array, Index
 from robocal_ros.correction.limiter import (
     DESIRED,
     DESIRED_RATE,
@@ -21,43 +21,27 @@ from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 ROUNDING = 1e-9
 
 
 @dataclass
 class SentPath:
-    """A trajectory that was put out, and the controller's clock on it.
+    """A trajectory that was put out, and the controller's clock on it."""
 
-    Attributes
-    ----------
-    index : (k,) its joints.
-    times : (m,) of its points, s; ``begin_s`` is their zero on the session's clock.
-    out, velocity : (m, k) as put out; ``velocity`` None for straight lines between the points.
-    known_times : (r,) of the rows below: those of the points, and before them when it was put out,
-        where it leads in.
-    offsets, rates, withheld : (r, n) offset, its rate, and what of it the limiter adds.
-    stage : the correction that it was made with; None for none.
-    led_from, put_s : (k,) where the controller leads in from, since when.
-    replaced : what it took the place of, until the controller is known to have accepted it.
-    """
-
-    index: Index
-    begin_s: float
-    times: Array
-    out: Array
-    velocity: Array | None
-    known_times: Array
-    offsets: Array
-    rates: Array
-    withheld: Array
-    stage: StagedCorrection | None
-    led_from: Array
-    put_s: float
-    at_once: bool
-    replaced: "SentPath | None" = None
+    index: Index  # (k,) its joints
+    begin_s: float  # zero of ``times`` on the session's clock
+    times: Array  # (m,) of its points, s
+    out: Array  # (m, k) as put out
+    velocity: Array | None  # (m, k); None for straight lines between the points
+    known_times: Array  # (r,) of the next rows: its points, before them where it leads in
+    offsets: Array  # (r, n)
+    rates: Array  # (r, n) of the offset
+    withheld: Array  # (r, n) what of it the limiter adds
+    stage: StagedCorrection | None  # that it was made with
+    led_from: Array  # (k,) where the controller leads in from
+    put_s: float  # since when
+    at_once: bool  # it begins as it goes out
+    replaced: "SentPath | None" = None  # by it, until the controller accepts it
     rejected: bool = False
     _scaling: float = 1.0
     _lost_s: float = 0.0  # by a clock that runs slower
@@ -120,29 +104,34 @@ class SentPath:
         t = self.time(now_s)
         return np.array([np.interp(t, self.known_times, column) for column in rows.T])
 
+    def offset(self, now_s: float) -> tuple[Array, Array]:
+        """Offset and its rate (n,) now, as the controller drives them between the points."""
+        t, times = self.time(now_s), self.known_times
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        if self.velocity is None or not 0 <= k < len(times) - 1:
+            return self.at(self.offsets, now_s), self.at(self.rates, now_s)
+        h = times[k + 1] - times[k]
+        s, v0, v1 = (t - times[k]) / h, self.rates[k], self.rates[k + 1]
+        way = (self.offsets[k + 1] - self.offsets[k]) / h
+        first, second = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
+        offset = self.offsets[k] + h * s * (v0 + s * (first + s * second))
+        return offset, v0 + s * (2.0 * first + 3.0 * s * second)
+
 
 class Output:
-    """What was put out last for each joint.
-
-    Attributes
-    ----------
-    limiter : the offsets of a stream, and of the begin of what comes next.
-    stage : the correction of the last target; None for none.
-    taught, out : (n,) the last target, as it was followed, and what went out; NaN before any.
-    out_s : when.
-    path : the trajectory that was put out since; None after a target.
-    mismatch : why nothing goes out until it is acknowledged; empty when nothing is wrong.
-    """
+    """What was put out last for each joint."""
 
     def __init__(self, arm: SerialArm, config: CorrectionConfig, state: RobotState) -> None:
         self._state, self._near = state, config.start_near(arm)
         self._fastest = config.velocity_limits
+        # the offsets of a stream, and of the begin of what comes next
         self.limiter = OffsetLimiter(arm.prismatic, config.turning, config.sliding)
-        self.stage: StagedCorrection | None = None
+        self.stage: StagedCorrection | None = None  # of the last target
+        # (n,) the last target, as it was followed, and what went out; NaN before any
         self.taught, self.out = np.full((2, arm.n), np.nan)
-        self.out_s = -np.inf
-        self.path: SentPath | None = None
-        self.mismatch = ""
+        self.out_s = -np.inf  # when
+        self.path: SentPath | None = None  # put out since; None after a target
+        self.mismatch = ""  # why nothing goes out until it is acknowledged
         self._track: deque[tuple[float, Array]] = deque()  # where the controller was sent lately
 
     # ---- the offset -----------------------------------------------------------------------------
@@ -170,10 +159,8 @@ class Output:
         way; else where the robot stands, joints without limits at the turn nearest to ``q`` (k,):
         what reads them may count no turns, what drives them does.
 
-        Raises
-        ------
-        RefusedError
-            When readings are missing or old, or the robot moves and not by what was put out.
+        Raises `RefusedError` when readings are missing or old, or the robot moves and not by what
+        was put out.
         """
         state = self._state
         known = state.reference(index, now_s)
@@ -212,12 +199,8 @@ class Output:
         """Offsets (k,) with which joints may begin at once at taught ones ``q`` (n,).
 
         The controller must be where they begin with an offset between the last one and those that
-        a robot may show, ``begins`` (r, n).
-
-        Raises
-        ------
-        RefusedError
-            As `place`, and when it is elsewhere.
+        a robot may show, ``begins`` (r, n). Raises `RefusedError` as `place`, and when it is
+        elsewhere.
         """
         place, exact = self.place(index, q[index], now_s)
         offset, beside = self._taken_up(index, place - q[index], begins, exact=exact)
@@ -266,7 +249,10 @@ class Output:
             return None, whole
         if not exact:
             return None
-        taught = self.uncorrected(place, now_s)
+        if self.path is not None and self.path.live(now_s):
+            taught = place - self.path.offset(now_s)[0]
+        else:
+            taught = self.uncorrected(place, now_s)
         return taught, place - taught
 
     def refuse(self, detail: str) -> RefusedError:
@@ -287,9 +273,9 @@ class Output:
         """The offset goes on from the path that was put out last."""
         if self.path is not None:
             state, path = self.limiter.state, self.path
-            state[OFFSET] = path.at(path.offsets, now_s)
+            state[OFFSET], rate = path.offset(now_s)
             moving = path.time(now_s) < path.times[-1] and path.live(now_s)
-            state[OFFSET_RATE] = path.at(path.rates, now_s) if moving else 0.0
+            state[OFFSET_RATE] = rate if moving else 0.0
             state[DESIRED] = state[OFFSET] - path.at(path.withheld, now_s)
             state[DESIRED_RATE], state[SHARE] = 0.0, 1.0
 

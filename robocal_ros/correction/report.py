@@ -4,32 +4,30 @@ import queue
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from rclpy.publisher import Publisher
+from robocal_msgs.msg import CorrectionStatus as StatusMessage
+from robocal_msgs.msg import JointOffset
 
 from robocal_ros import __version__
 from robocal_ros.core import frames
 from robocal_ros.core.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction.messages import CorrectionMessages, in_words
+from robocal_ros.correction.messages import doubles
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.correction.status import CorrectionStatus
 from robocal_ros.nodes.base import NO_SERIAL
+from robocal_ros.nodes.conversions import header, transform_message
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
-from robocal_ros.nodes.history_settings import (
-    acknowledge_history,
-    history_notice,
-    open_history,
-)
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.nodes.history_settings import acknowledge_history, history_notice, open_history
 
 TELL_S = 1.0  # the status goes out at least so often
 LOOK_S = 0.1  # between two looks at what has changed
@@ -38,6 +36,8 @@ FIGURES = (
     "header", "tool_shift_mm", "largest_offset", "remaining_mm", "withheld", "withheld_most",
     "withheld_mm", "withheld_most_mm", "lag_s",
 )  # fmt: skip
+# Fields of the message that are those of the session.
+SAME = ("enabled", "stale", "mismatch", "lag_s", "overtaken", "reduced", "last_refusal")
 RETRY_S = 5.0
 CLOSE_S = 5.0  # the end of the node waits so long for what is not yet written
 MOST_WAITING = 1000  # then the oldest are lost
@@ -49,27 +49,12 @@ class CorrectionLog:
     """Keeps each change of what is corrected with, from the first record on; and watches the disk.
 
     A thread of its own reads and writes: a disk that is slow, full or locked holds no command up.
-    What cannot be written is told and tried again.
-
-    Parameters
-    ----------
-    open_history : raises `RobocalError`. It is opened anew for what has changed.
-    notice : of a damaged history that nobody has acknowledged; empty without one.
-    acknowledge : writes down that somebody has; raises `RobocalError`.
-
-    Attributes
-    ----------
-    fault : why something waits to be written; empty when nothing does.
-    damage : the last notice.
+    What cannot be written is told and tried again. ``fault`` says why something waits to be
+    written, ``damage`` what is wrong with a history that nobody has acknowledged.
     """
 
-    def __init__(
-        self,
-        open_history: Callable[[], CalibrationHistory],
-        notice: Callable[[], str],
-        acknowledge: Callable[[], object],
-    ) -> None:
-        self._open, self._notice, self._acknowledge = open_history, notice, acknowledge
+    def __init__(self, settings: Mapping[str, Any], nominal: SerialArm) -> None:
+        self._settings, self._nominal = settings, nominal
         self._last: CorrectionRecord | None = None
         self._noted: queue.SimpleQueue[CorrectionRecord | str] = queue.SimpleQueue()
         self._waiting: deque[CorrectionRecord] = deque(maxlen=MOST_WAITING)
@@ -106,10 +91,10 @@ class CorrectionLog:
     def _try(self, *, acknowledges: bool) -> None:
         try:
             if acknowledges:
-                self._acknowledge()
-            self.damage = self._notice()
+                acknowledge_history(self._settings, ACKNOWLEDGED_BY)
+            self.damage = history_notice(self._settings)
             if self._waiting:
-                with self._open() as history:
+                with open_history(self._settings, self._nominal, owner=False)[1] as history:
                     while self._waiting:
                         history.note_correction(self._waiting[0])
                         self._waiting.popleft()
@@ -120,13 +105,9 @@ class CorrectionLog:
 
 
 class CorrectionReport:
-    """Tells what a session does, from its configuration to `close`.
+    """Tells what a session does, until its ``log`` is closed.
 
-    Parameters
-    ----------
-    nominal, reference : models; the reference with the taught tool.
-    offsets, statuses : publishers.
-    now_ns : the clock of what is published.
+    ``reference`` has the taught tool; ``now_ns`` is the clock of what is published.
     """
 
     def __init__(
@@ -142,9 +123,14 @@ class CorrectionReport:
         self._session, self._now_ns = session, now_ns
         self._offsets, self._statuses = offsets, statuses
         serial, chosen = settings["serial"] or NO_SERIAL, settings["reference"]
-        self._messages = CorrectionMessages(
-            nominal, reference, chosen, serial, bool(settings["shadow"])
-        )
+        self._joint_names, self._chosen = list(nominal.joint_names), chosen
+        self._own = {
+            "robot": nominal.name,
+            "serial": serial,
+            "model_hash": nominal.model_hash,
+            "taught_tool": transform_message(reference.T_flange_tool),
+            "shadow": bool(settings["shadow"]),
+        }
         self._refusals = 0
         self._told: list[str] = []
         self._told_s = 0.0
@@ -159,25 +145,24 @@ class CorrectionReport:
             reference_hash=reference.model_hash,
             taught_tool=(*T[:3, 3].tolist(), *frames.quat_xyzw(T).tolist()),
         )
-        self._log = CorrectionLog(
-            lambda: open_history(settings, nominal, owner=False)[1],
-            lambda: history_notice(settings),
-            lambda: acknowledge_history(settings, ACKNOWLEDGED_BY),
-        )
-
-    def close(self) -> None:
-        """Finish the history."""
-        self._log.close()
-
-    def acknowledge(self) -> None:
-        """Somebody has taken note of what the history tells."""
-        self._log.acknowledge()
+        self.log = CorrectionLog(settings, nominal)
 
     def offset(self, cause: int, now_s: float) -> None:
         """Publish what is added to the taught joints, while somebody subscribes."""
-        if self._offsets.get_subscription_count():
-            offset = self._session.offset(now_s)
-            self._offsets.publish(self._messages.offset(offset, cause, self._now_ns()))
+        if not self._offsets.get_subscription_count():
+            return
+        offset = self._session.offset(now_s)
+        message = JointOffset(
+            header=header(self._now_ns(), ""),
+            cause=cause,
+            joint_names=offset.names,
+            offset=doubles(offset.offset),
+            model_revision=offset.revision or 0,
+            tool_revision=offset.tool_revision or 0,
+            withheld=doubles(offset.withheld),
+            shadow=self._own["shadow"],
+        )
+        self._offsets.publish(message)
 
     def status(self, commanders: str, lease: str, *, only_news: bool = False) -> None:
         """Publish the status; a figure of the last command alone is no news.
@@ -186,18 +171,14 @@ class CorrectionReport:
         """
         now = time.monotonic()
         status = self._session.status(now)
-        message = self._messages.status(status, commanders, lease, self._log.damage, self._now_ns())
+        message = self._message(status)
+        message.commanders, message.lease, message.history = commanders, lease, self.log.damage
         names = message.get_fields_and_field_types()
         told = [str(getattr(message, name)) for name in names if name not in FIGURES]
         if only_news and told == self._told and now - self._told_s < TELL_S - 0.5 * LOOK_S:
             return
         self._told, self._told_s = told, now
-        self._note(status)
-        self._statuses.publish(message)
-
-    def _note(self, status: CorrectionStatus) -> None:
-        """Keep in the history what has changed."""
-        self._log.note(
+        self.log.note(
             self._record(
                 wall_ns=time.time_ns(),
                 enabled=status.enabled,
@@ -205,6 +186,35 @@ class CorrectionReport:
                 model_revision=0 if status.stale else status.revision or 0,
                 tool_revision=status.tool_revision or 0,
             )
+        )
+        self._statuses.publish(message)
+
+    def _message(self, status: CorrectionStatus) -> StatusMessage:
+        return StatusMessage(
+            header=header(self._now_ns(), ""),
+            **self._own,
+            **{name: getattr(status, name) for name in SAME},
+            state=int(status.state),
+            reason=status.in_words(),
+            reference=f"{self._chosen}: {status.reference}",
+            policy=getattr(StatusMessage, status.policy.name),
+            model_revision=status.revision or 0,
+            tool_revision=status.tool_revision or 0,
+            model_waits=status.waiting_revision is not None,
+            waiting_model_revision=status.waiting_revision or 0,
+            tool_waits=status.waiting_tool is not None,
+            waiting_tool_revision=status.waiting_tool or 0,
+            joint_names=self._joint_names,
+            withheld=doubles(status.withheld),
+            withheld_most=doubles(status.withheld_most),
+            withheld_mm=status.withheld_m * 1e3,
+            withheld_most_mm=status.withheld_most_m * 1e3,
+            tool_shift_mm=status.tcp_shift_m * 1e3,
+            remaining_mm=status.remaining_m * 1e3,
+            largest_offset=status.largest_shift,
+            **_counts("refused", status.refused),
+            **_counts("clamped", status.clamped),
+            **_counts("passed", status.passed),
         )
 
     def health(self, faults: list[str], warnings: list[str]) -> Health:
@@ -222,11 +232,15 @@ class CorrectionReport:
             faults = [*faults, f"{Reason.START_MISMATCH.value}: {status.mismatch}"]
         for fault in faults:
             health.worsen(ERROR, fault)
-        for warning in [*warnings, *_warnings(status), self._log.damage, self._log.fault]:
+        for warning in [*warnings, *_warnings(status), self.log.damage, self.log.fault]:
             if warning:
                 health.worsen(WARN, warning)
         health.values = _figures(status)
         return health
+
+
+def _counts(what: str, counts: Mapping[Reason, int]) -> dict[str, Sequence[Any]]:
+    return {f"{what}_reasons": [r.value for r in counts], what: list(counts.values())}
 
 
 def _warnings(status: CorrectionStatus) -> list[str]:
@@ -246,7 +260,7 @@ def _warnings(status: CorrectionStatus) -> list[str]:
 def _figures(status: CorrectionStatus) -> dict[str, object]:
     counts = {"refused": status.refused, "clamped": status.clamped, "passed": status.passed}
     figures: dict[str, object] = {
-        "correction": in_words(status),
+        "correction": status.in_words(),
         "reference": status.reference,
         "policy": status.policy.value,
         "tool waits": "" if status.waiting_tool is None else f"revision {status.waiting_tool}",

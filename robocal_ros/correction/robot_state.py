@@ -20,7 +20,7 @@ TRACK_S = 0.01  # between two places that are kept, s
 REFERENCE_AGE_S = 0.1  # a controller's reference that is older is none, s
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
-AHEAD_S = 0.5
+AHEAD_S = 0.1
 MOST_LAYOUTS = 16  # of readings, by their joints' names, that are remembered
 
 

@@ -9,21 +9,21 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.inputs import Array, JointCommand
+from robocal_ros.correction.output import SentPath
+from robocal_ros.correction.robot_state import RESPONSE_S
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
-
-Array = NDArray[np.float64]
 
 TRACK_S = 0.1  # readings of so long tell speed and standstill
 LEAST_TRACK_S = 0.02  # shorter ones tell no speed
 REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
 LAG_S = 0.03  # by so much the robot, and what is known of it, may follow a stop late
-SEEN = 0.08  # of the speed at the begin: a planned loss of so much must show, at least by half
+FOLLOWED = 25  # instants of a path that a place is compared with
+SEEN = 0.08  # of the fastest speed: a planned loss of so much must show, at least by half
 GIVE_UP_S = 5.0  # a robot that still moves then is stopped by a person
 DECELERATION = {False: 10.0, True: 1.0}  # turning rad/s^2, sliding m/s^2, where none is known
 
@@ -43,6 +43,8 @@ class RobotTrack:
         self._q, self._qd = np.full(arm.n, np.nan), np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
+        self._place, self._place_s = np.full(arm.n, np.nan), np.inf  # where it stands, since when
+        self._turning = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
         self._names: tuple[str, ...] = ()
         self._index = self._column = np.empty(0, dtype=np.int64)
 
@@ -54,6 +56,7 @@ class RobotTrack:
             self._index = np.array([self._number[state.names[i]] for i in columns], dtype=np.int64)
         if len(state.position) != len(state.names) or not len(self._index):
             return
+        was_silent = self._silent(now_s)
         self._q[self._index] = state.position[self._column]
         self._qd[self._index] = np.nan
         if state.velocity is not None and len(state.velocity) == len(state.names):
@@ -62,12 +65,17 @@ class RobotTrack:
         self._track.append((now_s, self._q.copy()))
         while len(self._track) > 2 and self._track[1][0] <= now_s - TRACK_S:
             self._track.popleft()
+        if was_silent or not np.all(np.abs(self._q - self._place) < self._near):
+            self._place, self._place_s = self._q.copy(), now_s
+
+    def _silent(self, now_s: float) -> bool:
+        return not now_s - float(np.min(self._read_s)) <= self._age_limit_s
 
     def here(self, now_s: float) -> tuple[Array, Array] | None:
         """Joints and speeds (n,) now; None where they were not all read lately."""
-        age_s = now_s - float(np.min(self._read_s))
-        if not age_s <= self._age_limit_s:
+        if self._silent(now_s):
             return None
+        age_s = now_s - float(np.min(self._read_s))
         last_s = self._track[-1][0]
         earlier = [place for place in self._track if last_s - place[0] >= LEAST_TRACK_S]
         qd = self._qd
@@ -85,6 +93,22 @@ class RobotTrack:
             return False
         places = np.array([q for _, q in self._track])
         return bool(np.all(np.ptp(places, axis=0) < self._near))
+
+    def stood_s(self, now_s: float) -> float:
+        """How long the joints have stood in one place; 0 where they were not all read lately."""
+        return 0.0 if self._silent(now_s) else now_s - self._place_s
+
+    def follows(self, path: SentPath, now_s: float) -> bool:
+        """Whether the robot is where a path has it, or was lately; True where it is not known."""
+        if self.here(now_s) is None:
+            return True
+        read_s = float(np.min(self._read_s))
+        times = np.linspace(read_s - RESPONSE_S, now_s + LAG_S, FOLLOWED)
+        places = np.array([path.place(t) for t in times])
+        q, near = self._q[path.index], self._near[path.index]
+        turns = np.round((q - places[-1]) / (2.0 * np.pi))
+        q = q - 2.0 * np.pi * np.where(self._turning[path.index], turns, 0.0)
+        return bool(np.all((q > places.min(axis=0) - near) & (q < places.max(axis=0) + near)))
 
 
 class RobotStop:
@@ -113,7 +137,8 @@ class RobotStop:
         known = np.isfinite(acceleration) & (acceleration > 0.0)
         self._limits = MotionLimits(stop_deceleration=np.where(known, acceleration, assumed))
         self._arm, self._track, self._send = arm, track, send
-        self._began_s = self._sent_s = self._speed = self._lasts_s = 0.0
+        self._began_s = self._sent_s = 0.0
+        self._times = self._speeds = np.zeros(1)
         self.why = self.fault = ""
         self.sent = 0
 
@@ -129,12 +154,16 @@ class RobotStop:
         self.fault = f"{why}: no stop can be planned, the joint states are missing or too old"
         return False
 
-    def watch(self, why: str, lasts_s: float, now_s: float) -> None:
-        """Watch a stop that was sent by others, and send one of its own where it is not obeyed."""
+    def watch(self, why: str, times: Array, speeds: Array, now_s: float) -> None:
+        """Watch a stop that was sent by others, and send one of its own where it is not obeyed.
+
+        ``times``, ``speeds``: (m,) of its points from now on, of the fastest joint.
+        """
         here = self._track.here(now_s)
-        self._speed = 0.0 if here is None else float(np.max(np.abs(here[1])))
+        measured = 0.0 if here is None else float(np.max(np.abs(here[1])))
         self._began_s = self._sent_s = now_s
-        self._lasts_s, self.sent = max(lasts_s, SHORTEST_STOP_S), 1
+        self._times = np.append(0.0, times * max(SHORTEST_STOP_S / times[-1], 1.0))
+        self._speeds, self.sent = np.append(measured, speeds), 1
         self.why, self.fault = why, ""
 
     def look(self, now_s: float, scaling: float = 1.0) -> bool:
@@ -153,10 +182,11 @@ class RobotStop:
             self.why = ""
             return False
         here = self._track.here(now_s)
-        planned = min((since_s - LAG_S) * scaling / self._lasts_s, 1.0)
-        if here is not None and planned > SEEN:
+        planned = float(np.interp((since_s - LAG_S) * scaling, self._times, self._speeds))
+        fastest = float(np.max(self._speeds))
+        if here is not None and planned < (1.0 - SEEN) * fastest:
             speed = float(np.max(np.abs(here[1])))
-            if speed > (1.0 - 0.5 * planned) * self._speed and not self._track.stands(now_s):
+            if speed > 0.5 * (fastest + planned) and not self._track.stands(now_s):
                 self._again(now_s)
         return True
 
@@ -166,8 +196,8 @@ class RobotStop:
             return False
         q, qd = here
         plan = stop(self._arm, self._limits, q + qd * REACTION_S, qd)
-        self._speed, self._sent_s = float(np.max(np.abs(qd))), now_s
-        self._lasts_s = plan.duration_s
+        self._times, self._speeds = plan.time_s, np.abs(plan.qd).max(axis=1)
+        self._sent_s = now_s
         self.sent += 1
         self._send(plan)
         return True

@@ -13,14 +13,15 @@ from dataclasses import replace
 from typing import NoReturn, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED, TAUGHT
-from robocal_ros.correction import limiter, serialized_path, staged
+from robocal_ros.correction import limiter, staged, wire
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import (
+    Array,
+    Index,
     JointCommand,
     OfferedModel,
     OfferedTool,
@@ -35,8 +36,6 @@ from robocal_ros.correction.status import CorrectionStatus, Offset
 from robocal_ros.correction.streams import Phase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Answer = TypeVar("Answer")
 
 # A message this much older than the last one comes from a clock that was set back.
@@ -60,6 +59,8 @@ class CorrectionSession:
     reference : model and tool (``T_flange_tool``) that the program was taught with: the nominal
         one for a program made off line, the calibrated cold one for a taught program.
     serial : the robot's.
+
+    The caller asks the ``stream`` of targets for what goes out without a message.
     """
 
     def __init__(
@@ -71,21 +72,19 @@ class CorrectionSession:
     ) -> None:
         config = config or CorrectionConfig()
         n = reference.n
-        config = replace(
-            config,
-            velocity_limits=np.broadcast_to(config.velocity_limits, (n,)).astype(np.float64),
-            acceleration_limits=np.broadcast_to(config.acceleration_limits, (n,)).astype(
-                np.float64
-            ),
+        speed, acceleration = (
+            np.broadcast_to(limits, (n,)).astype(np.float64)
+            for limits in (config.velocity_limits, config.acceleration_limits)
         )
+        config = replace(config, velocity_limits=speed, acceleration_limits=acceleration)
         self._reference, self._config = reference, config
         self._gate = CorrectionGate(nominal, reference, serial, config)
         self._state = RobotState(reference, config.joint_state_age_s, config.start_near(reference))
         self._desired = DesiredOffset(reference, config)
-        self._output = Output(reference, config, self._state)
-        self._stream = TargetStream(reference, config, self._state, self._desired, self._output)
+        self.output = Output(reference, config, self._state)
+        self.stream = TargetStream(reference, config, self._state, self._desired, self.output)
         self._paths = TrajectoryCorrector(
-            reference, config, self._state, self._desired, self._output
+            reference, config, self._state, self._desired, self.output
         )
         self._enabled = False
         self._taught = np.full(n, np.nan)  # readings, un-corrected
@@ -103,18 +102,10 @@ class CorrectionSession:
     def enable(self, on: bool) -> None:
         """Correct from now on, or no more: the offset changes with the next commands.
 
-        Raises
-        ------
-        RefusedError
-            When a robot without speed limits is to be corrected.
+        Raises `RefusedError` when a robot without speed limits is to be corrected.
         """
-        without = [
-            name
-            for name, limit in zip(
-                self._reference.joint_names, self._config.velocity_limits, strict=True
-            )
-            if not np.isfinite(limit)
-        ]
+        unlimited = np.flatnonzero(~np.isfinite(self._config.velocity_limits))
+        without = [self._reference.joint_names[i] for i in unlimited]
         if on and without and not self._config.shadow:
             self.refuse(
                 Reason.NO_SPEED_LIMITS,
@@ -125,7 +116,7 @@ class CorrectionSession:
 
     def acknowledge(self) -> None:
         """End a START_MISMATCH: the next command may begin where the robot stands."""
-        self._output.acknowledge()
+        self.output.acknowledge()
         self._stamps.clear()
 
     def take_over(self) -> None:
@@ -138,7 +129,7 @@ class CorrectionSession:
     def hold(self, reason: Reason, detail: str, now_s: float) -> None:
         """While this lasts no command is taken; a stream that runs is ended in order."""
         self._held[reason] = detail
-        self.end_stream(RefusedError(reason, detail), now_s)
+        self.stream.end(RefusedError(reason, detail), now_s)
 
     def release(self, reason: Reason) -> None:
         """It is over."""
@@ -167,8 +158,8 @@ class CorrectionSession:
         if self._gate.watch_age(now_ns):
             self._want()
         everything = np.arange(self._reference.n)
-        path = self._output.path
-        busy = self._stream.runs(now_s) or (path is not None and path.live(now_s))
+        path = self.output.path
+        busy = self.stream.runs(now_s) or (path is not None and path.live(now_s))
         waits = self._gate.tools.waiting is not None
         if waits and not busy and self._state.stands(everything, now_s):
             self._adopt_tool()
@@ -190,10 +181,7 @@ class CorrectionSession:
     def target(self, command: JointCommand, now_s: float) -> JointCommand:
         """Correct one message of a stream of joint targets; itself where nothing is added.
 
-        Raises
-        ------
-        RefusedError
-            Counted. A stream that runs is ended by it: `tail` slows the robot down.
+        A `RefusedError` ends a stream that runs: its `tail` slows the robot down.
         """
         try:
             self._require_order("target", command, (), now_s)
@@ -207,35 +195,13 @@ class CorrectionSession:
                 self._shadow(q[None])
                 corrected = command
             else:
-                corrected = self._stream.take(command, index, q, now_s)
+                corrected = self.stream.take(command, index, q, now_s)
         except RefusedError as error:
-            if error.reason not in DROPPED or self._stream.is_due(now_s, INSTEAD):
-                self._stream.end(error, now_s)
+            if error.reason not in DROPPED or self.stream.is_due(now_s, INSTEAD):
+                self.stream.end(error, now_s)
             raise self._count(error) from None
         self._goal[:] = q
         return corrected
-
-    def end_stream(self, why: RefusedError, now_s: float) -> None:
-        """A stream that runs cannot go on: `tail` slows the robot down."""
-        self._stream.end(why, now_s)
-
-    def tail(self, now_s: float) -> JointCommand | None:
-        """What must go out now although no message came; None when nothing must.
-
-        To be called at the stream's period: a stream that is ended slows the robot down, one that
-        caught up when its last message came goes on to it.
-        """
-        return self._stream.tail(now_s)
-
-    @property
-    def has_tail(self) -> bool:
-        """Whether the stream goes on without a message."""
-        return self._stream.has_tail
-
-    @property
-    def stream_period_s(self) -> float:
-        """Period of the stream's messages, NaN while it is not known."""
-        return self._stream.period_s
 
     def trajectory(
         self,
@@ -249,7 +215,7 @@ class CorrectionSession:
 
         ``starts_in_s``: when it begins, counted from now (its header's stamp); negative for one
         that is under way, 0 for one that begins as it is forwarded: see `SentPath.begin`. With
-        ``may_be_rejected`` the `path` is told what became of it.
+        ``may_be_rejected`` the output's path is told what became of it.
         """
         waiting = self._gate.tools.waiting, self._gate.tools.in_use
         try:
@@ -264,70 +230,51 @@ class CorrectionSession:
             if self._config.shadow:
                 self._shadow(q)
                 return command
-            if self._output.mismatch:
-                raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
-            self._stream.come_to_rest(now_s)
+            if self.output.mismatch:
+                raise RefusedError(Reason.START_MISMATCH, self.output.mismatch)
+            self.stream.come_to_rest(now_s)
             corrected, path = self._paths.correct(command, index, q, now_s, starts_in_s)
         except RefusedError as error:
             if self._gate.tools.waiting is not waiting[0]:
                 self._gate.tools.waiting, self._gate.tools.in_use = waiting
                 self._want()
             raise self._count(error) from None
-        path.replaced = self._output.path if may_be_rejected else None
+        path.replaced = self.output.path if may_be_rejected else None
         path.scale(self._state.scaling, now_s)
-        self._output.path = path
-        self._interrupted = path, self._stream.phase
-        self._stream.phase = Phase.IDLE
+        self.output.path = path
+        self._interrupted = path, self.stream.phase
+        self.stream.phase = Phase.IDLE
         self._goal[:] = q[-1]
-        most = self._output.limiter.most
+        most = self.output.limiter.most
         np.maximum(most, np.abs(path.withheld).max(axis=0), out=most)
         return corrected
 
-    @property
-    def path(self) -> SentPath | None:
-        """The trajectory that was put out last, to tell what becomes of it; None after targets."""
-        return self._output.path
-
     def reject(self, path: SentPath) -> None:
         """The controller did not take a trajectory: what it took the place of goes on there."""
-        self._output.reject(path)
+        self.output.reject(path)
         rejected, phase = self._interrupted
-        if path is rejected and self._output.path is None and self._stream.phase is Phase.IDLE:
-            self._stream.phase = phase
+        if path is rejected and self.output.path is None and self.stream.phase is Phase.IDLE:
+            self.stream.phase = phase
 
     def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:
         """A trajectory that stops what was put out last, as a controller takes it; None: it stands.
 
-        Its first point lies ``ahead_s`` ahead. A stream ends by `tail`.
+        Its first point lies ``ahead_s`` ahead. A stream ends by its `tail`.
         """
         stream = RefusedError(Reason.STOPPED, "a stop was asked for")
-        self._stream.end(stream, now_s)
-        command = self._paths.stop(now_s, ahead_s)
-        path = self._output.path
-        if command is not None and path is not None:
-            count, withheld = len(command), path.at(path.withheld, now_s)
-            offset = path.at(path.offsets, now_s)
-            self._output.path = SentPath(
-                index=path.index,
-                begin_s=now_s,
-                times=command.time_from_start_s,
-                out=command.position,
-                velocity=command.velocity,
-                known_times=command.time_from_start_s,
-                offsets=np.tile(offset, (count, 1)),
-                rates=np.zeros((count, len(offset))),
-                withheld=np.tile(withheld, (count, 1)),
-                stage=path.stage,
-                led_from=path.place(now_s),
-                put_s=now_s,
-                at_once=True,
-            )
+        self.stream.end(stream, now_s)
+        stopped = self._paths.stop(now_s, ahead_s)
+        if stopped is None:
+            return None
+        command, path = stopped
+        path.scale(self._state.scaling, now_s)
+        self.output.path = path
         return command
 
     def _shadow(self, q: Array) -> None:
         with contextlib.suppress(RefusedError):  # counted, and in the status
             self.counted(lambda: self._desired.at(q))
-        self._output.stage = self._desired.stage
+        self.output.stage = self._desired.stage
 
     def _require_released(self) -> None:
         for reason, detail in self._held.items():
@@ -347,7 +294,7 @@ class CorrectionSession:
         self._require_order("reading", state, state.names, now_s)
         index, column = self._state.find(state)
         self._state.read(index, state.position[column], now_s, age_s)
-        self._output.note_place(now_s)
+        self.output.note_place(now_s)
         q, position, velocity = self._uncorrected(state, index, column, now_s)
         self._taught[:] = q
         return replace(state, position=position, velocity=velocity, mark=TAUGHT)
@@ -357,12 +304,8 @@ class CorrectionSession:
     ) -> tuple[Array, Array | None]:
         """Un-correct joints (k,) of any joint state as `reading` does, and remember nothing.
 
-        Joints that are left out are where they were read last.
-
-        Raises
-        ------
-        RefusedError
-            When a position is not finite, a joint is named twice, or numbers differ.
+        Joints that are left out are where they were read last. Raises `RefusedError` when a
+        position is not finite, a joint is named twice, or numbers differ.
         """
         state = JointCommand(names, position, velocity)
         index, column = self._state.find(state)
@@ -380,9 +323,9 @@ class CorrectionSession:
             velocity = None  # a driver that has none says NaN, or gives fewer
         if self._config.shadow:
             return measured, state.position, velocity
-        taught, position = self._output.uncorrected(measured, now_s), state.position.copy()
+        taught, position = self.output.uncorrected(measured, now_s), state.position.copy()
         position[column] = taught[index]
-        stage, _ = self._output.correction(now_s)
+        stage, _ = self.output.correction(now_s)
         if velocity is not None and stage is not None and len(column):
             speed, velocity = np.zeros(self._reference.n), velocity.copy()
             speed[index] = velocity[column]
@@ -401,14 +344,14 @@ class CorrectionSession:
         index = self._state.index(tuple(names[i] for i in known)) if known else np.zeros(0, int)
         before = self._state.scaling
         self._state.controller(index, position[known], scaling, now_s)
-        if self._output.path is not None and self._state.scaling != before:
-            self._output.path.scale(self._state.scaling, now_s)
+        if self.output.path is not None and self._state.scaling != before:
+            self.output.path.scale(self._state.scaling, now_s)
 
     # ---- what is said of it ---------------------------------------------------------------------
 
     def offset(self, now_s: float) -> Offset:
         """What is added to the taught joints now, and what of it the limiter withholds."""
-        output, measured = self._output, self._state.measured
+        output, measured = self.output, self._state.measured
         withheld = np.zeros(self._reference.n)
         if self._config.shadow:
             stage = self._desired.stage
@@ -416,7 +359,7 @@ class CorrectionSession:
             offset = np.zeros_like(withheld)
             if stage is not None and len(places):
                 offset = stage.correct(places[-1:]).q[0] - places[-1]
-        elif self._stream.runs(now_s) and output.path is None:
+        elif self.stream.runs(now_s) and output.path is None:
             offset, withheld = output.out - output.taught, output.limiter.withheld
             offset = np.where(np.isfinite(offset), offset, 0.0)
         else:
@@ -478,12 +421,11 @@ class CorrectionSession:
 
     def status(self, now_s: float | None = None) -> CorrectionStatus:
         """What the session does; ``now_s``: while a trajectory is under way, at which instant."""
-        desired, tools, output = self._desired, self._gate.tools, self._output
+        desired, tools, output = self._desired, self._gate.tools, self.output
         at_s = np.inf if now_s is None else now_s
         stage, withheld = output.correction(at_s)
         settled = stage is desired.stage and bool(np.all(np.abs(withheld) <= SETTLED))
-        started = output.path is not None or bool(np.isfinite(output.out).any())
-        if not started:
+        if output.path is None and not np.isfinite(output.out).any():  # nothing was put out
             settled = True
         return CorrectionStatus(
             enabled=self._enabled,
@@ -504,7 +446,7 @@ class CorrectionSession:
             withheld_most=output.limiter.most.copy(),
             withheld_m=self._at_tool(withheld),
             withheld_most_m=self._at_tool(output.limiter.most),
-            lag_s=self._stream.lag_s,
+            lag_s=self.stream.lag_s,
             overtaken=self._overtaken,
             mismatch=output.mismatch,
             held=dict(self._held),
@@ -532,7 +474,7 @@ def load_kernels(arm: SerialArm) -> None:
     """Call the compiled code once, so that the first command need not wait for it."""
     staged.load_kernels(arm)
     limiter.load_kernels(arm.n)
-    serialized_path.load_kernels()
+    wire.load_kernels()
     config, q = CorrectionConfig(), np.zeros(arm.n)
     desired = DesiredOffset(arm, config)
     desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)

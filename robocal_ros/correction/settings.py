@@ -26,6 +26,8 @@ from robocal_ros.storage.robots import (
 Array = NDArray[np.float64]
 
 NOMINAL = "nominal"
+# Parameters that go to the session as they are.
+SAME = ("stream_gap_s", "joint_state_age_s", "flange_frame", "model_age_s", "free_axis", "shadow")
 
 
 def _tool_fault(values: list[float]) -> str | None:
@@ -66,7 +68,7 @@ SETTINGS = (
         "policy",
         Policy.REFUSE.value,
         "What becomes of a command whose correction exceeds a bound or leads beyond a limit: "
-        "refuse it, clamp the correction, or pass it while the correction is blended out",
+        "refuse it, clamp the correction, or pass it while its offset goes to zero",
         choices=tuple(policy.value for policy in Policy),
     ),
     Setting(
@@ -108,14 +110,7 @@ SETTINGS = (
         low=0.0,
         high=20.0,
     ),
-    Setting(
-        "thermal_tcp_deg",
-        0.1,
-        "and in orientation",
-        unit="deg",
-        low=0.0,
-        high=5.0,
-    ),
+    Setting("thermal_tcp_deg", 0.1, "and in orientation", unit="deg", low=0.0, high=5.0),
     Setting(
         "thermal_joint_deg",
         0.3,
@@ -150,14 +145,7 @@ SETTINGS = (
         low=0.01,
         high=2.0,
     ),
-    Setting(
-        "offset_mm_s",
-        5.0,
-        "and to a sliding joint",
-        unit="mm/s",
-        low=0.01,
-        high=5.0,
-    ),
+    Setting("offset_mm_s", 5.0, "and to a sliding joint", unit="mm/s", low=0.01, high=5.0),
     Setting(
         "stream_gap_s",
         0.1,
@@ -188,13 +176,7 @@ SETTINGS = (
 
 
 def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
-    """The nominal arm, and the reference arm with the taught tool.
-
-    Raises
-    ------
-    InputError
-        When a robot file cannot be read.
-    """
+    """The nominal arm, and the reference arm with the taught tool; `InputError` of their files."""
     nominal = load_robot(settings["robot"])
     chosen = settings["reference"]
     reference = nominal if chosen == NOMINAL else load_robot(chosen)
@@ -212,10 +194,7 @@ def arms(settings: Mapping[str, Any]) -> tuple[SerialArm, SerialArm]:
 def command_joints(settings: Mapping[str, Any], arm: SerialArm) -> tuple[str, ...]:
     """The joints of ``joint_commands``, in its order.
 
-    Raises
-    ------
-    InputError
-        When one of them is not the arm's, or is named twice.
+    Raises `InputError` when one of them is not the arm's, or is named twice.
     """
     names = tuple(settings["command_joints"]) or arm.joint_names
     unknown = [name for name in names if name not in arm.joint_names]
@@ -236,12 +215,8 @@ def _offset_limits(rate: float) -> OffsetLimits:
 def joint_limits(settings: Mapping[str, Any]) -> tuple[Array, Array]:
     """Speeds and accelerations (n,), rad/s (prismatic: m/s) ...; infinite where none is known.
 
-    An acceleration that nobody says is that to full speed in half a second.
-
-    Raises
-    ------
-    InputError
-        When the numbers of joints and of velocity limits differ.
+    An acceleration that nobody says is that to full speed in half a second. Raises `InputError`
+    when the numbers of joints and of velocity limits differ.
     """
     robot = load_description(settings["robot"])
     given, count = np.array(settings["velocity_limits"]), robot.arm.n
@@ -254,13 +229,7 @@ def joint_limits(settings: Mapping[str, Any]) -> tuple[Array, Array]:
 
 
 def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
-    """Settings of the session, in SI.
-
-    Raises
-    ------
-    InputError
-        When the numbers of joints and of velocity limits differ.
-    """
+    """Settings of the session, in SI; raises `InputError` as `joint_limits`."""
 
     def bounds(what: str) -> ShiftBounds:
         degrees = (settings[f"{what}_{where}_deg"] for where in ("tcp", "joint"))
@@ -275,17 +244,12 @@ def session_config(settings: Mapping[str, Any]) -> CorrectionConfig:
         tool=bounds("tool"),
         turning=_offset_limits(float(np.radians(settings["offset_deg_s"]))),
         sliding=_offset_limits(settings["offset_mm_s"] * 1e-3),
-        stream_gap_s=settings["stream_gap_s"],
         start_rad=float(np.radians(settings["start_deg"])),
         start_m=settings["start_mm"] * 1e-3,
-        joint_state_age_s=settings["joint_state_age_s"],
-        flange_frame=settings["flange_frame"],
         tool_frame=settings["tool_child_frame"],
         policy=Policy(settings["policy"]),
-        model_age_s=settings["model_age_s"],
-        free_axis=settings["free_axis"],
         velocity_limits=speeds,
         acceleration_limits=accelerations,
         robot_file_hash=robot_file_hash(settings["robot"]) if nameless else "",
-        shadow=settings["shadow"],
+        **{name: settings[name] for name in SAME},
     )

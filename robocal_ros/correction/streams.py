@@ -6,21 +6,17 @@ from enum import Enum
 from statistics import median
 
 import numpy as np
-from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.inputs import Array, Index, JointCommand
 from robocal_ros.correction.joint_correction import plain
 from robocal_ros.correction.limiter import DESIRED, LONGEST_STEP_S, OFFSET, OFFSET_RATE
 from robocal_ros.correction.output import ROUNDING, Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
@@ -45,11 +41,8 @@ class Phase(Enum):
 class TargetStream:
     """Targets of a stream, each corrected and put out at once.
 
-    Attributes
-    ----------
-    phase : what it does.
-    period_s : of its messages; NaN before two have come.
-    lag_s : how long the fastest joint needs from what was put out to what came in.
+    ``period_s`` of its messages is NaN before two have come; ``lag_s`` is how long the fastest
+    joint needs from what was put out to what came in.
     """
 
     def __init__(
@@ -122,11 +115,8 @@ class TargetStream:
     def take(self, command: JointCommand, index: Index, q: Array, now_s: float) -> JointCommand:
         """Correct a target (all taught joints ``q`` (n,), of which ``index`` go out).
 
-        Raises
-        ------
-        RefusedError
-            When it cannot be corrected, nothing may begin there, or it is too far ahead. `end`
-            is for the caller.
+        Raises `RefusedError` when it cannot be corrected, nothing may begin there, or it is too
+        far ahead; to `end` the stream is for the caller.
         """
         if self.phase is Phase.ENDING and self._why is not None:
             raise RefusedError(self._why.reason, f"the stream is ended for: {self._why.detail}")
@@ -210,13 +200,7 @@ class TargetStream:
         for _ in range(TRIES):
             desired = self._desired.at_one(q)
             share, tried = output.limiter.put_out(
-                q,
-                desired,
-                elapsed,
-                longest,
-                self._active,
-                limits,
-                (output.taught, output.out),
+                q, desired, elapsed, longest, self._active, limits, (output.taught, output.out)
             )
             if share < 0.0:
                 require_limits(tried[None], self._arm)

@@ -9,21 +9,37 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
-from robocal_ros.correction.inputs import TrajectoryCommand, require_few, require_finite
-from robocal_ros.correction.limiter import DESIRED, OFFSET, OFFSET_RATE, STILL
+from robocal_ros.correction.inputs import (
+    Array,
+    Index,
+    TrajectoryCommand,
+    require_few,
+    require_finite,
+)
+from robocal_ros.correction.limiter import (
+    ACCELERATION,
+    DESIRED,
+    LONGEST_STEP_S,
+    OFFSET,
+    OFFSET_RATE,
+    RATE,
+    REST_ACCELERATION,
+    REST_RATE,
+    STILL,
+)
 from robocal_ros.correction.output import Output, SentPath, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
 SPLINE_PEAK = 1.875
 SETTLED = 1e-9  # rad, m: of an offset that is the desired one
 LONGEST_WAIT_S = 60.0  # for which it is worked out how long an offset takes
-STOP_POINTS = 10
+TRIES = 12
+STOP_SPACING_S = 0.025  # of the points of a stop
+SHORTEST_STOP_S = 0.1
+OWN = 1.25  # of a path's own accelerations, where they are larger than the limits: a stop's
 
 
 class TrajectoryCorrector:
@@ -46,37 +62,36 @@ class TrajectoryCorrector:
     ) -> tuple[TrajectoryCommand, SentPath]:
         """Correct a trajectory of taught joints ``q`` (m, n), of which ``index`` go out.
 
-        Raises
-        ------
-        RefusedError
-            When it cannot be corrected, its begin is elsewhere, its end would not be reached with
-            the correction that belongs there, or a limit is exceeded. Nothing has changed then.
+        Raises `RefusedError` when it cannot be corrected, its begin is elsewhere, its end would not
+        be reached with the correction that belongs there, or a limit is exceeded. Nothing has
+        changed then.
         """
         output, limiter = self._output, self._output.limiter
-        kept = limiter.state.copy()
+        kept, limits = limiter.state.copy(), limiter.limits
         times = command.time_from_start_s + starts_in_s
         desired, result = self._desired.at(q)
         output.take_up(now_s)
         try:
             led_from = self._begin(index, q, desired, times, now_s)
             begin = limiter.state.copy()
-            way = np.abs(np.diff(q, axis=0))[:, index].max(axis=1, initial=0.0)
-            speed = np.append(2.0 * STILL, way / np.diff(times))  # a lead-in is a motion
-            speed[1:-1] = np.maximum(speed[1:-1], speed[2:])  # so is what begins to move
             active = np.zeros(self._arm.n)
             active[index] = 1.0
-            offsets, rates = limiter.follow(desired, np.maximum(times, 0.0), speed, active)
+            follows = self._settled(command, index, q, result)
+            speed = _speeds(q[:, index], times)
+            offsets, rates, bends = self._follow(desired, follows, times, speed, active)
             self._require_end(limiter.withheld[index], active)
             out = q + offsets
-            velocity, acceleration = self._rates(
-                command, index, q, result, offsets - desired, rates, times
-            )
+            velocity = acceleration = None
+            if command.velocity is not None:
+                velocity = command.velocity + rates[:, index]
+            if command.acceleration is not None:
+                acceleration = command.acceleration + bends[:, index]
             require_limits(out, self._arm)
             self._require_speeds(command, index, out, velocity, times, led_from)
         finally:
-            limiter.state[:] = kept
-        known_times, withheld = command.time_from_start_s, offsets - desired
-        sent, sent_rates, sent_withheld = offsets, rates, withheld
+            limiter.state[:], limiter.limits = kept, limits
+        known_times, sent, sent_rates = command.time_from_start_s, offsets, rates
+        withheld = sent_withheld = offsets - desired
         if led_from is not None:  # until its first point: from the offset that there is now
             known_times = np.append(-starts_in_s, known_times)
             sent = np.vstack([begin[OFFSET], offsets])
@@ -113,6 +128,8 @@ class TrajectoryCorrector:
     ) -> Array | None:
         """The offset that it begins with; returns where it leads in from (k,), None at once."""
         output, limiter = self._output, self._output.limiter
+        if output.path is None and self._state.stands(index, now_s):  # a stream's that is over
+            limiter.state[OFFSET_RATE] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
             here, wanted = (
                 np.array([np.interp(0.0, times, column) for column in rows.T])
@@ -152,36 +169,61 @@ class TrajectoryCorrector:
             f"let it last {more_s:.2f} s longer",
         )
 
-    def _rates(
-        self,
-        command: TrajectoryCommand,
-        index: Index,
-        q: Array,
-        result: StagedResult | None,
-        withheld: Array,
-        rates: Array,
-        times: Array,
-    ) -> tuple[Array | None, Array | None]:
-        """Velocities and accelerations (m, k), where the command has any.
-
-        By the chain rule where the offset is the desired one, else by the limiter's rates.
-        """
+    def _settled(
+        self, command: TrajectoryCommand, index: Index, q: Array, result: StagedResult | None
+    ) -> Array | None:
+        """Derivatives (1 or 2, m, n) of the desired offset, as many as the command has."""
         if command.velocity is None:
-            return None, None
-        zero = np.zeros_like(q)
-        speed, bend = zero.copy(), zero.copy()
-        speed[:, index] = command.velocity
+            return None
+        given = np.zeros((2, *q.shape))
+        given[0][:, index] = command.velocity
         if command.acceleration is not None:
-            bend[:, index] = command.acceleration
-        velocity, acceleration = speed, bend
+            given[1][:, index] = command.acceleration
+        rates = np.zeros_like(given)
         if result is not None and self._desired.stage is not None:
-            velocity, acceleration = self._desired.stage.rates(q, speed, bend, result)
-        apart = np.abs(withheld[:, index]).max(axis=1) > 0.0
-        if np.any(apart):
-            velocity[apart] = (speed + rates)[apart]
-            if len(times) > 1:
-                acceleration[apart] = (bend + np.gradient(rates, times, axis=0))[apart]
-        return velocity[:, index], None if command.acceleration is None else acceleration[:, index]
+            rates = np.array(self._desired.stage.rates(q, given[0], given[1], result)) - given
+        return rates if command.acceleration is not None else rates[:1]
+
+    def _follow(
+        self, desired: Array, follows: Array | None, times: Array, speed: Array, active: Array
+    ) -> tuple[Array, Array, Array]:
+        """Offsets, rates, accelerations (m, n), whose spline keeps the limits.
+
+        A controller makes cubics of points with velocities, quintics of those with accelerations
+        too: they bend more than the limiter's steps do, which get a smaller share of the limits
+        until the splines are within them.
+        """
+        limiter = self._output.limiter
+        begin, limits, share = limiter.state.copy(), limiter.limits, np.ones(2)
+        later = times > 0.0
+        for _ in range(TRIES):
+            limiter.state[:] = begin
+            limiter.limits = limits * np.tile(share[::-1], 2)[:, None]
+            offsets, rates = limiter.follow(desired, np.maximum(times, 0.0), speed, active)
+            if follows is None:
+                return offsets, rates, rates
+            withheld = np.vstack([begin[OFFSET] - begin[DESIRED], (offsets - desired)[later]])
+            rows = np.zeros((1 + len(follows), *withheld.shape))
+            rows[:2, 0], rows[0, 1:] = begin[[OFFSET, OFFSET_RATE]], offsets[later]
+            rows[1:, 1:] = follows[:, later]
+            h = np.diff(times[later], prepend=0.0)[:, None]
+            _add_derivatives(rows, withheld, h)
+            rows[1:], withheld = rows[1:] * active, withheld * active
+            moves = speed[later] > STILL
+            over = _over(rows, withheld, h, moves, limits)
+            # a controller without accelerations of its own comes in by a cubic
+            lead = _over(rows[:2, :2], withheld[:2], h[:1], moves[:1], limits)
+            over = np.maximum(over, lead)
+            if np.all(over <= 1.0 + SETTLED):
+                break
+            share *= np.where(over > 1.0, np.maximum(0.9 / np.maximum(over, 1.0), 0.25), 1.0)
+        else:
+            raise RefusedError(
+                Reason.TOO_SHORT, "between its points the offset would change too fast"
+            )
+        derivatives = np.repeat(rows[1:, :1], len(times), axis=1)
+        derivatives[:, later] = rows[1:, 1:]
+        return offsets, derivatives[0], derivatives[-1]
 
     def _require_speeds(
         self,
@@ -207,27 +249,82 @@ class TrajectoryCorrector:
             names, np.maximum(way, 0.0)[None], np.array([lead_s]), fastest, "would be led in"
         )
 
-    def stop(self, now_s: float, ahead_s: float) -> TrajectoryCommand | None:
-        """A trajectory that slows down what was put out last; None where nothing moves by it.
+    def stop(self, now_s: float, ahead_s: float) -> tuple[TrajectoryCommand, SentPath] | None:
+        """Slow down on the way of what was put out last; None where nothing moves by it.
 
-        All joints slow down together. Its first point lies ``ahead_s`` ahead, where the controller
-        is by then; velocities are given, so that it enters without a step.
+        From ``ahead_s`` ahead on the path's own clock slows down until it stands, so that no joint
+        leaves its path, or goes on beyond its end. Where the controller's clock stands it is held.
         """
         path = self._output.path
         if path is None or not path.live(now_s):
             return None
-        then_s = now_s + ahead_s
-        h = 1e-3
-        begin = path.place(then_s)
-        speed = (path.place(then_s) - path.place(then_s - h)) / h
-        lasts = float(np.max(np.abs(speed) / self._config.acceleration_limits[path.index]))
-        if not 0.0 < lasts < np.inf:
-            lasts = ahead_s
-        t = np.linspace(0.0, lasts, STOP_POINTS)[:, None]
-        position = begin + speed * (t - 0.5 * t * t / lasts)
-        velocity = speed * (1.0 - t / lasts)
+        clock = path.time(now_s)
+        rate = (path.time(now_s + ahead_s) - clock) / ahead_s
+        left = float(path.times[-1]) - clock - ahead_s
+        t, slow, on = np.zeros(1), np.zeros(1), np.zeros(1)
+        if rate > 0.0 and left > 0.0:
+            lasts, share = self._slow_down(path, now_s + ahead_s / rate, rate, left)
+            t = np.linspace(0.0, lasts, max(int(np.ceil(lasts / STOP_SPACING_S)), 2) + 1)
+            slow, on = 1.0 - share * t / lasts, t - 0.5 * share * t * t / lasts
+        at_s = now_s + (ahead_s + on) / rate if rate > 0.0 else np.array([now_s])
+        position, speed = _motion(path, at_s, rate)
+        velocity = speed * slow[:, None]
+        velocity[-1] = 0.0
+        offsets, rates, withheld = (
+            np.array([path.at(rows, at) for at in at_s])
+            for rows in (path.offsets, path.rates, path.withheld)
+        )
         names = tuple(self._arm.joint_names[i] for i in path.index)
-        return TrajectoryCommand(names, position, ahead_s + t[:, 0], velocity, mark=CORRECTED)
+        command = TrajectoryCommand(names, position, ahead_s + t, velocity, mark=CORRECTED)
+        return command, SentPath(
+            index=path.index,
+            begin_s=now_s,
+            times=command.time_from_start_s,
+            out=position,
+            velocity=velocity,
+            known_times=command.time_from_start_s,
+            offsets=offsets,
+            rates=rates * slow[:, None],
+            withheld=withheld,
+            stage=path.stage,
+            led_from=path.place(now_s),
+            put_s=now_s,
+            at_once=True,
+        )
+
+    def _slow_down(
+        self, path: SentPath, begin_s: float, rate: float, left: float
+    ) -> tuple[float, float]:
+        """How long to slow down on the ``left`` seconds of a path, and by what share of its speed.
+
+        With c(t) = t - t^2 / 2T, and c' = 1 - t/T = r, a path q(c) has the acceleration
+        q'' r^2 - q' / T: the shortest T is taken with which it is neither above the limit nor
+        much above the path's own. Where there is none, the path itself ends soon (share 0).
+        """
+        limits = self._config.acceleration_limits[path.index]
+        here = _motion(path, np.array([begin_s]), rate)[1][0]
+        least = max(float(np.max(np.abs(here) / limits)), SHORTEST_STOP_S)
+        spans = np.maximum(least * np.geomspace(0.25, 4.0, 33), SHORTEST_STOP_S)
+        spans = np.minimum(spans, 2.0 * left)
+        c = np.linspace(0.0, 0.5 * spans[-1], 101)
+        speed = _motion(path, begin_s + c / rate, rate)[1]
+        bend = np.gradient(speed, c, axis=0)
+        most = np.maximum(limits, OWN * np.abs(bend).max(axis=0))
+        slow = np.maximum(1.0 - 2.0 * c / spans[:, None], 0.0)[..., None]  # (spans, c, 1): r^2
+        over = np.abs(bend * slow - speed / spans[:, None, None]) / most
+        taken = np.max(np.where(slow > 0.0, over, 0.0), axis=(1, 2))
+        if np.any(taken <= 1.0):
+            return float(spans[np.argmax(taken <= 1.0)]), 1.0
+        if spans[-1] >= 2.0 * left:
+            return left, 0.0
+        return float(spans[-1]), 1.0
+
+
+def _motion(path: SentPath, at_s: Array, rate: float) -> tuple[Array, Array]:
+    """Places and speeds (m, k) on a path at instants (m,), the speeds by the path's own clock."""
+    h = 1e-4
+    places = np.array([[path.place(at + d) for at in at_s] for d in (-h, 0.0, h)])
+    return places[1], (places[2] - places[0]) / (2.0 * h * rate) if rate > 0.0 else 0.0 * places[1]
 
 
 def require_times(command: TrajectoryCommand) -> None:
@@ -240,3 +337,52 @@ def require_times(command: TrajectoryCommand) -> None:
         raise RefusedError(Reason.TIME_BACKWARDS, "time_from_start does not increase")
     require_finite(command.names, command.velocity)
     require_finite(command.names, command.acceleration)
+
+
+def _add_derivatives(rows: Array, withheld: Array, h: Array) -> None:
+    """Add those of what is withheld (r, n) to the derivatives in rows (2 or 3, r, n).
+
+    By the parabola through each three points, ``h`` (r - 1, 1) apart; what has come in stays.
+    """
+    slope = np.diff(withheld, axis=0) / h
+    both = h[:-1] + h[1:]
+    comes = (withheld[1:-1] != 0.0) | (slope[1:] != 0.0)
+    rows[1, 1:-1] += np.where(comes, (slope[:-1] * h[1:] + slope[1:] * h[:-1]) / both, 0.0)
+    if len(rows) > 2:
+        rows[2, 1:-1] += np.where(comes, 2.0 * np.diff(slope, axis=0) / both, 0.0)
+
+
+def _over(rows: Array, withheld: Array, h: Array, moves: NDArray[np.bool_], limits: Array) -> Array:
+    """Acceleration and rate (2,) of a spline, in units of the limits, where not all has come in.
+
+    ``rows`` (2 or 3, r, n) are offsets and derivatives, ``moves`` (r - 1,) of the ways between.
+    """
+    some = (withheld[:-1] != 0.0).any(axis=1) | (withheld[1:] != 0.0).any(axis=1)
+    if not some.any():
+        return np.zeros(2)
+    h, (p0, v0), (p1, v1) = h[some], rows[:2, :-1][:, some], rows[:2, 1:][:, some]
+    way = (p1 - p0) / h
+    c = [3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0 * way, 0.0 * way]
+    if len(rows) > 2:
+        b0, b1 = rows[2, :-1][some] * h, rows[2, 1:][some] * h
+        c[0] = 0.5 * b0
+        c[1] = 10.0 * way - 6.0 * v0 - 4.0 * v1 - 1.5 * b0 + 0.5 * b1
+        c[2] = -15.0 * way + 8.0 * v0 + 7.0 * v1 + 1.5 * b0 - b1
+        c[3] = 6.0 * way - 3.0 * (v0 + v1) - 0.5 * (b0 - b1)
+    u = np.linspace(0.0, 1.0, 9)[:, None, None]
+    rate = v0 + u * (2.0 * c[0] + u * (3.0 * c[1] + u * (4.0 * c[2] + u * 5.0 * c[3])))
+    bend = (2.0 * c[0] + u * (6.0 * c[1] + u * (12.0 * c[2] + u * 20.0 * c[3]))) / h
+    fast = moves[some][:, None] | (np.abs(v0) > limits[REST_RATE])
+    most = np.where(
+        fast[None], limits[[ACCELERATION, RATE], None], limits[[REST_ACCELERATION, REST_RATE], None]
+    )
+    return np.array([np.max(np.abs(x) / m) for x, m in zip((bend, rate), most, strict=True)])
+
+
+def _speeds(q: Array, times: Array) -> Array:
+    """Fastest joint (m,) on the way to each point; what leads in, or soon moves, is a motion."""
+    way = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0)
+    speed = np.append(2.0 * STILL, way / np.diff(times))
+    soon = np.searchsorted(times, times[1:-1] + LONGEST_STEP_S).clip(max=len(times) - 1)
+    speed[1:-1] = np.maximum(speed[1:-1], speed[soon])
+    return speed

@@ -1,7 +1,11 @@
-"""Joint states as they come over the wire, without a message's objects: for fast streams.
+"""Joint states and trajectories as they come over the wire, without a message's objects.
 
-Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState``. A stream's
-messages are laid out alike: where their numbers are is found once.
+Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState`` and
+``trajectory_msgs/JointTrajectory``: after four bytes of encapsulation a stamp, ``frame_id`` and
+joint names; then positions, velocities and efforts (sequences of double), or points, each of
+positions, velocities, accelerations, efforts and ``time_from_start``. Numbers are aligned to their
+size, counted from the end of the encapsulation. A stream's messages are laid out alike: where
+their numbers are is found once.
 """
 
 import math
@@ -9,12 +13,67 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.core.compiled import kernel
+from robocal_ros.correction.inputs import JointCommand, require_few
+
+Array = NDArray[np.float64]
 
 HEAD = b"\0\1\0\0"  # plain, little endian
 STAMP, FRAME = len(HEAD), len(HEAD) + 8  # where they begin
 NS = 1_000_000_000
+FIELDS = 4  # sequences of a point
+LEAST_POINT = 4 * FIELDS + 8  # bytes of a point without numbers
+
+# ---- text and numbers ---------------------------------------------------------------------------
+
+
+def _number(data: bytes, at: int) -> int:
+    return int.from_bytes(data[at : at + 4], "little")
+
+
+def _string(data: bytes, at: int) -> tuple[str, int]:
+    """Text and where the next number begins."""
+    (length,) = struct.unpack_from("<I", data, at)
+    end = at + 4 + length
+    if not length > 0 or end > len(data):
+        raise struct.error("a string is longer than the message")
+    return data[at + 4 : end - 1].decode(), end + -end % 4
+
+
+def _string_bytes(text: str) -> bytes:
+    data = text.encode() + b"\0"
+    return (struct.pack("<I", len(data)) + data).ljust(_string_size(text), b"\0")
+
+
+def _string_size(text: str) -> int:
+    return 4 + -(-(len(text.encode()) + 1) // 4) * 4
+
+
+def _names(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
+    """Names and where the next number begins."""
+    (count,) = struct.unpack_from("<I", data, at)
+    if count > len(data):
+        raise struct.error("more names than the message is long")
+    names, at = [], at + 4
+    for _ in range(count):
+        name, at = _string(data, at)
+        names.append(name)
+    return tuple(names), at
+
+
+def joint_names(data: bytes) -> tuple[str, ...]:
+    """The joints that a serialized message names; none where it cannot be read."""
+    if data[: len(HEAD)] != HEAD:
+        return ()
+    try:
+        return _names(data, _string(data, FRAME)[1])[0]
+    except (struct.error, UnicodeDecodeError):
+        return ()
+
+
+# ---- joint states -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -42,14 +101,8 @@ class _Layout:
 class JointWire:
     """Reads the joint messages of one topic and writes what goes out for them.
 
-    Parameters
-    ----------
-    is_reading : velocities and efforts of which one is not finite are none: many drivers have
-        none, and say NaN.
-
-    Attributes
-    ----------
-    is_finite : whether every number of the message read last is.
+    With ``is_reading`` velocities and efforts of which one is not finite are none: many drivers
+    have none, and say NaN. ``is_finite`` says whether every number of the message read last is.
     """
 
     def __init__(self, *, is_reading: bool = False) -> None:
@@ -106,9 +159,8 @@ class JointWire:
         """Lay the outgoing message out."""
         if self._made_for[0] is layout and self._made_for[1:] == (mark, counts):
             return
-        text = mark.encode() + b"\0"
-        out = bytearray(HEAD + bytes(8) + struct.pack("<I", len(text)) + text)
-        out += bytes(-len(out) % 4) + layout.head[layout.names_begin - FRAME :]
+        out = bytearray(HEAD + bytes(8) + _string_bytes(mark))
+        out += layout.head[layout.names_begin - FRAME :]
         self._places = []
         for count in counts:
             out += bytes(-len(out) % 4) + struct.pack("<I", count)
@@ -117,32 +169,6 @@ class JointWire:
             self._places.append(len(out))
             out += bytes(8 * count)
         self._out, self._made_for = out, (layout, mark, counts)
-
-
-def _number(data: bytes, at: int) -> int:
-    return int.from_bytes(data[at : at + 4], "little")
-
-
-def joint_names(data: bytes) -> tuple[str, ...]:
-    """The joints that a serialized message names; none where it cannot be read."""
-    if data[: len(HEAD)] != HEAD:
-        return ()
-    try:
-        return _names(data, _string(data, FRAME)[1])[0]
-    except (struct.error, UnicodeDecodeError):
-        return ()
-
-
-def _names(data: bytes, at: int) -> tuple[tuple[str, ...], int]:
-    """Names and where the next number begins."""
-    (count,) = struct.unpack_from("<I", data, at)
-    if count > len(data):
-        raise struct.error("more names than the message is long")
-    names, at = [], at + 4
-    for _ in range(count):
-        name, at = _string(data, at)
-        names.append(name)
-    return tuple(names), at
 
 
 def _layout(data: bytes) -> _Layout | None:
@@ -168,21 +194,119 @@ def _layout(data: bytes) -> _Layout | None:
         return None
     head = data[FRAME:names_end]
     return _Layout(
-        head,
-        frame_id,
-        names,
-        names_begin,
-        names_end,
-        tuple(counts),
-        tuple(places),
-        len(data),
+        head, frame_id, names, names_begin, names_end, tuple(counts), tuple(places), len(data)
     )
 
 
-def _string(data: bytes, at: int) -> tuple[str, int]:
-    """Text and where the next number begins."""
-    (length,) = struct.unpack_from("<I", data, at)
-    end = at + 4 + length
-    if not length > 0 or end > len(data):
-        raise struct.error("a string is longer than the message")
-    return data[at + 4 : end - 1].decode(), end + -end % 4
+# ---- trajectories -------------------------------------------------------------------------------
+
+
+@kernel
+def _places(
+    words: NDArray[np.uint32], begin: int, size: int, places: NDArray[np.int64], times: Array
+) -> bool:
+    """Where numbers begin (in doubles) and how many they are: ``places`` (m, 4, 2)."""
+    at = begin
+    for i in range(places.shape[0]):
+        for field in range(FIELDS):
+            if at + 4 > size:
+                return False
+            count = int(words[at // 4])
+            at += 4
+            if count > 0:
+                at = (at + 7) // 8 * 8
+            places[i, field, 0], places[i, field, 1] = at // 8, count
+            at += 8 * count
+        if at + 8 > size:
+            return False
+        times[i] = np.int32(words[at // 4]) + 1e-9 * words[at // 4 + 1]
+        at += 8
+    return True
+
+
+@kernel
+def _gather(doubles: Array, places: NDArray[np.int64], rows: Array) -> None:
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rows[i, j] = doubles[places[i, 0] + j]
+
+
+@kernel
+def _scatter(rows: Array, places: NDArray[np.int64], doubles: Array) -> None:
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            doubles[places[i, 0] + j] = rows[i, j]
+
+
+@dataclass(frozen=True)
+class SerializedPath:
+    """A trajectory of m points of k joints, each field in all points or in none."""
+
+    stamp_ns: int
+    frame_id: str
+    names: tuple[str, ...]
+    times_s: Array  # (m,) from the start
+    doubles: Array  # the message after its encapsulation, as numbers
+    size: int  # of that, bytes
+    places: NDArray[np.int64]  # (m, 4, 2) first number and count of each field of each point
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def rows(self, field: int) -> Array | None:
+        """Numbers (m, k) of a field (0 to 3: positions … efforts); None where it has none."""
+        k = int(self.places[0, field, 1])
+        if k == 0:
+            return None
+        out = np.empty((len(self), k))
+        _gather(self.doubles, self.places[:, field], out)
+        return out
+
+    def changed(self, frame_id: str, rows: dict[int, Array]) -> bytes:
+        """The message with other numbers (m, k) of fields, and a ``frame_id`` that it `takes`."""
+        doubles = self.doubles.copy()
+        for field, values in rows.items():
+            _scatter(np.ascontiguousarray(values), self.places[:, field], doubles)
+        body, stamp = doubles.tobytes(), FRAME - STAMP
+        rest = body[stamp + _string_size(self.frame_id) : self.size]
+        return HEAD + body[:stamp] + _string_bytes(frame_id) + rest
+
+    def takes(self, frame_id: str) -> bool:
+        """Whether all numbers stay aligned with this ``frame_id``."""
+        return (_string_size(frame_id) - _string_size(self.frame_id)) % 8 == 0
+
+
+def read_path(data: bytes) -> SerializedPath | None:
+    """Read a serialized trajectory; None for one that is not regular, or no such message at all.
+
+    Raises `RefusedError` for too many points, before they are read.
+    """
+    size = len(data) - len(HEAD)
+    if size < FRAME - STAMP or data[:2] != HEAD[:2]:
+        return None
+    try:
+        sec, nanosec = struct.unpack_from("<iI", data, STAMP)
+        frame_id, at = _string(data, FRAME)
+        names, at = _names(data, at)
+        (count,) = struct.unpack_from("<I", data, at)
+    except (struct.error, UnicodeDecodeError):
+        return None
+    if not 0 < count <= size // LEAST_POINT:
+        return None
+    require_few(count)
+    doubles = np.zeros(-(-size // 8))
+    doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(HEAD))
+    places, times = np.empty((count, FIELDS, 2), dtype=np.int64), np.empty(count)
+    whole = _places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times)
+    if not whole or np.any(places[:, :, 1] != places[0, :, 1]):
+        return None
+    return SerializedPath(sec * NS + nanosec, frame_id, names, times, doubles, size, places)
+
+
+def load_kernels() -> None:
+    """Call the compiled code once, so that the first trajectory need not wait for it."""
+    doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
+    _places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
+    path = SerializedPath(0, "", (), np.zeros(1), doubles, doubles.nbytes, places + 1)
+    rows = path.rows(0)
+    path.changed("", {} if rows is None else {0: rows})

@@ -28,6 +28,7 @@ from robocal_ros.core.samples import stamp_ns
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.motion.settings import NS, trajectory_message
+from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.parameters import Setting
@@ -92,10 +93,10 @@ class MotionDriver:
             JointTrajectoryControllerState, "controller_state", self._take_state, qos.SENSOR
         )
         node.add_input(Float64, "speed_scaling", self._take_scaling, qos.SENSOR)
-        self._stated_s = -np.inf  # when the controller told its own scaling
+        self._stated_s = -np.inf  # when the controller told its state
         self._stated: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
         self._ahead_s = np.inf  # its clock, of this one, by its last stamp
-        self._scaling, self._rejected = 1.0, False
+        self._scaling, self._rejected = SpeedScaling(), False
         self._velocities = True  # whether the hardware has any, as far as the controller says
         self._newest = 0
         self.way = ""
@@ -143,7 +144,10 @@ class MotionDriver:
 
         A scaled clock counts from a stamp on as if it were not.
         """
-        if self._stated is None or self._now() - self._stated_s > STATED_S or self._scaling != 1.0:
+        now_s = self._now()
+        if self._stated is None or now_s - self._stated_s > STATED_S:
+            return None
+        if self._scaling.at(now_s) not in (None, 1.0):
             return None
         begin_ns, q, qd = self._stated
         speed = float(np.linalg.norm(qd))
@@ -214,9 +218,9 @@ class MotionDriver:
         self._velocities = known and bool(speeds.any())
         begin_ns, self._stated_s, self._stated = stamp_ns(message.header.stamp), now_s, None
         before_s, self._ahead_s = self._ahead_s, begin_ns / NS - now_s
-        self._scaling = message.speed_scaling_factor
+        self._scaling.controller(getattr(message, "speed_scaling_factor", np.nan), now_s)
         if robot is not None:
-            robot.scaled(self._scaling, now_s)
+            self._tell_scaling(robot, now_s)
         reference = message.reference
         if len(reference.positions) != count or len(reference.velocities) != count:
             return  # a controller that holds may leave them out
@@ -238,8 +242,14 @@ class MotionDriver:
 
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()
-        if robot is not None and now_s - self._stated_s > 1.0:
-            robot.scaled(message.data / 100.0, now_s)  # percent, as ur_robot_driver publishes it
+        self._scaling.slider(message.data, now_s)
+        if robot is not None:
+            self._tell_scaling(robot, now_s)
+
+    def _tell_scaling(self, robot: RobotWatch, now_s: float) -> None:
+        scaling = self._scaling.at(now_s)
+        if scaling is not None:
+            robot.scaled(scaling, now_s)
 
 
 def guarded(node: EndpointNode, callback: Callable[[Future], None]) -> Callable[[Future], None]:

@@ -15,6 +15,7 @@ from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.measuring import start_near
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.silence import Silence
+from robocal_ros.motion.speed_scaling import TOLD_S
 
 Array = NDArray[np.float64]
 
@@ -25,7 +26,6 @@ BACK_S = 1.0  # stamps that go back by more began anew
 FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 AS_NEAR = 0.01  # of the allowed deviation: what no reading tells apart
 APART_S = 0.00375  # instants of the plan that a reading is compared with
-TOLD_S = 1.0  # a speed scaling that was not said again for so long is not known
 REFERENCE_S = 0.1  # a controller's place that is older is none
 JITTER_S = 0.03  # by so much noise moves a reading back or forth along the plan
 UNSAID_S = 0.1  # a scaling that rises is known so late: the robot is then ahead of its clock
@@ -66,7 +66,7 @@ class RobotWatch:
     Attributes
     ----------
     silence : how long no new reading came.
-    scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it.
+    scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it lately.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
@@ -91,6 +91,8 @@ class RobotWatch:
 
     def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
         """Take joints (n,); ``stamp_s`` on their own clock."""
+        if self.scaling != 1.0 and not self.scaling_known(now_s):
+            self._driven_s, self._at_s, self.scaling = self.driven_s(now_s), now_s, 1.0
         if self._readings and stamp_s <= self._readings[-1][0]:
             if stamp_s > self._readings[-1][0] - BACK_S:
                 return  # a clock that stands still is heard as silence

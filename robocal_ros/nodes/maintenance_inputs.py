@@ -4,7 +4,7 @@ from typing import Any
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.correction.reported import CorrectionState, ToldCorrection
+from robocal_ros.correction.status import CorrectionState, ToldCorrection
 from robocal_ros.sessions.maintenance.accuracy import Drift
 
 MM = 1e-3
@@ -67,5 +67,6 @@ def told_correction(message: Any) -> ToldCorrection:
         waiting_tool_revision=message.waiting_tool_revision if message.tool_waits else None,
         stale=message.stale,
         mismatch=message.mismatch,
+        commanders=message.commanders,
         last_refusal=message.last_refusal,
     )

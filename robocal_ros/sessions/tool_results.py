@@ -28,7 +28,7 @@ from robocal_ros.core.tool.judging import (
 )
 from robocal_ros.core.tool.mandrel import StationFinding, station_finding, with_mandrel
 from robocal_ros.core.tool.quick_check import Answer, QuickCheck, quick_check, sideways_check
-from robocal_ros.core.tool.witness import SMALL_M
+from robocal_ros.core.tool.witness import SMALL_M, Witness
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.tool_config import ToolConfig, made_with
@@ -70,7 +70,9 @@ class ToolResults:
         self._nominal, self._history, self._config = nominal, history, config
         self._software, self._current = software, current
         self._answers: OrderedDict[tuple[str, str], Outcome] = OrderedDict()
-        self._station: tuple[int, StationFinding] | None = None  # with its stamp, ns
+        self._changed: KnownTool | None = None  # last one whose change is not proven the tool's
+        # What the mandrel said last: its stamp, ns, and what was seen changed before it.
+        self._station: tuple[int, StationFinding, KnownTool | None] | None = None
 
     def taught(self, mode: str) -> Array:
         """What a mode measures (4, 4), as it was taught: the tool, or the mandrel.
@@ -137,10 +139,9 @@ class ToolResults:
         if healthy is not None:
             found = changed_tool(taught, healthy, found)
         anchor = self._current.anchor
+        shift = run.path.at(run.last_edge_s)[0][0, :3, :3] @ difference(found, in_force)[:3]
         witness = witness_of(found, in_force, self._config.bend, anchor)
-        if (station := self._known_station(command)) is not None:
-            shift = run.path.at(run.last_edge_s)[0][0, :3, :3] @ difference(found, in_force)[:3]
-            witness = with_mandrel(witness, station, shift)
+        witness = self._with_mandrel(witness, found, shift, command)
         verdict = judge_tool(found, estimate, taught, in_force, self._config.limits, witness)
         document = run_document(found, estimate, run.circles, verdict) | {
             "change": change_document(change_between(in_force.T_flange_tool, found.T_flange_tool)),
@@ -158,7 +159,7 @@ class ToolResults:
         run.require_even_readings()
         estimate = run.estimate(Held())
         found = KnownTool.measured(estimate)
-        self._station = None  # what was said of it before holds no more
+        self._station = self._changed = None  # what was said of them before holds no more
         taught, mandrel = self.taught(run.mode), run.mode == WITNESS_REFERENCE
         kind = MANDREL if mandrel else HEALTHY_TOOL
         verdict = judge_healthy(found, estimate, taught)
@@ -184,14 +185,32 @@ class ToolResults:
         both = [c for c in (found.own_covariance, reference.own_covariance) if c is not None]
         R = run.path.at(run.last_edge_s)[0][0, :3, :3]
         station = station_finding(found, reference, np.sum(both, axis=0), R)
-        self._station = (command.stamp_ns or 0), station
+        self._station = (command.stamp_ns or 0), station, self._changed
         verdict = station.verdict
         return Outcome(command, verdict.code, verdict.reason, station.document())
 
-    def _known_station(self, command: Command) -> StationFinding | None:
-        """The mandrel's answer, while it is fresh."""
-        stamp_ns, station = self._station or (0, None)
-        return station if 0 <= (command.stamp_ns or 0) - stamp_ns <= WITNESS_NS else None
+    def _with_mandrel(
+        self, witness: Witness, found: KnownTool, shift: Array, command: Command
+    ) -> Witness:
+        """Ask the mandrel, while its answer is fresh: whose is the change?
+
+        It was measured after this change where what was seen then is within `SMALL_M` of what is
+        found now: more cannot have come since.
+        """
+        if self._station is not None:
+            stamp_ns, station, changed = self._station
+            if 0 <= (command.stamp_ns or 0) - stamp_ns <= WITNESS_NS:
+                after = changed is not None and (
+                    change_between(changed.T_flange_tool, found.T_flange_tool).tip_m <= SMALL_M
+                )
+                witness = with_mandrel(witness, station, shift, after=after)
+        if witness.cause == "tool":
+            return witness
+        self._changed = found
+        if witness.cause == "doubt" and self._current.measured_mandrel is not None:
+            reason = f"{witness.reason}; measure the mandrel (mode WITNESS), then repeat"
+            return replace(witness, reason=reason)
+        return witness
 
     def early(self, run: ToolRun, command: Command) -> Outcome | None:
         """The answer of a quick check whose circle says enough; None: go on."""

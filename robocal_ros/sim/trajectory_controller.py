@@ -73,6 +73,8 @@ class TrajectoryController:
         own = Tolerances(np.full(n, of.trajectory), np.full(n, of.goal), of.goal_time)
         self.own_tolerances = self._tolerances = own
         self._last, self._last_speed = self.q.copy(), np.zeros(n)
+        self._sorted = self.q.copy()  # what the original wrote last when it sorted joints
+        self._succeeded = False
         self._new: Trajectory | None = None
         self._path = SampledPath(self._holding(self.q), -1.0, self.q, None)
         # Its time: so many steps of so much after a begin, however the cycles are cut.
@@ -211,6 +213,7 @@ class TrajectoryController:
             elif reached[first] and self.active:
                 self.active.end(GoalState.SUCCEEDED, text="Goal successfully reached!")
                 self.active, self._is_holding = None, True
+                self._succeeded, self._sorted = True, np.zeros_like(self._sorted)
         self._last, self._last_speed = cycles.command[count - 1], cycles.speed[count - 1]
         self._steps += count - 1
         return count
@@ -257,11 +260,20 @@ class TrajectoryController:
         return Trajectory.of(self.names, [0.0], here[None])
 
     def _ordered(self, given: Trajectory) -> Trajectory:
-        """In the controller's order; a joint that is not named stays where it was sent last."""
-        if given.names == self.names:
-            return given
+        """In the controller's order; of a joint that is named twice the last value counts.
+
+        A joint that is not named stays where it was sent last. But where the number of names is
+        right, as another is named twice, it gets what the original sorted last for it: one buffer
+        serves positions, velocities and accelerations of all messages. What holds after a goal
+        that succeeded, and whatever holds later, has efforts, which are 0 and sorted last.
+        """
         index = [self.names.index(name) for name in given.names]
         q = np.tile(self._last, (len(given.time_s), 1))
         qd, qdd = np.zeros_like(q), np.zeros_like(q)
+        if len(index) == len(self.names):
+            q[:] = qd[:] = qdd[:] = self._sorted
         q[:, index], qd[:, index], qdd[:, index] = given.q, given.qd, given.qdd
+        self._sorted = (qdd if given.has_qdd[-1] else qd if given.has_qd[-1] else q)[-1]
+        if self._is_holding and self._succeeded:
+            self._sorted = np.zeros_like(self._sorted)
         return replace(given, names=self.names, q=q, qd=qd, qdd=qdd)

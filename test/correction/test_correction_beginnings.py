@@ -187,6 +187,21 @@ def test_old_readings_do_not_tell_where_the_robot_is(warm: Robot) -> None:
     assert np.array_equal(warm.session.target(command, warm.now).position, at)
 
 
+@pytest.mark.parametrize(("ahead_s", "known"), [(0.09, True), (0.11, False), (0.45, False)])
+def test_readings_stamped_far_ahead_do_not_tell_where_the_robot_is(
+    warm: Robot, ahead_s: float, known: bool
+) -> None:
+    at = warm.stream()
+    command = JointCommand(NAMES, HOME)
+    warm.now += 0.3
+    warm.session.reading(JointCommand(NAMES, at), warm.now, -ahead_s)
+    if known:
+        warm.session.target(command, warm.now)
+        return
+    said = refused(Reason.STALE_JOINTS, warm.session.target, command, warm.now)
+    assert "over 0.1 s ahead of the clock" in said
+
+
 def test_a_part_of_the_joints_is_not_completed_from_old_readings(warm: Robot) -> None:
     warm.stream()
     part = JointCommand(NAMES[:2], HOME[:2])

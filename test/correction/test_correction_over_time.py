@@ -124,7 +124,7 @@ def slow_down(robot: Robot, watch: Watch) -> None:
     for _ in range(500):
         robot.now += DT
         robot.read(robot.at)
-        command = robot.session.tail(robot.now)
+        command = robot.session.stream.tail(robot.now)
         if command is None:
             return
         watch.out(command.names, command.position)
@@ -264,7 +264,7 @@ def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
     robot.rest(0.49)
     refused(Reason.START_MISMATCH, robot.stream, q, dt=0.01)
     assert np.array_equal(robot.at, before)
-    assert robot.session.tail(robot.now + DT) is None  # it stands already
+    assert robot.session.stream.tail(robot.now + DT) is None  # it stands already
 
 
 BEGIN = np.where(np.arange(6) == 3, NOMINAL.upper - 1e-4, HOME)
@@ -306,7 +306,7 @@ def test_a_refusal_in_motion_slows_the_robot_down(
     sent_s, begin = robot.now, robot.at[0]
     refused(why, robot.stream, BAD[why], dt=periods[0] * DT)
     for dt in periods[1:].tolist():
-        if (command := robot.session.tail(robot.now)) is None:
+        if (command := robot.session.stream.tail(robot.now)) is None:
             break
         robot.go(command)
         t = min(robot.now - sent_s, speed / SLOWEST)
@@ -329,7 +329,7 @@ def test_a_target_that_is_refused_moves_nothing_that_stands() -> None:
         robot, _ = under_way(speed=0.0)
         refused(why, robot.stream, q)
         for _ in range(10):
-            assert robot.session.tail(robot.now) is None
+            assert robot.session.stream.tail(robot.now) is None
             robot.now += DT
 
 
@@ -341,13 +341,13 @@ def test_a_robot_that_stands_is_not_set_in_motion_to_be_stopped(held: float, cou
     dt = DT if count else held * DT
     refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan), dt=dt)
     for _ in range(count):
-        command = robot.session.tail(robot.now)
+        command = robot.session.stream.tail(robot.now)
         assert command is not None
         robot.go(command)
         robot.now += DT
     robot.now += held * DT if count else 0.0
     for _ in range(50):
-        assert robot.session.tail(robot.now) is None
+        assert robot.session.stream.tail(robot.now) is None
         robot.now += DT
 
 
@@ -429,7 +429,7 @@ def test_a_last_message_that_came_late_is_still_reached() -> None:
     assert robot.session.status().lag_s > 0.0
     for _ in range(100):
         robot.now += DT
-        if (command := robot.session.tail(robot.now)) is not None:
+        if (command := robot.session.stream.tail(robot.now)) is not None:
             robot.go(command)
     assert np.allclose(robot.at, q, rtol=0.0, atol=1e-12)
 

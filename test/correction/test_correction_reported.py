@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from robocal_ros.core.proposals import THERMAL, TOOL, Head
-from robocal_ros.correction.reported import CorrectionState, ToldCorrection, uncorrected
+from robocal_ros.correction.status import CorrectionState, ToldCorrection, uncorrected
 
 NOMINAL, TAUGHT = Head(THERMAL, 0, None, None), Head(TOOL, 0, None, None)
 MODEL, BENT = Head(THERMAL, 4, 17, {}), Head(TOOL, 2, 18, {})
@@ -15,12 +15,27 @@ OFF = replace(ON, state=CorrectionState.OFF, enabled=False)
 WITHOUT = replace(ON, state=CorrectionState.WITHOUT_MODEL, model_revision=0, tool_revision=0)
 SHADOW = replace(ON, shadow=True)
 MISMATCH = replace(ON, state=CorrectionState.MISMATCH, mismatch="joint_a1 is 2 deg beside")
+RIVAL = "planner publishes arm/joint_trajectory"
+OTHER = replace(ON, state=CorrectionState.OTHER_COMMANDER, commanders=RIVAL)
 
 
 def test_a_correction_with_what_is_in_force_is_right():
     assert uncorrected(ON, MODEL, BENT) == ""
     blends = replace(ON, state=CorrectionState.BLENDING)
     assert uncorrected(blends, MODEL, BENT) == ""
+
+
+def test_in_each_state_the_line_reads_whether_commands_are_corrected():
+    off = CorrectionState.OFF
+    told = {
+        state: replace(OTHER, state=state, enabled=state is not off) for state in CorrectionState
+    }
+    said = {state: uncorrected(told[state], MODEL, BENT) for state in CorrectionState}
+    right = {state for state, words in said.items() if not words}
+    # LEASED: the program's commands are refused
+    assert right == {CorrectionState.ON, CorrectionState.BLENDING, CorrectionState.LEASED}
+    other = said[CorrectionState.OTHER_COMMANDER]
+    assert other == f"joint_correction_node puts nothing out, {RIVAL}: end them"
 
 
 @pytest.mark.parametrize(
@@ -32,6 +47,8 @@ def test_a_correction_with_what_is_in_force_is_right():
         (SHADOW, "shadow mode"),
         (WITHOUT, "wire its inputs"),
         (MISMATCH, "joint_a1 is 2 deg beside: see where the robot stands, call ~/acknowledge"),
+        (OTHER, RIVAL),
+        (replace(OTHER, enabled=False), RIVAL),
         (replace(ON, stale="model revision 4 is 90 s old, allowed 60 s"), "90 s old"),
     ],
     ids=str,
@@ -41,7 +58,9 @@ def test_nothing_is_right_that_does_not_correct_what_must_be(told, words):
     assert words in uncorrected(told, MODEL, BENT, follows=True)  # no news explains it
 
 
-@pytest.mark.parametrize("told", [None, OFF, SHADOW, MISMATCH, replace(WITHOUT, enabled=True)])
+@pytest.mark.parametrize(
+    "told", [None, OFF, SHADOW, MISMATCH, OTHER, replace(WITHOUT, enabled=True)]
+)
 def test_the_nominal_model_and_the_taught_tool_need_no_correction(told):
     assert uncorrected(told, NOMINAL, TAUGHT) == ""
 

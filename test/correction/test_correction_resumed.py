@@ -124,9 +124,9 @@ def test_a_clock_that_was_set_back_ends_a_stream_in_order() -> None:
         stamp += round(DT * 1e9)
         robot.stream(q, stamp_ns=stamp)
     refused(Reason.TIME_BACKWARDS, robot.stream, q, stamp_ns=stamp - 500_000_000)
-    assert robot.session.has_tail
+    assert robot.session.stream.has_tail
     speeds = [np.radians(60.0)]
-    while (command := robot.session.tail(robot.now)) is not None:
+    while (command := robot.session.stream.tail(robot.now)) is not None:
         speeds.append((command.position[0] - robot.at[0]) / DT)
         robot.go(command)
         robot.now += DT
@@ -147,7 +147,7 @@ def test_a_goal_that_was_rejected_breaks_no_stream() -> None:
         goal, position=goal.position + (q - HOME), time_from_start_s=goal.time_from_start_s
     )
     robot.session.trajectory(goal, robot.now, may_be_rejected=True)
-    path = robot.session.path
+    path = robot.session.output.path
     assert path is not None
     robot.session.reject(path)
     q[0] += np.radians(20.0) * DT

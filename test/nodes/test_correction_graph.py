@@ -122,12 +122,45 @@ def test_the_cell_s_own_nodes_are_known_by_their_lease(watched: Watched) -> None
     assert watched.watch.look(now) == (Reason.LEASED, "/some_name: tool")
     assert watched.watch.lease == "/some_name: tool"
     assert watched.watch.look(now + 0.99) is not None
-    assert watched.watch.look(now + 1.01) is None  # it was not renewed
-    watched.leases.hear(lease, now + 1.02)
     lease.held = False
     watched.leases.hear(lease, now + 1.1)
     assert watched.watch.look(now + 1.1) is None
     assert not inbox
+
+
+def test_another_node_of_a_holders_process_is_a_stranger(watched: Watched) -> None:
+    """Finding: whatever a process with a publisher of leases did, it was the cell's own."""
+    own = watched.process("some_name")
+    own.node.create_publisher(MotionLease, "/motion_lease", qos.LATCHED)
+    own.node.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.graph.spin_until(lambda: watched.own.count_publishers(PATH) == 2, "both")
+    watched.becomes(None)
+    planner = Node("planner", context=own.context)
+    publisher = planner.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    watched.becomes(Reason.OTHER_COMMANDER, f"/planner publishes {PATH}")
+    planner.destroy_publisher(publisher)
+    watched.becomes(None)
+    planner.destroy_node()
+
+
+def test_a_lease_that_ends_by_silence_lasts_until_the_robot_stands() -> None:
+    """Finding: the node was killed, its motion was still driven, and the program began."""
+    leases = Leases("kr150", "s1")
+    lease = MotionLease(robot="kr150", serial="s1", holder="/some_name", held=True, purpose="tool")
+    leases.hear(lease, 100.0)
+    for now_s, stood_s in ((101.1, 0.0), (101.9, 50.0), (104.0, 0.9), (200.0, 0.0)):
+        leases.look(now_s, stood_s)
+        assert "/some_name: tool: it has not renewed its lease for 1 s" in leases.words(now_s)
+        assert leases.lost(now_s)
+    leases.look(201.0, 1.0)
+    assert not leases.words(201.0)
+    assert not leases.lost(201.0)
+    leases.hear(lease, 300.0)  # it was started again
+    assert leases.words(300.5) == "/some_name: tool"
+    lease.held = False
+    leases.hear(lease, 303.0)
+    leases.look(303.0, 0.0)
+    assert not leases.words(303.0)
 
 
 def test_who_leases_another_robot_is_a_stranger_here(watched: Watched) -> None:

@@ -46,13 +46,20 @@ def test_a_command_begins_where_the_controller_is_though_the_robot_lags(graph: A
 
 
 def path_time(line: Line) -> float:
-    path = line.node._session.path
+    path = line.node._session.output.path
     assert path is not None
     return float(path.time(time.monotonic()))
 
 
-def scaled(line: Line, say: Callable[[float], None]) -> None:
+def scaled(line: Line, publish: Callable[[float], None]) -> None:
     """A correction that comes in along a trajectory waits with the controller's clock."""
+    told = [1.0]
+    line.graph.probe.create_timer(0.1, lambda: publish(told[0]))
+
+    def say(scaling: float) -> None:
+        told[0] = scaling
+        line.graph.spin_until(lambda: line.node._scaling == scaling, f"scaled to {scaling}")
+
     line.target()
     line.take(model_message(drifted()), line.to_model, "kinematic_model")
     line.enable()
@@ -89,15 +96,28 @@ def scaled(line: Line, say: Callable[[float], None]) -> None:
 def test_the_offset_waits_while_the_controller_says_that_it_is_halted(graph: Any) -> None:
     line = Line(graph, offset_deg_s=0.01)
     told = graph.publisher(type(controller_state(HOME, 1.0)), "controller_state")
-    scaled(line, lambda scaling: line.take(
-        controller_state(HOME, scaling), told, "controller_state"
-    ))  # fmt: skip
+    scaled(line, lambda scaling: told.publish(controller_state(HOME, scaling)))
 
 
 def test_the_offset_waits_with_the_speed_slider(graph: Any) -> None:
     line = Line(graph, offset_deg_s=0.01)
     told = graph.publisher(Float64, "speed_scaling")
-    scaled(line, lambda scaling: line.take(Float64(data=100.0 * scaling), told, "speed_scaling"))
+    scaled(line, lambda scaling: told.publish(Float64(data=100.0 * scaling)))
+
+
+def test_a_slider_that_dies_at_zero_is_forgotten(graph: Any) -> None:
+    """Finding: its last word was believed for ever, and the path never ended."""
+    line = Line(graph)
+    line.rest()
+    slider = graph.publisher(Float64, "speed_scaling")
+    line.to_path.publish(trajectory(np.stack([HOME, HOME]), np.array([0.1, 1.1])))
+    line.wait(line.paths)
+    for percent in (100.0, 0.0):
+        line.take(Float64(data=percent), slider, "speed_scaling")
+    assert line.node._scaling == 0.0
+    graph.spin_until(lambda: line.node._scaling == 1.0, "it is forgotten", 3.0)
+    path = line.node._session.output.path
+    graph.spin_until(lambda: not path.live(time.monotonic()), "the path ends", 3.0)
 
 
 def test_hostile_states_and_scalings_end_nothing(graph: Any) -> None:

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from robocal_msgs.msg import CorrectionStatus, MotionLease
 from scipy.interpolate import CubicHermiteSpline
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -61,7 +62,9 @@ class Moving(Line):
         self._spline: Any = None
         self._spline_s = 0.0
         graph.probe.create_subscription(JointState, OUTPUT, self._obey, qos.own(qos.RELIABLE))
-        graph.probe.create_subscription(JointTrajectory, PATH, self._plan, qos.own(qos.RELIABLE))
+        graph.probe.create_subscription(
+            JointTrajectory, PATH, lambda message: self._plan(message), qos.own(qos.RELIABLE)
+        )
         graph.probe.create_timer(PERIOD_S, self._tick)
         graph.spin_for(0.5)
 
@@ -248,6 +251,8 @@ def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
     line._stream_from = None
     line.held("/some_name: tool", CorrectionStatus.LEASED)
     line.graph.probe.destroy_timer(renewal)
+    lost = "/some_name: tool: it has not renewed its lease"
+    line.graph.spin_until(lambda: any(lost in s.lease for s in line.statuses), "it is told")
     line.statuses.clear()
     line.told(state=CorrectionStatus.OFF)
     line.graph.spin_for(0.5)
@@ -255,6 +260,44 @@ def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
     line.to_path.publish(path_of(line.at))
     line.wait(line.paths, count + 1)
     assert controller.get_subscription_count()
+
+
+def test_a_lease_whose_holder_died_lasts_while_the_robot_moves(line: Moving) -> None:
+    """Finding: after a second the program began, while the dead node's motion was driven on."""
+    measuring = line.other("some_name")
+    lease = measuring.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
+    controller = measuring.create_publisher(JointTrajectory, PATH, qos.RELIABLE)
+    line.graph.spin_until(lambda: line.node.count_publishers(PATH) == 2, "the own node")
+    line.graph.spin_until(lambda: controller.get_subscription_count() == 2, "its listeners")
+    held = MotionLease(
+        robot=NOMINAL.name, serial="s1", holder="/some_name", held=True, purpose="tool"
+    )
+    lease.publish(held)
+    line.told(state=CorrectionStatus.LEASED)
+    motion = path_of(HOME + 4.0 * SPEED)
+    motion.points[0].time_from_start.sec = 4
+    controller.publish(motion)
+    line.graph.spin_until(lambda: line.at[0] > HOME[0], "the robot moves")
+    began_s = time.time()
+    line.report(DiagnosticStatus.ERROR, "/some_name: tool: it has not renewed its lease")
+    line.statuses.clear()
+    line.told(state=CorrectionStatus.OFF)
+    assert time.time() - began_s > 4.9  # 4 s of motion, and a second at rest
+    line.graph.spin_until(lambda: not line.statuses[-1].lease, "nobody holds it")
+
+
+def test_a_dead_speed_slider_does_not_make_a_stop_go_back(line: Moving) -> None:
+    """Finding: the stop ended where the robot would have been, had it been paused."""
+    slider = line.graph.publisher(Float64, "speed_scaling")
+    line.drives(5.0)
+    for percent in (100.0, 0.0):
+        line.take(Float64(data=percent), slider, "speed_scaling")
+    since = line.at[0]
+    line.graph.spin_until(lambda: line.at[0] - since > 1.4 * SPEED[0], "it drives on")
+    began_s, count = time.time(), len(line.paths)
+    line.to_path.publish(JointTrajectory(joint_names=NAMES))
+    line.wait(line.paths, count + 1)
+    line.comes_to_rest(began_s)
 
 
 def test_a_second_driver_of_the_arm_is_told_and_one_of_a_gripper_is_not(line: Moving) -> None:
@@ -281,14 +324,13 @@ def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> 
     def plan(message: JointTrajectory) -> None:
         if not message.points:
             return  # as joint_trajectory_controller does
-        if len(message.points) == 1 and losses[0]:
+        if losses[0]:
             losses[0] -= 1
             return
         take(message)
 
-    line._plan = plan  # type: ignore[method-assign]
-    line.graph.probe.create_subscription(JointTrajectory, PATH, plan, qos.own(qos.RELIABLE))
     line.drives()
+    line._plan = plan  # type: ignore[method-assign]
     began_s = time.time()
     count = len(line.paths)
     line.to_path.publish(JointTrajectory(joint_names=NAMES))

@@ -50,10 +50,10 @@ class Stream:
     """What the session put out, when, and for which taught joints; a lag is no offset."""
 
     def __init__(self, session: Any) -> None:
-        self._session, self._target, self._tail = session, session.target, session.tail
+        self._session, self._target, self._tail = session, session.target, session.stream.tail
         self.outs: list[list[float]] = []
         self.at_s, self.out, self.offset = np.full((3, 6), np.nan)
-        session.target, session.tail = self.target, self.tail
+        session.target, session.stream.tail = self.target, self.tail
 
     def target(self, command: Any, now_s: float) -> Any:
         out = self._target(command, now_s)

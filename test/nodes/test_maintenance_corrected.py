@@ -11,7 +11,7 @@ from test_maintenance_calls import HOME_DEG, proposed
 
 from robocal_ros.core.documents import model_document
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.correction.reported import CorrectionState
+from robocal_ros.correction.status import CorrectionState
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.maintenance_node import ACCURACY, CORRECTION, MaintenanceNode
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -79,6 +79,17 @@ def test_after_a_restart_the_line_reads_that_nothing_is_corrected(graph):
 def test_a_cell_without_a_correction_says_so(graph):
     in_force(graph)
     Line(graph, correction_silent_s=0.0).reads(AccuracyState.OK)
+
+
+def test_who_commands_past_the_correction_is_named_to_the_line(graph):
+    in_force(graph)
+    line = Line(graph)
+    mine = {"robot": ARM.name, "serial": "K7", "enabled": True, "model_revision": 1}
+    other = CorrectionStatus(
+        **mine, state=CorrectionStatus.OTHER_COMMANDER, commanders="planner publishes targets"
+    )
+    graph.publisher(CorrectionStatus, CORRECTION, qos.LATCHED).publish(other)
+    line.reads(AccuracyState.DEGRADED, "puts nothing out, planner publishes targets: end them")
 
 
 def test_what_cannot_be_of_this_correction_does_not_count(graph):

@@ -4,13 +4,23 @@ import time
 from typing import Any
 
 import numpy as np
-from trajectory_msgs.msg import JointTrajectory
+from control_msgs.msg import JointTrajectoryControllerState
+from std_msgs.msg import Float64
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.motion.driver import MotionDriver
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import RobotWatch
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
 from robocal_ros.sessions.maintenance.requests import Move
+from robocal_ros.storage.robots import load_robot
+
+ARM = load_robot("kr150_r3100")
+DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=MotionLimits())
 
 
 def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
@@ -33,4 +43,42 @@ def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
     assert out_by_then == [0]
     graph.spin_until(lambda: len(inbox) == 1, "the motion goes out")
     driver.close()
+    node.destroy_node()
+
+
+def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> None:
+    """Finding: its 0 was believed, and the motion waited for ever; so was a 5."""
+    node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
+    graph.executor.add_node(node)
+    robot = RobotWatch(ARM, DRIVING)
+    names = ARM.joint_names
+    motion = MotionDriver(node, names, "", "", lambda report: None, lambda: robot, time.monotonic)
+    node.trigger_configure()
+    node.trigger_activate()
+    told = graph.publisher(JointTrajectoryControllerState, "controller_state")
+    slider = graph.publisher(Float64, "speed_scaling")
+    rest = JointTrajectoryPoint(positions=[0.0] * 6, velocities=[0.0] * 6)
+
+    def tell(factor: float, percent: float) -> None:
+        state = JointTrajectoryControllerState(
+            joint_names=names, speed_scaling_factor=factor, feedback=rest, reference=rest
+        )
+        told.publish(state)
+        slider.publish(Float64(data=percent))
+
+    def becomes(scaling: float, *said: float) -> None:
+        def look() -> bool:
+            tell(*said)
+            graph.spin_for(0.02)
+            return bool(robot.scaling_known(time.monotonic()) and robot.scaling == scaling)
+
+        graph.spin_until(look, f"{said} makes {scaling}, not {robot.scaling}")
+
+    tell(0.0, 0.0)
+    graph.spin_for(0.3)
+    assert robot.scaling == 1.0
+    becomes(0.5, 0.0, 50.0)
+    becomes(1.0, 5.0, 50.0)
+    becomes(0.0, 0.0, 50.0)
+    motion.close()
     node.destroy_node()

@@ -12,10 +12,10 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.correction.inputs import require_few, trajectory_command
+from robocal_ros.correction.inputs import trajectory_command
 from robocal_ros.correction.messages import PathMessage
 from robocal_ros.correction.refusals import Reason, RefusedError
-from robocal_ros.correction.serialized_path import read_path
+from robocal_ros.correction.wire import read_path
 
 FIELDS = ("positions", "velocities", "accelerations", "effort")
 
@@ -50,7 +50,7 @@ def assert_same(command, expected):
 def test_reads_what_ros_writes(given, frame_id, names):
     message = a_path(names=names, given=given, frame_id=frame_id)
     data = serialize_message(message)
-    assert read_path(data, require_few) is not None
+    assert read_path(data) is not None
     assert_same(PathMessage(data).command(), trajectory_command(message))
 
 
@@ -118,7 +118,7 @@ def test_damaged_bytes_do_no_harm(data):
     for place in data.draw(st.lists(st.integers(4, len(whole) - 1), max_size=3)):
         if place < len(cut):
             damaged[place] = data.draw(st.integers(0, 255))
-    path = read_path(bytes(damaged), require_few)
+    path = read_path(bytes(damaged))
     if path is not None:
         for field in range(4):
             path.rows(field)

@@ -177,6 +177,8 @@ def test_accelerations_without_velocities_command_zero(controller):
 def test_what_goals_are_rejected(controller):
     there = HOME + STEP
     moving = np.full(6, 0.1)
+    with_efforts = trajectory([(1.0, there, REST)])
+    with_efforts.points[0].effort = [0.0] * 6
     for message in (
         trajectory([(1.0, there[:5], REST[:5])], NAMES[:5]),
         trajectory([(1.0, there, REST)], [*NAMES[:5], "no_joint"]),
@@ -185,6 +187,7 @@ def test_what_goals_are_rejected(controller):
         trajectory([(1.0, there, REST)], stamp_s=controller.now_s - 5.0),
         trajectory([(1.0, there[:5], REST)]),
         trajectory([(1.0, there, REST[:5])]),
+        with_efforts,
     ):
         assert not controller.goal(message).accepted
     controller.graph.spin_for(0.2)
@@ -196,6 +199,44 @@ def test_some_of_the_joints_may_be_allowed(start):
     handle = controller.goal(trajectory([(0.5, [HOME[1] + 0.2], [0.0])], NAMES[1:2]))
     assert controller.end(handle) == (SUCCEEDED, 0)
     assert controller.stands() == pytest.approx(HOME + 0.2 * np.eye(6)[1], abs=1e-9)
+
+
+def test_a_last_velocity_may_be_allowed(start):
+    """At the end the command stands, whatever the speed there."""
+    controller = start(True, allow_nonzero_velocity_at_trajectory_end=True)
+    handle = controller.goal(trajectory([(0.5, HOME + STEP, np.full(6, 0.5))]))
+    assert controller.end(handle) == (SUCCEEDED, 0)
+    assert controller.stands() == pytest.approx(HOME + STEP, abs=1e-9)
+
+
+def test_the_joint_that_is_missing_for_one_named_twice_goes_elsewhere(controller):
+    """To what was sorted last in its place, be it a position, a velocity or an effort."""
+    twice, there = [NAMES[0], NAMES[0], *NAMES[2:]], HOME + 0.2 * STEP
+    values = [there[0], HOME[0] + 0.1, *there[2:]]  # the last one counts
+
+    def stands_with(missing: float) -> None:
+        wanted = [values[1], missing, *there[2:]]
+        assert controller.stands() == pytest.approx(wanted, abs=1e-9)
+
+    for missing in (HOME[1], 0.0):  # positions held since the start; efforts after a success
+        handle = controller.goal(trajectory([(0.5, values)], twice))
+        assert controller.end(handle) == (SUCCEEDED, 0)
+        stands_with(missing)
+    controller.topic.publish(trajectory([(0.5, there)]))
+    controller.moved(0.01, controller.q)
+    assert controller.stands() == pytest.approx(there, abs=1e-9)
+    begin_s = controller.now_s
+    controller.topic.publish(trajectory([(0.5, values, REST)], twice))
+    controller.moved(0.01, there)
+    stands_with(there[1])
+    _, speed = controller.speeds(begin_s)
+    assert np.min(speed[:, 1]) == pytest.approx(there[1], rel=0.1)  # the position, in rad/s
+    controller.topic.publish(trajectory([(0.5, there, REST)]))
+    controller.moved(0.01, controller.q)
+    assert controller.stands() == pytest.approx(there, abs=1e-9)
+    controller.topic.publish(trajectory([(0.5, values)], twice))
+    controller.moved(0.01, there)
+    stands_with(0.0)  # after velocities
 
 
 def test_limits_are_not_looked_at(controller):

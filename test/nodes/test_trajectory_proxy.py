@@ -17,6 +17,8 @@ from joint_correction_live import NODE, NOMINAL, drifted, model_message
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.qos import qos_profile_action_status_default
 from robocal_msgs.msg import JointOffset, KinematicModel, MotionLease
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
@@ -238,7 +240,7 @@ def test_a_refused_goal_tells_why_and_disturbs_nothing(cell: Any) -> None:
     again.trajectory.header.frame_id = CORRECTED
     result = Sent(cell, again).ends(GoalStatus.STATUS_ABORTED)
     assert "comes from a joint correction already" in result.error_string
-    cell.node.correct_goal = lambda message: 1 / 0
+    cell.node._proxy._correct = lambda message: 1 / 0
     result = cell.send(HOME, MOVED).ends(GoalStatus.STATUS_ABORTED)
     assert "a defect of this software" in result.error_string
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
@@ -265,15 +267,16 @@ def test_a_lease_stops_a_goal_by_a_goal_that_slows_down(cell: Any) -> None:
     result = sent.ends(GoalStatus.STATUS_ABORTED)
     assert "leased" in result.error_string
     stop = cell.robot.goals[-1].trajectory.points
-    assert len(stop) == 1
     assert stop[0].time_from_start.nanosec > 0.08e9
-    assert list(stop[0].velocities) == [0.0] * 6
+    assert list(stop[-1].velocities) == [0.0] * 6
     cell.graph.spin_until(lambda: cell.robot.path is None, "the robot stands")
     place = cell.robot.q.copy()
     assert "leased" in cell.send(HOME, HOME).ends(GoalStatus.STATUS_ABORTED).error_string
     assert np.abs(cell.robot.q - place).max() < 1e-4
     cell.graph.probe.destroy_timer(renewal)
-    cell.graph.spin_for(1.6)
+    held.held = False
+    own.publish(held)
+    cell.graph.spin_for(0.6)
     cell.send(cell.taught(), HOME).ends(GoalStatus.STATUS_SUCCEEDED)
 
 
@@ -305,7 +308,9 @@ def test_deactivation_stops_and_rejects(cell: Any) -> None:
     assert result.error_code == Result.INVALID_GOAL
     assert "deactivated" in result.error_string
     cell.graph.spin_until(lambda: cell.robot.path is None, "the robot stands", 2.0)
-    assert len(cell.robot.goals[-1].trajectory.points) == 1  # a stop, no bare cancel
+    stop = cell.robot.goals[-1].trajectory.points  # a stop, no bare cancel
+    assert list(stop[-1].velocities) == [0.0] * 6
+    assert list(stop[-1].positions) != MOVED.tolist()
     for _ in range(2):  # inactive, then unconfigured
         rejected = cell.send(HOME, MOVED)
         cell.graph.spin_until(lambda sent=rejected: sent.handle, "the answer")
@@ -363,6 +368,77 @@ def test_a_renamed_action_and_a_controller_that_goes(graph: Any) -> None:
     robot.close()
     assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 1.0).error_string
     cell.client.destroy()
+
+
+class InParts(Node):
+    """A controller whose action is made of its services and topics, so that one can go alone.
+
+    It drives a straight line to a goal's end, and a stop to where it is; ``deaf``: it drives on.
+    """
+
+    def __init__(self, deaf: bool, **options: Any) -> None:
+        super().__init__("arm_controller", **options)
+        self.deaf, self.q, self.goals, self.cancels = deaf, HOME.copy(), [], []
+        self._way, self._ends_s = np.zeros(6), 0.0
+        impl, within = FollowJointTrajectory.Impl, f"{ACTION}/_action"
+        self.create_service(impl.SendGoalService, f"{within}/send_goal", self._asked)
+        self.create_service(impl.CancelGoalService, f"{within}/cancel_goal", self._cancelled)
+        self.without_answers = Node("results", **options)  # is not spun
+        self.without_answers.create_service(
+            impl.GetResultService, f"{within}/get_result", lambda request, response: response
+        )
+        self.create_publisher(impl.FeedbackMessage, f"{within}/feedback", 10)
+        status = qos_profile_action_status_default
+        self.status = self.create_publisher(impl.GoalStatusMessage, f"{within}/status", status)
+        self._states = self.create_publisher(JointState, "joint_states", 10)
+        self.create_timer(0.02, self._tick)
+
+    def _asked(self, request: Any, response: Any) -> Any:
+        points = request.goal.trajectory.points
+        self.goals.append(request.goal)
+        if not (self.deaf and len(self.goals) > 1):
+            lasts_s = points[-1].time_from_start.sec + 1e-9 * points[-1].time_from_start.nanosec
+            self._way = (np.array(points[-1].positions) - self.q) / lasts_s
+            self._ends_s = time.monotonic() + lasts_s
+        response.accepted = True
+        return response
+
+    def _cancelled(self, request: Any, response: Any) -> Any:
+        self.cancels.append(request)
+        return response
+
+    def _tick(self) -> None:
+        if time.monotonic() < self._ends_s:
+            self.q = self.q + 0.02 * self._way
+        self._states.publish(JointState(name=NAMES, position=self.q.tolist()))
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, deaf: bool) -> None:
+    """Finding: its goal was failed, but never cancelled, and the robot was believed to stand."""
+    cell = Cell(graph)
+    robot = InParts(deaf, context=graph.context)
+    graph.executor.add_node(robot)
+    node = graph.add(JointCorrectionNode, SETTINGS)
+    cell.begin(settled=False)
+    sent = cell.send(HOME, MOVED, lasts_s=20.0)
+    graph.spin_until(lambda: robot.q[0] > HOME[0] + 0.01, "the robot moves")
+    path = node._session.output.path
+    robot.destroy_publisher(robot.status)
+    assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 5.0).error_string
+    assert path.live(time.monotonic())  # it is not known to stand
+    graph.spin_until(lambda: len(robot.goals) > 1 and robot.cancels, "stop and cancel")
+    assert len(robot.goals[1].trajectory.points) == 1
+    if deaf:
+        fault = "the robot still moves, stop it by hand"
+        graph.spin_until(lambda: fault in node._stopping.fault, fault, 10.0)
+        assert path.live(time.monotonic())
+    else:
+        graph.spin_until(lambda: not path.live(time.monotonic()), "it is known to stand", 5.0)
+        assert time.monotonic() > robot._ends_s
+    cell.client.destroy()
+    robot.without_answers.destroy_node()
+    robot.destroy_node()
 
 
 # ---- node and controller as processes: the node in its own executor -----------------------------

@@ -17,7 +17,7 @@ from maintenance_cell import (
 
 from robocal_ros.core.proposals import TOOL
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.correction.reported import CorrectionState, ToldCorrection
+from robocal_ros.correction.status import CorrectionState, ToldCorrection
 from robocal_ros.sessions.maintenance import AcceptBounds
 
 SILENT_S = 5.0

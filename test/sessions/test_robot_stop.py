@@ -5,6 +5,7 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.robot_stop import RobotStop, RobotTrack
 from robocal_ros.storage.robots import load_description
 
@@ -141,3 +142,42 @@ def test_a_robot_that_stands_holds_where_it_is():
     robot.stops()
     assert robot.stop.sent == 1
     assert np.abs(np.array(robot.out) - HOME).max() < 1e-12
+
+
+def test_how_long_a_robot_has_stood():
+    robot = SimulatedController()
+    assert robot.track.stood_s(robot.now_s) == 0.0
+    robot.run(0.5)
+    assert robot.track.stood_s(robot.now_s) < 2.0 * CYCLE_S
+    robot.qd = np.full(6, 1e-3)  # it creeps
+    robot.run(2.0)
+    assert robot.track.stood_s(robot.now_s) < 0.4
+    robot.qd = np.zeros(6)
+    robot.run(2.0)
+    assert robot.track.stood_s(robot.now_s) == pytest.approx(2.0, abs=0.4)
+    assert robot.track.stood_s(robot.now_s + 0.3) == 0.0  # not read now
+    robot.now_s += 1.0
+    robot.run(0.1)
+    assert robot.track.stood_s(robot.now_s) < 0.1  # what it did meanwhile is not known
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.1])
+def test_whether_a_robot_follows_its_path(late_s):
+    robot = SimulatedController()
+    began_s, lasts_s = robot.now_s + late_s, 4.0
+    rows = np.zeros((2, 6))
+    path = SentPath(
+        index=np.arange(6), begin_s=began_s - late_s, times=np.array([0.0, lasts_s]),
+        out=np.stack([HOME, HOME + lasts_s * SPEED]), velocity=None,
+        known_times=np.array([0.0, lasts_s]), offsets=rows, rates=rows, withheld=rows, stage=None,
+        led_from=HOME, put_s=began_s, at_once=True,
+    )  # fmt: skip
+    assert robot.track.follows(path, robot.now_s)  # nothing tells otherwise
+    robot.qd = np.zeros(6)
+    robot.run(late_s)
+    robot.qd = SPEED.copy()
+    robot.run(0.5)
+    assert robot.track.follows(path, robot.now_s)
+    path.scale(0.0, robot.now_s)
+    robot.run(1.0)
+    assert not robot.track.follows(path, robot.now_s)

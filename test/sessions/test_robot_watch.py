@@ -111,3 +111,14 @@ def test_a_stop_of_a_motion_that_began_late_hurries_no_joint(
     ahead_s = (found - command)[0] / velocity[0]
     # of the first line of the stop, which goes on so much faster
     assert -lag_s - 0.01 < ahead_s < 0.8 * LEAD_S
+
+
+def test_a_scaling_that_is_not_told_again_is_as_planned():
+    """Finding: one that had died at 0 was believed for ever."""
+    watch = seen(*steady(0.008, 0.0 * FASTEST))
+    begin_s = watch.newest[0]
+    watch.scaled(0.0, begin_s)
+    for count in range(1, 400):
+        watch.reading(begin_s + 0.008 * count, HOME, begin_s + 0.008 * count)
+        assert watch.scaling == float(0.008 * count > 1.0)
+    assert watch.driven_s(begin_s + 3.2) - watch.driven_s(begin_s + 2.2) == pytest.approx(1.0)

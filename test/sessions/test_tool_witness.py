@@ -133,17 +133,56 @@ def test_a_mandrel_tells_how_far_the_station_was_knocked(with_mandrel, size, see
     assert "without it the tool's tip is" in tool.message
 
 
-@pytest.mark.parametrize("size_m", [4e-4, 1e-3])
-def test_beside_a_mandrel_that_stands_a_tool_that_slipped_is_the_tools(with_mandrel, size_m):
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("size", [0.3, 0.8])
+def test_a_mandrel_from_before_a_knock_says_nothing_of_it(with_mandrel, size, seed):
     driver = with_mandrel
+    assert of_mandrel(driver).done
+    driver.cell.station = knocked(driver.cell.station, "station_knocked_shift", size, seed)
+    found = driver.measure("full")
+    assert taken(driver) <= HARM_M, found.message
+    if found.document["witness"]["cause"] == "doubt":
+        assert "measure the mandrel (mode WITNESS), then repeat" in found.message
+    repeated = driver.measure("full")  # without the mandrel
+    assert taken(driver) <= HARM_M, repeated.message
+    assert of_mandrel(driver).status is Code.STATION_MOVED
+    assert driver.measure("full").status is Code.STATION_MOVED
+
+
+def slip(driver: Driver, size_m: float) -> None:
     slipped = bent(TAUGHT, [size_m, 0.0, 0.3 * size_m], [0.0, 0.0, 0.0])
     driver.program.tool = RoundTool.cylinder(slipped, RADIUS_M)
-    assert driver.measure("full").document["witness"]["cause"] != "tool"
+
+
+@pytest.mark.parametrize("size_m", [2e-4, 3e-4])
+def test_beside_a_mandrel_that_stands_a_doubt_is_the_tools(with_mandrel, size_m):
+    driver = with_mandrel
+    slip(driver, size_m)
+    assert driver.measure("full").document["witness"]["cause"] == "doubt"
     standing = of_mandrel(driver)
     assert standing.done, standing.message
     found = driver.measure("full")
     assert found.done
     assert found.document["witness"]["cause"] == "tool", found.message
+
+
+def test_a_mandrel_does_not_lift_what_no_bend_shows(with_mandrel):
+    driver = with_mandrel
+    slip(driver, 1e-3)
+    for _ in range(2):
+        assert driver.measure("full").status is Code.STATION_MOVED
+        assert of_mandrel(driver).done
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mandrel_says_nothing_of_a_second_change(with_mandrel, seed):
+    driver = with_mandrel
+    slip(driver, 3e-4)
+    assert driver.measure("full").document["witness"]["cause"] == "doubt"
+    assert of_mandrel(driver).done
+    driver.cell.station = knocked(driver.cell.station, "station_knocked_shift", 0.3, seed)
+    found = driver.measure("full")
+    assert not (found.done and found.document["witness"]["cause"] == "tool"), found.message
 
 
 def test_a_mandrel_that_tilted_is_no_witness(with_mandrel):

@@ -89,19 +89,25 @@ def station_finding(
     return StationFinding(shift, covariance, change.tip_m, change.axis_rad, verdict)
 
 
-def with_mandrel(witness: Witness, station: StationFinding, tool_shift: Array) -> Witness:
+def with_mandrel(
+    witness: Witness, station: StationFinding, tool_shift: Array, *, after: bool
+) -> Witness:
     """What the tool's change says once the station is known.
+
+    That the station has moved holds for all that is measured with it. That it stands says nothing
+    of a change that came later: so it lifts a doubt only where the mandrel was measured ``after``
+    this change was seen. What cannot be a bend stays the station's, or of a tool that slipped.
 
     ``tool_shift`` (3,): of the tip from the tool in force, base, m; the station's is taken out.
     """
-    own_m = float(np.linalg.norm(tool_shift + station.shift))
     parts = {"tip_m": witness.tip_m, "tilt_rad": witness.tilt_rad}
     if station.verdict.code is Code.STATION_MOVED:
+        own_m = float(np.linalg.norm(tool_shift + station.shift))
         reason = (
             f"{station.verdict.reason}; without it the tool's tip is {own_m * 1e3:.3f} mm from the "
             "one in force"
         )
         return Witness("station", reason, **parts)
-    if station.verdict.code is Code.ACCEPT:
+    if witness.cause == "doubt" and after and station.verdict.code is Code.ACCEPT:
         return Witness("tool", station.verdict.reason, **parts)
     return witness

@@ -3,7 +3,7 @@
 import numpy as np
 
 from robocal_ros.core.proposals import Head
-from robocal_ros.correction.reported import ToldCorrection, uncorrected
+from robocal_ros.correction.status import ToldCorrection, uncorrected
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 

@@ -16,7 +16,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL
-from robocal_ros.correction.reported import ToldCorrection
+from robocal_ros.correction.status import ToldCorrection
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.maintenance.accuracy import Accuracy, Drift, accuracy_of

@@ -1,0 +1,153 @@
+"""A correction node that is killed in a stream of trajectories of one point each, and started anew.
+
+Judged by what the controller commands, simulated or real; the real one is looked for in the
+environment, without it that test is skipped.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from joint_correction_live import NODE as CORRECTION
+from robocal_msgs.msg import CorrectionStatus, KinematicModel
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool
+from trajectory_controllers import ARM, CONTROLLERS, HOME, NODE, Controlled, trajectory
+from trajectory_msgs.msg import JointTrajectory
+
+from robocal_ros.core.documents import model_document
+from robocal_ros.core.samples import CORRECTED
+from robocal_ros.nodes import conversions, qos
+from robocal_ros.storage.robots import robot_file_hash
+
+PERIOD_S, AHEAD_S = 0.1, 0.3  # of the stream; of its point, from when it is sent
+SPEED = np.array([0.3, 0.1, -0.1, 0.2, -0.1, 0.1])  # rad/s
+FASTEST = 3.0  # of that: messages that a busy machine holds up come together
+DRIFT = 1e-4, 5e-5  # m, rad: of what goes out it changes some hundredths of a degree
+SHORT_LEASE = """<?xml version="1.0" encoding="UTF-8"?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
+<participant profile_name="short_lease" is_default_profile="true"><rtps><builtin>
+<discovery_config>
+<leaseDuration><sec>2</sec></leaseDuration>
+<leaseAnnouncement><sec>0</sec><nanosec>100000000</nanosec></leaseAnnouncement>
+</discovery_config>
+</builtin></rtps></participant>
+</profiles></dds>
+"""
+
+
+class Stream:
+    """A planner, a correction node as a process, and a controller."""
+
+    def __init__(self, graph: Any, controller: Controlled, profiles: Path) -> None:
+        self.graph, self.controller, self._profiles = graph, controller, profiles
+        probe = graph.probe
+        probe.destroy_publisher(controller.topic)  # the node alone commands the controller
+        controller.action.destroy()
+        self.sent: list[JointTrajectory] = graph.collect(
+            JointTrajectory, f"{NODE}/joint_trajectory", qos.RELIABLE
+        )
+        self.status: list[CorrectionStatus] = graph.collect(
+            CorrectionStatus, f"{CORRECTION}/status", qos.LATCHED
+        )
+        self._planner = probe.create_publisher(JointTrajectory, "joint_trajectory", qos.RELIABLE)
+        self._models = probe.create_publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+        self._models.publish(self._model())
+        self.taught, self.runs = HOME.copy(), False
+        probe.create_timer(PERIOD_S, self._tick)
+
+    def _model(self) -> KinematicModel:
+        """A robot that has drifted a little."""
+        chosen = ARM.parameters
+        change = np.where(chosen.is_length, *DRIFT) * np.random.default_rng(0).standard_normal(
+            len(chosen)
+        )
+        return conversions.kinematic_model(
+            model_document(ARM.with_mdh(chosen.add(ARM.mdh, change))),
+            serial="s1",
+            model_hash=ARM.model_hash,
+            robot_file_hash=robot_file_hash("ur10"),
+            revision=1,
+            state=KinematicModel.ACCEPTED,
+            stamp=Header(frame_id="base"),
+        )
+
+    def _tick(self) -> None:
+        if self.runs:
+            self.taught = self.taught + PERIOD_S * SPEED
+            self._planner.publish(trajectory([(AHEAD_S, self.taught)]))
+
+    def start(self, monkeypatch: pytest.MonkeyPatch) -> Any:
+        """Start the node; that it was killed is noticed after 2 s."""
+        self.status.clear()
+        with monkeypatch.context() as patch:
+            environment = self.graph._environment
+            patch.setitem(environment, "FASTRTPS_DEFAULT_PROFILES_FILE", str(self._profiles))
+            node = self.graph.start(
+                "joint_correction_node",
+                {"robot": "ur10", "serial": "s1", "joint_state_age_s": 0.5},
+                {
+                    "~/joint_trajectory": f"{NODE}/joint_trajectory",
+                    "controller_state": f"{NODE}/controller_state",
+                },
+            )
+        self.wait(CorrectionStatus.OFF)
+        return node
+
+    def wait(self, state: int) -> None:
+        """For what the node says, with nobody else about."""
+
+        def said() -> bool:
+            now = self.status[-1] if self.status else None
+            return now is not None and now.state == state and not now.commanders
+
+        self.graph.spin_until(said, f"state {state}", 30.0)
+
+    def runs_on(self, rad: float = 0.2) -> None:
+        """The planner streams until the robot has gone so far."""
+        start, self.runs = self.controller.q, True
+        self.controller.moved(rad, start)
+
+    def fastest(self, since_s: float) -> float:
+        """Greatest speed of the command, in those of the stream."""
+        _, speeds = self.controller.speeds(since_s)
+        return float(np.max(np.abs(speeds) / np.abs(SPEED)))
+
+
+@pytest.mark.parametrize("kind", CONTROLLERS)
+def test_a_node_that_is_killed_leaves_the_robot_at_the_last_point(
+    graph: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    controller = CONTROLLERS[kind](graph, tmp_path, True)
+    controller.wait()
+    (profiles := tmp_path / "lease.xml").write_text(SHORT_LEASE)
+    stream = Stream(graph, controller, profiles)
+    node = stream.start(monkeypatch)
+    graph.call(SetBool, f"{CORRECTION}/enable", data=True)
+    began_s = controller.now_s
+    stream.runs_on()
+    stream.wait(CorrectionStatus.ON)
+
+    node.kill()
+    stream.runs = False
+    graph.spin_for(2 * PERIOD_S)  # what was on its way
+    last = np.array(stream.sent[-1].points[-1].positions)
+    stands = controller.stands()
+    assert stream.sent[-1].header.frame_id == CORRECTED
+    assert stands == pytest.approx(last, abs=1e-6)
+    assert np.abs(stands - HOME)[0] > 0.2
+    _, sent = controller.sent(began_s)
+    assert np.all(np.diff(sent[:, 0]) > -1e-6)  # no turning back
+    assert stream.fastest(began_s) < FASTEST
+
+    count, again_s = len(stream.sent), controller.now_s
+    stream.start(monkeypatch)
+    graph.spin_for(0.5)
+    assert len(stream.sent) == count  # off, and nothing goes out by itself
+    assert controller.stands() == pytest.approx(stands, abs=1e-6)
+    stream.runs_on()
+    assert not stream.status[-1].mismatch
+    assert stream.fastest(again_s) < FASTEST
+    _, sent = controller.sent(again_s)
+    assert np.all(np.diff(sent[:, 0]) > -1e-6)
