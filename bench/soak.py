@@ -82,7 +82,7 @@ def endurance(amount: Amount) -> Table:
     add("whole gaps of a live cell at the limits as they are set, and its calls' times", 1,
         lambda: not _pytest("test/nodes/soak_maintenance.py"))  # fmt: skip
     matrix = "test/nodes/test_fault_matrix.py"
-    add("the seventeen faults of a cell's tool side over DDS, each with its code", 1,
+    add("the nineteen faults of a cell's tool side over DDS, each with its code", 1,
         lambda: not _pytest(matrix, ROBOCAL_FAULTS="all"))  # fmt: skip
     add("sensor, sphere or robot knocked in a live cell, each told in the next gap", 1,
         lambda: not _pytest("test/nodes/soak_knocks.py"))  # fmt: skip
