@@ -1,4 +1,4 @@
-"""Joint states as they come over the wire, many at a time: stamps and positions without objects.
+"""Joint states as they come over the wire, many at a time, and the points of trajectories.
 
 Layout: OMG CDR, plain, little endian, as ROS 2 writes ``sensor_msgs/JointState``: after four bytes
 of encapsulation a stamp, ``frame_id``, joint names, then positions, velocities and efforts
@@ -22,6 +22,7 @@ ENCAPSULATION = 4  # bytes
 LITTLE_ENDIAN = b"\0\1"
 STAMP = 8  # bytes
 SEQUENCES = 3  # positions, velocities, efforts
+FIELDS = 4  # sequences of a trajectory's point
 SECOND_NS = 1_000_000_000
 
 
@@ -124,6 +125,45 @@ def _places(message: bytes, fixed: Bytes) -> tuple[int, int]:
     if at > len(message):
         raise struct.error("the message is shorter than its lengths say")
     return begins[0]
+
+
+@kernel
+def point_places(
+    words: NDArray[np.uint32], begin: int, size: int, places: Places, times: Array
+) -> bool:
+    """Where numbers begin (in doubles) and how many they are: ``places`` (m, 4, 2)."""
+    at = begin
+    for i in range(places.shape[0]):
+        for field in range(FIELDS):
+            if at + 4 > size:
+                return False
+            count = int(words[at // 4])
+            at += 4
+            if count > 0:
+                at = (at + 7) // 8 * 8
+            places[i, field, 0], places[i, field, 1] = at // 8, count
+            at += 8 * count
+        if at + 8 > size:
+            return False
+        times[i] = np.int32(words[at // 4]) + 1e-9 * words[at // 4 + 1]
+        at += 8
+    return True
+
+
+@kernel
+def gather_rows(doubles: Array, places: Places, rows: Array) -> None:
+    """Numbers (m, k) of a field with ``places`` (m, 2) of a message's ``doubles``."""
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            rows[i, j] = doubles[places[i, 0] + j]
+
+
+@kernel
+def scatter_rows(rows: Array, places: Places, doubles: Array) -> None:
+    """The other way."""
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            doubles[places[i, 0] + j] = rows[i, j]
 
 
 def load_kernels() -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel
+from robocal_ros.core.serialized_joints import FIELDS, gather_rows, point_places, scatter_rows
 from robocal_ros.correction.inputs import JointCommand, require_few
 
 Array = NDArray[np.float64]
@@ -23,7 +23,6 @@ Array = NDArray[np.float64]
 HEAD = b"\0\1\0\0"  # plain, little endian
 STAMP, FRAME = len(HEAD), len(HEAD) + 8  # where they begin
 NS = 1_000_000_000
-FIELDS = 4  # sequences of a point
 LEAST_POINT = 4 * FIELDS + 8  # bytes of a point without numbers
 
 # ---- text and numbers ---------------------------------------------------------------------------
@@ -201,43 +200,6 @@ def _layout(data: bytes) -> _Layout | None:
 # ---- trajectories -------------------------------------------------------------------------------
 
 
-@kernel
-def _places(
-    words: NDArray[np.uint32], begin: int, size: int, places: NDArray[np.int64], times: Array
-) -> bool:
-    """Where numbers begin (in doubles) and how many they are: ``places`` (m, 4, 2)."""
-    at = begin
-    for i in range(places.shape[0]):
-        for field in range(FIELDS):
-            if at + 4 > size:
-                return False
-            count = int(words[at // 4])
-            at += 4
-            if count > 0:
-                at = (at + 7) // 8 * 8
-            places[i, field, 0], places[i, field, 1] = at // 8, count
-            at += 8 * count
-        if at + 8 > size:
-            return False
-        times[i] = np.int32(words[at // 4]) + 1e-9 * words[at // 4 + 1]
-        at += 8
-    return True
-
-
-@kernel
-def _gather(doubles: Array, places: NDArray[np.int64], rows: Array) -> None:
-    for i in range(rows.shape[0]):
-        for j in range(rows.shape[1]):
-            rows[i, j] = doubles[places[i, 0] + j]
-
-
-@kernel
-def _scatter(rows: Array, places: NDArray[np.int64], doubles: Array) -> None:
-    for i in range(rows.shape[0]):
-        for j in range(rows.shape[1]):
-            doubles[places[i, 0] + j] = rows[i, j]
-
-
 @dataclass(frozen=True)
 class SerializedPath:
     """A trajectory of m points of k joints, each field in all points or in none."""
@@ -259,14 +221,14 @@ class SerializedPath:
         if k == 0:
             return None
         out = np.empty((len(self), k))
-        _gather(self.doubles, self.places[:, field], out)
+        gather_rows(self.doubles, self.places[:, field], out)
         return out
 
     def changed(self, frame_id: str, rows: dict[int, Array]) -> bytes:
         """The message with other numbers (m, k) of fields, and a ``frame_id`` that it `takes`."""
         doubles = self.doubles.copy()
         for field, values in rows.items():
-            _scatter(np.ascontiguousarray(values), self.places[:, field], doubles)
+            scatter_rows(np.ascontiguousarray(values), self.places[:, field], doubles)
         body, stamp = doubles.tobytes(), FRAME - STAMP
         rest = body[stamp + _string_size(self.frame_id) : self.size]
         return HEAD + body[:stamp] + _string_bytes(frame_id) + rest
@@ -297,7 +259,7 @@ def read_path(data: bytes) -> SerializedPath | None:
     doubles = np.zeros(-(-size // 8))
     doubles.view(np.uint8)[:size] = np.frombuffer(data, np.uint8, size, len(HEAD))
     places, times = np.empty((count, FIELDS, 2), dtype=np.int64), np.empty(count)
-    whole = _places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times)
+    whole = point_places(doubles.view(np.uint32), at + 4 - len(HEAD), size, places, times)
     if not whole or np.any(places[:, :, 1] != places[0, :, 1]):
         return None
     return SerializedPath(sec * NS + nanosec, frame_id, names, times, doubles, size, places)
@@ -306,7 +268,7 @@ def read_path(data: bytes) -> SerializedPath | None:
 def load_kernels() -> None:
     """Call the compiled code once, so that the first trajectory need not wait for it."""
     doubles, places = np.zeros(8), np.zeros((1, FIELDS, 2), dtype=np.int64)
-    _places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
+    point_places(doubles.view(np.uint32), 0, doubles.nbytes, places, np.zeros(1))
     path = SerializedPath(0, "", (), np.zeros(1), doubles, doubles.nbytes, places + 1)
     rows = path.rows(0)
     path.changed("", {} if rows is None else {0: rows})
