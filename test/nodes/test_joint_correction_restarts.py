@@ -23,7 +23,9 @@ from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.correction.joint_correction import JointCorrection
+from robocal_ros.correction.bounds import CorrectionConfig
+from robocal_ros.correction.clamping import correction_between
+from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.nodes import qos
 from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -198,5 +200,6 @@ def test_no_step_whoever_is_killed(graph: Any, tmp_path: Path) -> None:
         cell.enable()
     assert cell.largest_step() < START_RAD
     _, taught, out = cell.sent[-1]
-    whole = JointCorrection.between(with_tool(NOMINAL, 0.0), with_tool(drifted(), BENT_M))
+    models = (pack_model(with_tool(arm, m)) for arm, m in ((NOMINAL, 0.0), (drifted(), BENT_M)))
+    whole = correction_between(*models, NOMINAL, CorrectionConfig())
     assert out == pytest.approx(whole.correct(taught[None]).q[0], abs=1e-9)  # what was, is again

@@ -28,11 +28,13 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Pat
     assert len(cell.sent) == 2
     graph.spin_for(0.5)
     cell.is_open = False
-    graph.spin_until(lambda: len(cell.sent) == 3, "the stop", within_s=1.0)
+    graph.spin_until(lambda: len(cell.sent) >= 3, "the stop", within_s=1.0)
     graph.spin_for(0.5)
     assert cell.stands(1.0)
-    assert len(cell.sent) == 3
-    assert not any(cell.sent[2].points[-1].velocities)
+    for stop in cell.sent[2:]:  # one whose effect is seen late is sent again, from where it is
+        assert not any(stop.points[-1].velocities)
+        assert np.max(np.abs(np.array(stop.points[-1].positions) - cell.q)) < 0.005
+    stopped = len(cell.sent)
     graph.spin_until(ended.done, "the result")
     assert not ended.result().result.success
     status = graph.call(GetMaintenance, "/maintenance_node/status")
@@ -52,7 +54,7 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Pat
     assert "robot is not at home: " in answer.message
     away = graph.call(RunMaintenanceCycle, "/maintenance_node/run", cycle_id="c2", gap_s=GAP_S)
     assert away.status == Code.CONFLICT
-    assert len(cell.sent) == 3
+    assert len(cell.sent) == stopped
 
 
 def test_calls_are_answered_at_once_while_the_robot_moves(graph: Any, tmp_path: Path) -> None:
