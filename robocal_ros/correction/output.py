@@ -33,9 +33,11 @@ class SentPath:
     times: Array  # (m,) of its points, s
     out: Array  # (m, k) as put out
     velocity: Array | None  # (m, k); None for straight lines between the points
+    acceleration: Array | None  # (m, k); None for cubics
     known_times: Array  # (r,) of the next rows: its points, before them where it leads in
     offsets: Array  # (r, n)
     rates: Array  # (r, n) of the offset
+    bends: Array  # (r, n) its accelerations, where the path has some
     withheld: Array  # (r, n) what of it the limiter adds
     stage: StagedCorrection | None  # that it was made with
     led_from: Array  # (k,) where the controller leads in from
@@ -82,7 +84,7 @@ class SentPath:
         )
 
     def place(self, now_s: float) -> Array:
-        """Where the controller is (k,): cubic between points with velocities, else straight."""
+        """Where the controller is (k,), between the points as it drives there."""
         t = self.time(now_s)
         if t < self.times[0]:
             lead = self.times[0] + self.begin_s - self.put_s
@@ -91,13 +93,10 @@ class SentPath:
         k = int(np.searchsorted(self.times, t, side="right")) - 1
         if k + 1 >= len(self.times):
             return self.out[-1].copy()
-        dt = self.times[k + 1] - self.times[k]
-        s, way = (t - self.times[k]) / dt, self.out[k + 1] - self.out[k]
-        if self.velocity is None:
-            return np.asarray(self.out[k] + s * way)
-        v0, v1 = self.velocity[k] * dt, self.velocity[k + 1] * dt
-        curve = 3.0 * way - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * way)
-        return np.asarray(self.out[k] + s * (v0 + s * curve))
+        ends = slice(k, k + 2)
+        rates = None if self.velocity is None else self.velocity[ends]
+        bends = None if self.acceleration is None else self.acceleration[ends]
+        return spline(self.times, self.out[ends], rates, bends, k, t)[0]
 
     def at(self, rows: Array, now_s: float) -> Array:
         """Rows (r, n) of it now (n,)."""
@@ -110,12 +109,45 @@ class SentPath:
         k = int(np.searchsorted(times, t, side="right")) - 1
         if self.velocity is None or not 0 <= k < len(times) - 1:
             return self.at(self.offsets, now_s), self.at(self.rates, now_s)
-        h = times[k + 1] - times[k]
-        s, v0, v1 = (t - times[k]) / h, self.rates[k], self.rates[k + 1]
-        way = (self.offsets[k + 1] - self.offsets[k]) / h
-        first, second = 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way
-        offset = self.offsets[k] + h * s * (v0 + s * (first + s * second))
-        return offset, v0 + s * (2.0 * first + 3.0 * s * second)
+        ends = slice(k, k + 2)
+        # it comes in by a cubic
+        comes_in = k < len(times) - len(self.times)
+        bends = None if self.acceleration is None or comes_in else self.bends[ends]
+        return spline(times, self.offsets[ends], self.rates[ends], bends, k, t)
+
+
+def spline_terms(
+    way: Array, v0: Array, v1: Array, bends: Array | None
+) -> tuple[Array, Array, Array, Array]:
+    """Factors of u^2 to u^5 of a cubic, with ``bends`` (2, ...) a quintic, from u = 0 to 1."""
+    if bends is None:
+        return 3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0 * way, 0.0 * way
+    b0, b1 = bends
+    return (
+        0.5 * b0,
+        10.0 * way - 6.0 * v0 - 4.0 * v1 - 1.5 * b0 + 0.5 * b1,
+        -15.0 * way + 8.0 * v0 + 7.0 * v1 + 1.5 * b0 - b1,
+        6.0 * way - 3.0 * (v0 + v1) - 0.5 * (b0 - b1),
+    )
+
+
+def spline(
+    times: Array, ends: Array, rates: Array | None, bends: Array | None, k: int, t: float
+) -> tuple[Array, Array]:
+    """Place and speed (n,) at ``t`` between the points k and k + 1, as a controller drives.
+
+    ``ends``, ``rates`` and ``bends`` (2, n) are those of the two: a line through the places, a
+    cubic with their speeds, a quintic with their accelerations too.
+    """
+    h = times[k + 1] - times[k]
+    u, way = (t - times[k]) / h, ends[1] - ends[0]
+    if rates is None:
+        return ends[0] + u * way, way / h
+    v0, v1 = rates * h
+    c2, c3, c4, c5 = spline_terms(way, v0, v1, None if bends is None else bends * (h * h))
+    place = ends[0] + u * (v0 + u * (c2 + u * (c3 + u * (c4 + u * c5))))
+    speed = v0 + u * (2.0 * c2 + u * (3.0 * c3 + u * (4.0 * c4 + u * 5.0 * c5)))
+    return place, speed / h
 
 
 class Output:

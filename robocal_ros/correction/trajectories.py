@@ -27,7 +27,7 @@ from robocal_ros.correction.limiter import (
     REST_RATE,
     STILL,
 )
-from robocal_ros.correction.output import Output, SentPath, hold_speeds
+from robocal_ros.correction.output import Output, SentPath, hold_speeds, spline_terms
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
@@ -90,12 +90,12 @@ class TrajectoryCorrector:
             self._require_speeds(command, index, out, velocity, times, led_from)
         finally:
             limiter.state[:], limiter.limits = kept, limits
-        known_times, sent, sent_rates = command.time_from_start_s, offsets, rates
+        known_times, sent = command.time_from_start_s, np.stack([offsets, rates, bends])
         withheld = sent_withheld = offsets - desired
         if led_from is not None:  # until its first point: from the offset that there is now
             known_times = np.append(-starts_in_s, known_times)
-            sent = np.vstack([begin[OFFSET], offsets])
-            sent_rates = np.vstack([begin[OFFSET_RATE], rates])
+            first = np.stack([begin[OFFSET], begin[OFFSET_RATE], 0.0 * begin[OFFSET]])
+            sent = np.concatenate([first[:, None], sent], axis=1)
             sent_withheld = np.vstack([begin[OFFSET] - begin[DESIRED], withheld])
         path = SentPath(
             index=index,
@@ -103,9 +103,11 @@ class TrajectoryCorrector:
             times=command.time_from_start_s,
             out=out[:, index],
             velocity=velocity,
+            acceleration=acceleration,
             known_times=known_times,
-            offsets=sent,
-            rates=sent_rates,
+            offsets=sent[0],
+            rates=sent[1],
+            bends=sent[2],
             withheld=sent_withheld,
             stage=self._desired.stage if result is not None else None,
             led_from=out[0, index] if led_from is None else led_from,
@@ -270,10 +272,7 @@ class TrajectoryCorrector:
         position, speed = _motion(path, at_s, rate)
         velocity = speed * slow[:, None]
         velocity[-1] = 0.0
-        offsets, rates, withheld = (
-            np.array([path.at(rows, at) for at in at_s])
-            for rows in (path.offsets, path.rates, path.withheld)
-        )
+        offsets, rates = np.array([path.offset(at) for at in at_s]).transpose(1, 0, 2)
         names = tuple(self._arm.joint_names[i] for i in path.index)
         command = TrajectoryCommand(names, position, ahead_s + t, velocity, mark=CORRECTED)
         return command, SentPath(
@@ -282,10 +281,12 @@ class TrajectoryCorrector:
             times=command.time_from_start_s,
             out=position,
             velocity=velocity,
+            acceleration=None,
             known_times=command.time_from_start_s,
             offsets=offsets,
             rates=rates * slow[:, None],
-            withheld=withheld,
+            bends=0.0 * rates,
+            withheld=np.array([path.at(path.withheld, at) for at in at_s]),
             stage=path.stage,
             led_from=path.place(now_s),
             put_s=now_s,
@@ -361,14 +362,8 @@ def _over(rows: Array, withheld: Array, h: Array, moves: NDArray[np.bool_], limi
     if not some.any():
         return np.zeros(2)
     h, (p0, v0), (p1, v1) = h[some], rows[:2, :-1][:, some], rows[:2, 1:][:, some]
-    way = (p1 - p0) / h
-    c = [3.0 * way - 2.0 * v0 - v1, v0 + v1 - 2.0 * way, 0.0 * way, 0.0 * way]
-    if len(rows) > 2:
-        b0, b1 = rows[2, :-1][some] * h, rows[2, 1:][some] * h
-        c[0] = 0.5 * b0
-        c[1] = 10.0 * way - 6.0 * v0 - 4.0 * v1 - 1.5 * b0 + 0.5 * b1
-        c[2] = -15.0 * way + 8.0 * v0 + 7.0 * v1 + 1.5 * b0 - b1
-        c[3] = 6.0 * way - 3.0 * (v0 + v1) - 0.5 * (b0 - b1)
+    bends = np.stack([rows[2, :-1][some], rows[2, 1:][some]]) * h if len(rows) > 2 else None
+    c = spline_terms((p1 - p0) / h, v0, v1, bends)
     u = np.linspace(0.0, 1.0, 9)[:, None, None]
     rate = v0 + u * (2.0 * c[0] + u * (3.0 * c[1] + u * (4.0 * c[2] + u * 5.0 * c[3])))
     bend = (2.0 * c[0] + u * (6.0 * c[1] + u * (12.0 * c[2] + u * 20.0 * c[3]))) / h

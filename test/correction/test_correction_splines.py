@@ -18,7 +18,7 @@ from correction_robot import (
     offer,
     swing,
 )
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
@@ -100,7 +100,12 @@ LEG = st.tuples(
 )
 
 
+COARSE = [("tool", 50, 1.0, 0.3, True, False, 0.6), ("on", 20, 1.0, 0.3, True, False, 0.35)]
+
+
 @settings(max_examples=25, deadline=None)
+@example([*COARSE, ("off", 30, 0.2, 0.05, True, False, 0.5)])
+@example([*COARSE[::-1], ("model", 30, 0.01, 0.05, False, False, 0.5)])
 @given(st.lists(LEG, min_size=1, max_size=6))
 def test_between_the_points_too(legs: list) -> None:
     """One after the other, from rest and in place of one that is under way."""
@@ -124,8 +129,6 @@ def test_between_the_points_too(legs: list) -> None:
         way_s = np.max(np.abs(end - begin[0]) / LIMITS["velocity_limits"]) * 3.2
         lasts = 2.0 + way_s + 4.0 * np.max(np.abs(begin[1]) / LIMITS["acceleration_limits"])
         m = max(int(lasts / spacing), 1) + 1
-        # where it is on quintics is known as on cubics: the same where points are near
-        bends &= spacing <= 0.05
         command = shifted(quintic(begin, end, lasts, m, bends=bends), first_s)
         try:
             own, mine = check(robot, command, begins, rest and first_s == 0.0)
