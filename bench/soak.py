@@ -165,7 +165,7 @@ def live(seconds: float) -> Table:
 
 
 def correction(seconds: float) -> Table:
-    """joint_correction_node at 500 Hz while its models change."""
+    """joint_correction_node at 250 Hz while its models change."""
     from bench.soak_correction import soak
 
     return soak(seconds)

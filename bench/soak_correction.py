@@ -1,4 +1,4 @@
-"""joint_correction_node for hours: a stream at 500 Hz, and another model every ten seconds.
+"""joint_correction_node for hours: a stream at 250 Hz, and another model every ten seconds.
 
 ``tools/with_ros python -m bench.soak_correction --seconds 60`` for a look; an hour is the default.
 With ``--keep`` it writes docs/figures/soak_correction.md too.
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from robocal_msgs.msg import KinematicModel
+from robocal_msgs.msg import CorrectionStatus, KinematicModel
 
 from bench.soaking import soak_main
 from bench.startup import EXECUTABLES
@@ -27,7 +27,7 @@ from robocal_ros.storage.robots import load_robot
 
 Array = NDArray[np.float64]
 
-RATE_HZ = 500
+RATE_HZ = 250
 CHANGE_S = 10.0  # between two models
 SETTLED_S = 4.0  # after this a model is in force: twice 0.3 deg at 2 deg/s, and stalls
 STALL_S = 0.02  # the probe sees outputs so much closer together than they went out
@@ -94,10 +94,12 @@ def soak(seconds: float) -> Table:
             stream, watch = Stream(probe, subject, arm.joint_names), Watch(arm)
             stream.watch = watch.look
             probe.wait(lambda: stream.connected, subject.name)
+            told = probe.latest(CorrectionStatus, subject.topic(f"{subject.node}/status"))
             memory_mb = _run(probe, stream, watch, arm, seconds)
+            refused = dict(zip(told[-1].refused_reasons, told[-1].refused, strict=True))
         finally:
             probe.close(subject)
-    return _judged(stream, watch, memory_mb, seconds)
+    return _judged(stream, watch, memory_mb, refused, seconds)
 
 
 def _run(probe: Probe, stream: Stream, watch: Watch, arm: SerialArm, seconds: float) -> list[float]:
@@ -123,7 +125,9 @@ def _run(probe: Probe, stream: Stream, watch: Watch, arm: SerialArm, seconds: fl
     return memory_mb
 
 
-def _judged(stream: Stream, watch: Watch, memory_mb: list[float], seconds: float) -> Table:
+def _judged(
+    stream: Stream, watch: Watch, memory_mb: list[float], refused: dict[str, int], seconds: float
+) -> Table:
     table = Table(
         "soak_correction",
         f"joint_correction_node for {seconds:.0f} s at {RATE_HZ} Hz, another model every "
@@ -141,6 +145,8 @@ def _judged(stream: Stream, watch: Watch, memory_mb: list[float], seconds: float
     table.add("joint states", stream.sent[STATES], None)
     table.add("models", WARM + len(memory_mb), None)
     table.add("overwritten by newer ones", lost, None)
+    count = sum(refused.values())
+    table.add("refused or ended: " + (str(refused) if refused else "none"), count, Goal(count, 0))
     table.add("largest step", watch.worst, Goal(watch.worst, 1.0))
     table.add("targets compared with the model in force", watch.checked, None)
     table.add("of them stale", watch.stale, Goal(watch.stale, 0))

@@ -7,7 +7,7 @@ import struct
 import subprocess
 import time
 from array import array
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -298,6 +298,12 @@ class Probe:
         return self.node.create_publisher(
             KinematicModel, subject.topic("kinematic_model"), qos.own(qos.LATCHED)
         )
+
+    def latest(self, kind: type, topic: str) -> deque[Any]:
+        """Where the last message of a latched topic is found."""
+        found: deque[Any] = deque(maxlen=1)
+        self.node.create_subscription(kind, topic, found.append, qos.own(qos.LATCHED))
+        return found
 
     def close(self, *subjects: Subject) -> None:
         """End everything."""
