@@ -72,7 +72,7 @@ class OwnMotions(HouseNode):
         )
         self.reports = self.add_output(String, "own/reports", DEEP)
         self.add_input(JointState, "joint_states", self._take_joints, qos.STREAM)
-        self.add_input(String, "own/orders", self._take_order, qos.RELIABLE)
+        self.add_input(String, "own/orders", self._take_order, DEEP)
         self.add_timer(TICK_S, self._tick, steady=True)
 
     def activate(self) -> None:

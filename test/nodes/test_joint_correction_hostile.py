@@ -6,6 +6,7 @@ lets it. A stream's time is that of the session's clock, which is looked at as i
 """
 
 import itertools
+import time
 from array import array
 from typing import Any
 
@@ -245,7 +246,9 @@ class Attacked(Line):
             return
         assert self.graph.call(Trigger, f"{NODE}/acknowledge").success
         self.rest()
-        taught, _ = self.node._session.taught(tuple(NAMES), np.array(self.at), None, 0.0)
+        # as at the end of a path that the robot did not follow: with all of the offset
+        over_s = time.monotonic() + 60.0
+        taught, _ = self.node._session.taught(tuple(NAMES), np.array(self.at), None, over_s)
         self.taught = taught
         assert self.command(self.stream, self.good(self.taught))
 
