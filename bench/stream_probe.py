@@ -302,7 +302,7 @@ class Probe:
     def latest(self, kind: type, topic: str) -> deque[Any]:
         """Where the last message of a latched topic is found."""
         found: deque[Any] = deque(maxlen=1)
-        take = lambda message: found.append(message)  # noqa: E731, PLW0108 (rclpy looks at it)
+        take = lambda message: found.append(message)  # noqa: E731 (rclpy looks at it)
         self.node.create_subscription(kind, topic, take, qos.own(qos.LATCHED))
         return found
 
