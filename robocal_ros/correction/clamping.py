@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import FADES_FROM, CorrectionConfig, Policy
+from robocal_ros.correction.rates import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
 
@@ -73,12 +74,21 @@ class ClampedCorrection(StagedCorrection):
         """Taught joints (n,) of one point's corrected ones."""
         return np.asarray(self.uncorrect(corrected[None])[0])
 
-    def _by_chain_rule(
-        self, q: Array, before: Array, velocity: Array, after: Array, works: tuple[Array, Array]
-    ) -> Array | None:
-        if not self.correct(q[None]).whole[0]:
-            return None
-        return super()._by_chain_rule(q, before, velocity, after, works)
+    def velocity_one(self, q: Array, velocity: Array, corrected: Array, whole: bool) -> Array:
+        """Velocities (n,) of one point's corrected joints."""
+        at = q + STEP_AHEAD_S * velocity
+        change = self.correct(at[None]).q[0] - at - (corrected - q)
+        return np.asarray(velocity + change / STEP_AHEAD_S)
+
+    def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
+        """Velocities (n,) of one point's taught joints, of those of the corrected ones."""
+        found, corrected = velocity, self.correct(q[None]).q[0]
+        for _ in range(MOST_STEPS):
+            miss = velocity - self.velocity_one(q, found, corrected, whole=False)
+            found = found + miss
+            if not np.max(np.abs(miss)) > VELOCITY_EXACT:
+                break
+        return np.asarray(found)
 
     def _shares(self, q: Array, full: StagedResult) -> dict[Reason, Array]:
         """Largest share (m,) of the shift by each bound; equation 1."""

@@ -27,7 +27,7 @@ class DesiredOffset:
     known : the same as if it were on: a robot may show it that was corrected before.
     reduced : how many points were corrected in part, as a direction of theirs is weak.
     clamped, passed : how many messages were corrected in part, or not at all, for what bound.
-    made : whether the last message was corrected with ``stage``.
+    made, whole : whether the last message was corrected with ``stage``, and all of it by `at_one`.
     tcp_shift_m, largest, remaining_m : of the last message: error at the tool that the drift would
         have made, largest offset wanted, error that is left.
     """
@@ -42,7 +42,7 @@ class DesiredOffset:
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
         self.tcp_shift_m = self.largest = self.remaining_m = 0.0
-        self.made = False
+        self.made = self.whole = False
         self._zero, self._out = np.zeros(reference.n), np.zeros((2, reference.n + solution.REPORT))
         bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
         self._bounds = np.array(bounds, dtype=np.float64)
@@ -61,7 +61,7 @@ class DesiredOffset:
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
-        self.made = False
+        self.made = self.whole = False
         if self.stage is None:
             self.tcp_shift_m = self.largest = self.remaining_m = 0.0
             return np.zeros_like(q), None
@@ -85,7 +85,7 @@ class DesiredOffset:
     def at_one(self, q: Array) -> Array:
         """`at` for one point (n,), fast where nothing is out of the ordinary; not kept."""
         stage, n = self.stage, len(q)
-        self.made = stage is not None
+        self.made, self.whole = stage is not None, False
         if stage is None:
             self.tcp_shift_m = self.largest = self.remaining_m = 0.0
             return self._zero
@@ -95,11 +95,12 @@ class DesiredOffset:
         stage.correct_one(q, out)
         if not rates.within(q, out, self._bounds, self._tcp, offset):
             return np.asarray(self.at(q[None])[0][0])
-        report = out[:, n:]
-        self.reduced += int(report[:, solution.WEAK].any())
-        self.tcp_shift_m = float(report[0, solution.TCP_SHIFT])
+        report = out[:, n:].tolist()  # for so few numbers lists are faster
+        self.whole = all(row[solution.WEAK] == 0.0 for row in report)
+        self.reduced += not self.whole
+        self.tcp_shift_m = report[0][solution.TCP_SHIFT]
         self.largest = max(map(abs, offset.tolist()))
-        self.remaining_m = float(report[:, solution.POSITION_ERROR].sum())
+        self.remaining_m = sum(row[solution.POSITION_ERROR] for row in report)
         return offset
 
     def begins(self, q: Array) -> Array:

@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 # Where rounding and the fourth derivative weigh alike in an acceleration: some 1e-7 rad/s^2.
 RATE_STEP_S = 2e-4
+# Where they do in a velocity from one side: some 1e-6 rad/s.
+STEP_AHEAD_S = 5e-7
 VELOCITY_EXACT = 1e-6  # rad/s, m/s: of a reading's velocity
 MOST_STEPS = 20
 
@@ -58,48 +60,59 @@ def rates_batch(
 
 
 @lean
-def _by_differences(
-    q: Array, velocity: Array, largest: Array, free: bool, works: Array, at: Array, report: Array,
-    out: Array,
-) -> None:  # fmt: skip
-    n, h, last = q.shape[0], RATE_STEP_S, works.shape[0] - 1
-    for j in range(n):
-        at[j] = q[j] + velocity[j] * h
-    correct_staged(at, largest, free, works, report)
-    for j in range(n):
-        out[j] = report[last, j] - at[j]
-        at[j] = q[j] - velocity[j] * h
-    correct_staged(at, largest, free, works, report)
-    for j in range(n):
-        out[j] = velocity[j] + (out[j] - (report[last, j] - at[j])) / (2.0 * h)
+def velocity_by_chain(
+    q: Array, qd: Array, corrected: Array, first: Array, last: Array, out: Array
+) -> bool:
+    """The velocities (6,) of `rates_batch` for one point; whether they are finite."""
+    n = q.shape[0]
+    taught, room = room_in(first, n), room_in(last, n)
+    J, L, v = room.J, room.B, room.e
+    _stand(q, taught.taught_links, taught.taught_root, taught.taught_tool, room)
+    for r in range(6):
+        v[r] = 0.0
+        for i in range(n):
+            v[r] += J[i, r] * qd[i]
+    _stand(corrected, room.links, room.root, room.tool, room)
+    if not newton.factor(J, L):
+        return False
+    newton.solve(J, L, v, out, out)
+    size = 0.0
+    for i in range(n):
+        size += abs(out[i])
+    return size < np.inf
 
 
 @lean
 def velocity_by_differences(
-    q: Array, velocity: Array, largest: Array, free: bool, works: Array, spare: Array,
-    report: Array, out: Array,
+    q: Array, velocity: Array, corrected: Array, largest: Array, free: bool, works: Array,
+    at: Array, report: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Velocities ``out`` (n,) of the corrected joints at taught ones ``q`` (n,), anywhere.
+    """Velocities ``out`` (n,) of the ``corrected`` joints of taught ones ``q`` (n,), anywhere.
 
-    ``spare`` (2, n) and ``report`` (k, n + 7) are scratch.
+    ``at`` (n,) and ``report`` (k, n + 7) are scratch.
     """
-    _by_differences(q, velocity, largest, free, works, spare[0], report, out)
+    n, h, last = q.shape[0], STEP_AHEAD_S, works.shape[0] - 1
+    for j in range(n):
+        at[j] = q[j] + velocity[j] * h
+    correct_staged(at, largest, free, works, report)
+    for j in range(n):
+        out[j] = velocity[j] + ((report[last, j] - at[j]) - (corrected[j] - q[j])) / h
 
 
 @lean
 def taught_velocity_by_differences(
-    q: Array, velocity: Array, largest: Array, free: bool, works: Array, spare: Array,
-    report: Array, out: Array,
+    q: Array, velocity: Array, corrected: Array, largest: Array, free: bool, works: Array,
+    spare: Array, report: Array, out: Array,
 ) -> None:  # fmt: skip
     """Velocities ``out`` (n,) of the taught joints ``q``, of those of the corrected ones (n,).
 
-    The shift changes slower than the joints move.
+    The shift changes slower than the joints move. ``spare`` (2, n) is scratch.
     """
     n = q.shape[0]
     for j in range(n):
         out[j] = velocity[j]
     for _ in range(MOST_STEPS):
-        _by_differences(q, out, largest, free, works, spare[0], report, spare[1])
+        velocity_by_differences(q, out, corrected, largest, free, works, spare[0], report, spare[1])
         size = 0.0
         for j in range(n):
             miss = velocity[j] - spare[1, j]

@@ -92,10 +92,11 @@ class StagedCorrection:
         self.stages = len(parts)
         self._works = np.stack([part.work for part in parts])
         self._largest = np.stack([part.largest for part in parts])
-        self._still = np.zeros((1, self.n))
         self._one = np.empty((self.stages, self.n + solution.REPORT))
         self._spare = np.empty((2, self.n))
         self._back = [part.inverse() for part in reversed(parts)]
+        self._back_works = np.stack([part.work for part in self._back])
+        self._solved: Array | None = None  # taught joints whose report is in `_one`
 
     def correct(self, q: Array) -> StagedResult:
         """Correct joints (m, n)."""
@@ -118,43 +119,43 @@ class StagedCorrection:
         q = np.empty(self.n)
         limits = self._largest, self._free
         if solution.uncorrect_staged(corrected, *limits, self._works, 20, EXACT, self._one, q):
+            self._solved = q
             return q
         return np.asarray(self.uncorrect(corrected[None])[0])
 
-    def velocity_one(self, q: Array, velocity: Array, corrected: Array) -> Array:
-        """Velocities (n,) of one point's corrected joints, as `rates` has them."""
-        ends, given = (self._works[0], self._works[-1]), (self._largest, self._free, self._works)
-        found = self._by_chain_rule(q, q, velocity, corrected, ends)
-        if found is None:
-            found = np.empty(self.n)
-            rates.velocity_by_differences(q, velocity, *given, self._spare, self._one, found)
+    def velocity_one(self, q: Array, velocity: Array, corrected: Array, whole: bool) -> Array:
+        """Velocities (n,) of the ``corrected`` joints of taught ones ``q``, as `rates` has them.
+
+        ``corrected`` is just what `correct_one` makes; ``whole``: with no weak direction.
+        """
+        found = np.empty(self.n)
+        if not (whole and self._by_chain(q, velocity, corrected, self._works, found)):
+            given, self._solved = (self._largest, self._free, self._works), None
+            rates.velocity_by_differences(
+                q, velocity, corrected, *given, self._spare[0], self._one, found
+            )
         return found
 
     def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
         """Velocities (n,) of one point's taught joints ``q``, of those of the corrected ones."""
-        ends, given = (self._back[0].work, self._back[-1].work), (self._largest, self._free)
-        found = self._by_chain_rule(q, corrected, velocity, q, ends)
-        if found is None:
-            found = np.empty(self.n)
+        if q is not self._solved:
+            self.correct_one(q, self._one)
+        found, self._solved = np.empty(self.n), None
+        whole = not self._one[:, self.n + solution.WEAK].any()
+        if not (whole and self._by_chain(corrected, velocity, q, self._back_works, found)):
+            given, at_q = (self._largest, self._free, self._works), self._one[-1, : self.n].copy()
             rates.taught_velocity_by_differences(
-                q, velocity, *given, self._works, self._spare, self._one, found
+                q, velocity, at_q, *given, self._spare, self._one, found
             )
         return found
 
-    def _by_chain_rule(
-        self, q: Array, before: Array, velocity: Array, after: Array, works: tuple[Array, Array]
-    ) -> Array | None:
-        """Velocities (n,) at joints ``after`` where no direction is weak at ``q``."""
+    def _by_chain(
+        self, before: Array, velocity: Array, after: Array, works: Array, out: Array
+    ) -> bool:
+        """Velocities ``out`` (n,) at ``after`` by the chain rule; whether that is possible."""
         if self.n != 6 or self._free:
-            return None
-        self.correct_one(q, self._one)
-        if self._one[:, self.n + solution.WEAK].any():
-            return None
-        out, unused = np.empty((2, 1, self.n))
-        rates.rates_batch(
-            before[None], velocity[None], self._still, after[None], *works, out, unused
-        )
-        return out[0] if np.isfinite(out).all() else None
+            return False
+        return rates.velocity_by_chain(before, velocity, after, works[0], works[-1], out)
 
     def uncorrect(self, corrected: Array) -> Array:
         """Taught joints (m, n) of corrected ones: the inverse of `correct`.
@@ -208,7 +209,9 @@ def load_kernels(arm: SerialArm) -> None:
     stage.correct_one(q[0], np.empty((stage.stages, arm.n + solution.REPORT)))
     stage.uncorrect(q)
     stage.uncorrect_one(q[0])
-    stage.velocity_one(q[0], q[0], q[0])
-    given = q[0], q[0], np.ones((stage.stages, arm.n)), False, stage._works, np.zeros((2, arm.n))
-    for by_differences in (rates.velocity_by_differences, rates.taught_velocity_by_differences):
-        by_differences(*given, np.empty((stage.stages, arm.n + solution.REPORT)), np.empty(arm.n))
+    stage.velocity_one(q[0], q[0], q[0], whole=True)
+    stage.velocity_one(q[0], q[0], q[0], whole=False)
+    stage.taught_velocity_one(q[0], q[0], q[0])
+    given = np.ones((stage.stages, arm.n)), False, stage._works, np.zeros((2, arm.n))
+    report = np.empty((stage.stages, arm.n + solution.REPORT))
+    rates.taught_velocity_by_differences(q[0], q[0], q[0], *given, report, np.empty(arm.n))

@@ -280,7 +280,8 @@ class TargetStream:
         elif stage is not None and state[OFFSET].tolist() == state[DESIRED].tolist():
             speeds = np.zeros(self._arm.n)
             speeds[index] = velocity
-            velocity = stage.velocity_one(output.taught, speeds, output.out)[index]
+            whole = self._desired.whole
+            velocity = stage.velocity_one(output.taught, speeds, output.out, whole)[index]
         else:
             velocity = velocity + state[OFFSET_RATE, index]
         if (np.abs(velocity) > self._fastest[index] * (1.0 + ROUNDING)).any():

@@ -165,7 +165,11 @@ def test_there_and_back_is_exact(seed: int) -> None:
     sides = [np.sign(np.linalg.det(tool_jacobian(reference, q))) for q in (taught, back.q)]
     mirrored = whole & (sides[0] != sides[1])
     assert np.sum(mirrored) <= 1
-    assert np.abs(back.q - taught)[whole & ~mirrored].max() < 1e-12
+    # some thirty roundings of a pose, as the Jacobian turns them into joints
+    rounding = 32.0 * np.finfo(float).eps * np.linalg.cond(tool_jacobian(reference, taught))
+    assert np.all(
+        np.abs(back.q - taught).max(axis=1)[whole & ~mirrored] < rounding[whole & ~mirrored]
+    )
 
 
 @settings(max_examples=60, deadline=None)
