@@ -175,8 +175,8 @@ class JointCorrection:
     def inverse(self) -> "JointCorrection":
         """The correction with the models exchanged: from corrected to taught joints.
 
-        Exact (to rounding: 1e-11 rad for condition numbers below 1e3) where no direction is weak and all
-        six equations hold. `staged.StagedCorrection.uncorrect` is exact in the other postures too.
+        Exact (to rounding: 1e-11 rad for condition numbers below 1e3) where no direction is weak
+        and all six equations hold; `staged.StagedCorrection.uncorrect` in the other postures too.
         """
         return JointCorrection(self.models[::-1], self.largest, self.free_axis, self.slope)
 
