@@ -74,7 +74,7 @@ class ClampedCorrection(StagedCorrection):
         """Taught joints (n,) of one point's corrected ones."""
         return np.asarray(self.uncorrect(corrected[None])[0])
 
-    def velocity_one(self, q: Array, velocity: Array, corrected: Array, whole: bool) -> Array:
+    def velocity_one(self, q: Array, velocity: Array, corrected: Array) -> Array:
         """Velocities (n,) of one point's corrected joints."""
         at = q + STEP_AHEAD_S * velocity
         change = self.correct(at[None]).q[0] - at - (corrected - q)
@@ -84,7 +84,7 @@ class ClampedCorrection(StagedCorrection):
         """Velocities (n,) of one point's taught joints, of those of the corrected ones."""
         found, corrected = velocity, self.correct(q[None]).q[0]
         for _ in range(MOST_STEPS):
-            miss = velocity - self.velocity_one(q, found, corrected, whole=False)
+            miss = velocity - self.velocity_one(q, found, corrected)
             found = found + miss
             if not np.max(np.abs(miss)) > VELOCITY_EXACT:
                 break

@@ -6,12 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction import rates, solution
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, require_solved, require_within
 from robocal_ros.correction.clamping import ClampedResult, correction_between
 from robocal_ros.correction.joint_correction import pack_model
+from robocal_ros.correction.limiter import OffsetLimiter, put_out
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
+from robocal_ros.correction.stepping import (
+    FIGURES,
+    LARGEST,
+    NOT_WITHIN,
+    REDUCED,
+    REMAINING,
+    SHIFT,
+)
 
 Array = NDArray[np.float64]
 
@@ -25,11 +33,10 @@ class DesiredOffset:
     ----------
     stage : the correction in use; None while nothing is to be corrected.
     known : the same as if it were on: a robot may show it that was corrected before.
-    reduced : how many points were corrected in part, as a direction of theirs is weak.
+    figures : what is said of the messages, see `stepping`.
     clamped, passed : how many messages were corrected in part, or not at all, for what bound.
-    made, whole : whether the last message was corrected with ``stage``, and all of it by `at_one`.
-    tcp_shift_m, largest, remaining_m : of the last message: error at the tool that the drift would
-        have made, largest offset wanted, error that is left.
+    made : whether the last message was corrected with ``stage``.
+    fast : whether `put_out` worked out the velocities too.
     """
 
     def __init__(self, reference: SerialArm, config: CorrectionConfig) -> None:
@@ -38,12 +45,12 @@ class DesiredOffset:
         self._actual = self._reference
         self.stage: StagedCorrection | None = None
         self.known: StagedCorrection | None = None
-        self.reduced = 0
+        self.figures = np.zeros(FIGURES)
         self.clamped: Counter[Reason] = Counter()
         self.passed: Counter[Reason] = Counter()
-        self.tcp_shift_m = self.largest = self.remaining_m = 0.0
-        self.made = self.whole = False
-        self._zero, self._out = np.zeros(reference.n), np.zeros((2, reference.n + solution.REPORT))
+        self.made = self.fast = False
+        self._zero = np.zeros(reference.n)
+        self._span = np.array([reference.lower, reference.upper], dtype=np.float64)
         bounds = config.thermal.of_joints(reference), config.tool.of_joints(reference)
         self._bounds = np.array(bounds, dtype=np.float64)
         self._tcp = np.array([config.thermal.tcp_m, config.thermal.tcp_rad])
@@ -61,9 +68,9 @@ class DesiredOffset:
 
     def at(self, q: Array) -> tuple[Array, StagedResult | None]:
         """Wanted offsets (m, n) at taught joints; raises `RefusedError` as the policy says."""
-        self.made = self.whole = False
+        self.made = self.fast = False
+        self.figures[[SHIFT, LARGEST, REMAINING]] = 0.0
         if self.stage is None:
-            self.tcp_shift_m = self.largest = self.remaining_m = 0.0
             return np.zeros_like(q), None
         result = self.stage.correct(q)
         require_solved(result)
@@ -76,32 +83,42 @@ class DesiredOffset:
                 return np.zeros_like(q), None
             self.clamped[result.reason] += 1
         offset, self.made = result.q - q, True
-        self.reduced += int(np.count_nonzero(result.weak))
-        self.tcp_shift_m = float(result.arm.tcp_shift_m.max())
-        self.largest = float(np.abs(offset).max())
-        self.remaining_m = float(result.remaining_m.max())
+        self.figures[REDUCED] += np.count_nonzero(result.weak)
+        self.figures[SHIFT] = result.arm.tcp_shift_m.max()
+        self.figures[LARGEST] = np.abs(offset).max()
+        self.figures[REMAINING] = result.remaining_m.max()
         return offset, result
 
-    def at_one(self, q: Array) -> Array:
-        """`at` for one point (n,), fast where nothing is out of the ordinary; not kept."""
-        stage, n = self.stage, len(q)
-        self.made, self.whole = stage is not None, False
-        if stage is None:
-            self.tcp_shift_m = self.largest = self.remaining_m = 0.0
-            return self._zero
-        if self._config.policy is not Policy.REFUSE:
-            return np.asarray(self.at(q[None])[0][0])
-        out, offset = self._out[: stage.stages], np.empty(n)
-        stage.correct_one(q, out)
-        if not rates.within(q, out, self._bounds, self._tcp, offset):
-            return np.asarray(self.at(q[None])[0][0])
-        report = out[:, n:].tolist()  # for so few numbers lists are faster
-        self.whole = all(row[solution.WEAK] == 0.0 for row in report)
-        self.reduced += not self.whole
-        self.tcp_shift_m = report[0][solution.TCP_SHIFT]
-        self.largest = max(map(abs, offset.tolist()))
-        self.remaining_m = sum(row[solution.POSITION_ERROR] for row in report)
-        return offset
+    def put_out(
+        self,
+        q: Array,
+        velocity: Array,
+        times: tuple[float, float],
+        limiter: OffsetLimiter,
+        active: Array,
+        speeds: Array,
+    ) -> float:
+        """Put one target (n,) with its velocities out by the limiter; see `stepping.step_out`.
+
+        In one piece where nothing is out of the ordinary; else raises `RefusedError` as `at`, and
+        leaves the velocities to the caller.
+        """
+        stage, limits, span = self.stage, limiter.limits, self._span
+        if stage is not None and self._config.policy is Policy.REFUSE:
+            share = stage.step_out(
+                q, velocity, *times, limiter.memory, limits, active, speeds, span, self._bounds,
+                self._tcp, self.figures,
+            )  # fmt: skip
+            if share != NOT_WITHIN:
+                self.made = self.fast = True
+                return share
+        desired = self.at(q[None])[0][0] if stage is not None else self._nothing()
+        return put_out(limiter.memory, q, desired, *times, limits, active, speeds[0], span)
+
+    def _nothing(self) -> Array:
+        self.made = self.fast = False
+        self.figures[SHIFT] = self.figures[LARGEST] = self.figures[REMAINING] = 0.0
+        return self._zero
 
     def begins(self, q: Array) -> Array:
         """Offsets (3, n) at taught joints (n,) that a robot may show: wanted, known, none.

@@ -36,6 +36,11 @@ Array = NDArray[np.float64]
 # rows of the limits (4, n) and of a limiter's state (5, n)
 REST_RATE, REST_ACCELERATION, RATE, ACCELERATION = range(4)
 OFFSET, OFFSET_RATE, DESIRED, DESIRED_RATE, SHARE = STATE = range(5)
+# rows of its memory (16, n) after those of the state: the last target, as it was followed, and what
+# went out; the most that was withheld; the offset wanted for a target, the velocities that go out
+# with it, scratch; and what is tried: a state, and what would go out
+TAUGHT, OUT, MOST, WANTED, VELOCITY = range(5, 10)
+TRIED, MEMORY = 11, 17
 # A desired rate may have so much of its limit before less of the offset is aimed at; all of it
 # comes back in so long, s.
 FULL_RATE, WHOLE_S = 0.5, 0.5
@@ -164,53 +169,52 @@ def step(
     advance(state, desired, dt, moves, limits, active)
 
 
-@kernel
+@lean
 def put_out(
-    state: Array, goal: Array, desired: Array, elapsed: float, longest: float, limits: Array,
-    active: Array, fastest: Array,
-    lower: Array, upper: Array, taught: Array, out: Array, most: Array, tried: Array,
+    memory: Array, goal: Array, desired: Array, elapsed: float, longest: float, limits: Array,
+    active: Array, fastest: Array, span: Array,
 ) -> float:  # fmt: skip
     """Put one target of a stream out, if no joint is too fast on the way.
 
     Parameters
     ----------
+    memory : (17, n) of the limiter.
     elapsed, longest : time since the last output, and what of it a step may use.
     active : (n,) 1 for the joints that go out.
-    fastest, lower, upper : (n,) speeds and limits of the joints.
-    taught, out, most : (n,) of the last output, and most that was withheld: renewed.
-    tried : (6, n) scratch; its last row is what would go out.
+    fastest, span : (n,) speeds of the joints, (2, n) their limits.
 
     Returns
     -------
     float
         Largest share of its speed that a joint takes; -1 where one would be beyond its limits.
-        Unless it is between 0 and 1, nothing has changed.
+        Unless it is between 0 and 1, nothing has changed but what is tried.
     """
     n, fast, share, inside = goal.shape[0], 0.0, 0.0, True
+    tried, would, taught, out = memory[TRIED : MEMORY - 1], memory[-1], memory[TAUGHT], memory[OUT]
     for j in range(n):
         for row in range(SHARE + 1):
-            tried[row, j] = state[row, j]
+            tried[row, j] = memory[row, j]
         if active[j] != 0.0:
             fast = max(fast, abs(goal[j] - taught[j]))
     if longest > 0.0:
         moves = fast > STILL * elapsed
-        advance(tried[: SHARE + 1], desired, min(longest, LONGEST_STEP_S), moves, limits, active)
+        advance(tried, desired, min(longest, LONGEST_STEP_S), moves, limits, active)
     for j in range(n):
         tried[DESIRED, j] = desired[j]
-        tried[-1, j] = goal[j] + tried[OFFSET, j]
+        would[j] = goal[j] + tried[OFFSET, j]
         if active[j] != 0.0:
-            inside &= lower[j] - ROUNDING <= tried[-1, j] <= upper[j] + ROUNDING
-            step = abs(tried[-1, j] - out[j])
+            inside &= span[0, j] - ROUNDING <= would[j] <= span[1, j] + ROUNDING
+            step = abs(would[j] - out[j])
             if step > ROUNDING:
                 share = max(share, step / (fastest[j] * longest) if longest > 0.0 else np.inf)
     if not (inside and share <= 1.0 + ROUNDING):
         return share if inside else -1.0
     for j in range(n):
         for row in range(SHARE + 1):
-            state[row, j] = tried[row, j]
+            memory[row, j] = tried[row, j]
         if active[j] != 0.0:
-            taught[j], out[j] = goal[j], tried[-1, j]
-            most[j] = max(most[j], abs(state[OFFSET, j] - state[DESIRED, j]))
+            taught[j], out[j] = goal[j], would[j]
+            memory[MOST, j] = max(memory[MOST, j], abs(memory[OFFSET, j] - memory[DESIRED, j]))
     return share
 
 
@@ -256,10 +260,8 @@ class OffsetLimiter:
 
     Attributes
     ----------
-    state : (5, n) offset, its rate, the desired offset, its rate and the share of it that is aimed
-        at, at the last step.
+    memory : (17, n) its rows are those named above.
     limits : (4, n).
-    most : (n,) most that was withheld of a target.
     """
 
     def __init__(self, prismatic: NDArray[np.bool_], turning: OffsetLimits, sliding: OffsetLimits):
@@ -267,10 +269,14 @@ class OffsetLimiter:
         self.limits = np.ascontiguousarray(
             np.where(prismatic, np.array(sliding.row())[:, None], np.array(turning.row())[:, None])
         )
-        self.state = np.zeros((len(STATE), n))
-        self.state[SHARE] = 1.0
-        self.most = np.zeros(n)
-        self._tried = np.empty((len(STATE) + 1, n))
+        self.memory = np.zeros((MEMORY, n))
+        self.memory[SHARE] = 1.0
+        self.memory[[TAUGHT, OUT]] = np.nan
+
+    @property
+    def state(self) -> Array:
+        """(5, n) offset, its rate, the desired offset, its rate and the share of it aimed at."""
+        return self.memory[: len(STATE)]
 
     def begin(self, index: NDArray[np.int64], offset: Array, desired: Array) -> None:
         """Joints ``index`` (k,) stand with an offset (k,), at rest."""
@@ -282,32 +288,11 @@ class OffsetLimiter:
     @property
     def withheld(self) -> Array:
         """(n,) offset less the desired one."""
-        return np.asarray(self.state[OFFSET] - self.state[DESIRED])
+        return np.asarray(self.memory[OFFSET] - self.memory[DESIRED])
 
     def step(self, desired: Array, dt_s: float, active: Array) -> None:
         """A step of ``dt_s`` > 0 at rest."""
         step(self.state, desired, dt_s, False, self.limits, active)
-
-    def put_out(
-        self,
-        goal: Array,
-        desired: Array,
-        elapsed: float,
-        longest: float,
-        active: Array,
-        arm: tuple[Array, Array, Array],
-        sent: tuple[Array, Array],
-    ) -> tuple[float, Array]:
-        """One target of a stream; see `put_out`. Its share, and what would go out (n,).
-
-        ``arm``: fastest, lower, upper; ``sent``: taught and out of the last output.
-        """
-        times = elapsed, longest
-        share = put_out(
-            self.state, goal, desired, *times, self.limits, active, *arm, *sent, self.most,
-            self._tried,
-        )  # fmt: skip
-        return share, self._tried[-1]
 
     def follow(
         self, desired: Array, times: Array, speed: Array, active: Array
@@ -323,5 +308,7 @@ def load_kernels(n: int) -> None:
     limiter = OffsetLimiter(np.zeros(n, dtype=np.bool_), TURNING, SLIDING)
     limiter.step(np.zeros(n), 0.004, np.ones(n))
     zeros, ones = np.zeros(n), np.ones(n)
-    limiter.put_out(zeros, zeros, 0.004, 0.004, ones, (ones, -ones, ones), (zeros, zeros.copy()))
+    put_out(
+        limiter.memory, zeros, zeros, 0.004, 0.004, limiter.limits, ones, ones, np.zeros((2, n))
+    )
     limiter.follow(np.zeros((2, n)), np.arange(2.0), np.zeros(2), np.ones(n))

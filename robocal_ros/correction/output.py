@@ -14,14 +14,15 @@ from robocal_ros.correction.limiter import (
     DESIRED_RATE,
     OFFSET,
     OFFSET_RATE,
+    OUT,
+    ROUNDING,
     SHARE,
+    TAUGHT,
     OffsetLimiter,
 )
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
-
-ROUNDING = 1e-9
 
 
 @dataclass
@@ -159,12 +160,20 @@ class Output:
         # the offsets of a stream, and of the begin of what comes next
         self.limiter = OffsetLimiter(arm.prismatic, config.turning, config.sliding)
         self.stage: StagedCorrection | None = None  # of the last target
-        # (n,) the last target, as it was followed, and what went out; NaN before any
-        self.taught, self.out = np.full((2, arm.n), np.nan)
         self.out_s = -np.inf  # when
         self.path: SentPath | None = None  # put out since; None after a target
         self.mismatch = ""  # why nothing goes out until it is acknowledged
         self._track: deque[tuple[float, Array]] = deque()  # where the controller was sent lately
+
+    @property
+    def taught(self) -> Array:
+        """(n,) the last target, as it was followed; NaN before any."""
+        return self.limiter.memory[TAUGHT]
+
+    @property
+    def out(self) -> Array:
+        """(n,) what went out for it."""
+        return self.limiter.memory[OUT]
 
     # ---- the offset -----------------------------------------------------------------------------
 

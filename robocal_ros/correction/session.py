@@ -28,11 +28,13 @@ from robocal_ros.correction.inputs import (
     TrajectoryCommand,
     require_finite,
 )
+from robocal_ros.correction.limiter import MOST
 from robocal_ros.correction.offers import CorrectionGate
 from robocal_ros.correction.output import Output, SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.status import CorrectionStatus, Offset
+from robocal_ros.correction.stepping import LARGEST, REDUCED, REMAINING, SHIFT
 from robocal_ros.correction.streams import Phase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
 
@@ -245,7 +247,7 @@ class CorrectionSession:
         self._interrupted = path, self.stream.phase
         self.stream.phase = Phase.IDLE
         self._goal[:] = q[-1]
-        most = self.output.limiter.most
+        most = self.output.limiter.memory[MOST]
         np.maximum(most, np.abs(path.withheld).max(axis=0), out=most)
         return corrected
 
@@ -439,18 +441,18 @@ class CorrectionSession:
             tool_revision=None if tools.in_use is None else tools.in_use.revision,
             waiting_tool=None if tools.waiting is None else tools.waiting.revision,
             stale=self._gate.stale,
-            tcp_shift_m=desired.tcp_shift_m,
-            largest_shift=desired.largest,
-            remaining_m=desired.remaining_m,
+            tcp_shift_m=float(desired.figures[SHIFT]),
+            largest_shift=float(desired.figures[LARGEST]),
+            remaining_m=float(desired.figures[REMAINING]),
             withheld=withheld,
-            withheld_most=output.limiter.most.copy(),
+            withheld_most=output.limiter.memory[MOST].copy(),
             withheld_m=self._at_tool(withheld),
-            withheld_most_m=self._at_tool(output.limiter.most),
+            withheld_most_m=self._at_tool(output.limiter.memory[MOST]),
             lag_s=self.stream.lag_s,
             overtaken=self._overtaken,
             mismatch=output.mismatch,
             held=dict(self._held),
-            reduced=desired.reduced,
+            reduced=int(desired.figures[REDUCED]),
             clamped=dict(desired.clamped),
             passed=dict(desired.passed),
             policy=self._config.policy,
@@ -475,9 +477,10 @@ def load_kernels(arm: SerialArm) -> None:
     staged.load_kernels(arm)
     limiter.load_kernels(arm.n)
     wire.load_kernels()
-    config, q = CorrectionConfig(), np.zeros(arm.n)
-    desired = DesiredOffset(arm, config)
+    config, q, ones = CorrectionConfig(), np.zeros(arm.n), np.ones(arm.n)
+    desired, speeds = DesiredOffset(arm, config), np.ones((2, arm.n))
     desired.want(arm.with_mdh(arm.mdh + 1e-6), on=True)
-    desired.at_one(q)
+    offsets = limiter.OffsetLimiter(arm.prismatic, config.turning, config.sliding)
+    desired.put_out(q, q, (0.004, 0.004), offsets, ones, speeds)
     state = RobotState(arm, config.joint_state_age_s, config.start_near(arm))
     state.require_positions(arm.joint_names, np.arange(arm.n), q[None])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction import rates, solution
+from robocal_ros.correction import rates, solution, stepping
 from robocal_ros.correction.joint_correction import (
     DRIFT_SLOPE,
     TOOL_SLOPE,
@@ -92,6 +92,7 @@ class StagedCorrection:
         self.stages = len(parts)
         self._works = np.stack([part.work for part in parts])
         self._largest = np.stack([part.largest for part in parts])
+        self._reports = np.empty((2, self.stages, self.n + solution.REPORT))
         self._one = np.empty((self.stages, self.n + solution.REPORT))
         self._spare = np.empty((2, self.n))
         self._back = [part.inverse() for part in reversed(parts)]
@@ -123,18 +124,16 @@ class StagedCorrection:
             return q
         return np.asarray(self.uncorrect(corrected[None])[0])
 
-    def velocity_one(self, q: Array, velocity: Array, corrected: Array, whole: bool) -> Array:
-        """Velocities (n,) of the ``corrected`` joints of taught ones ``q``, as `rates` has them.
-
-        ``corrected`` is just what `correct_one` makes; ``whole``: with no weak direction.
-        """
-        found = np.empty(self.n)
-        if not (whole and self._by_chain(q, velocity, corrected, self._works, found)):
-            given, self._solved = (self._largest, self._free, self._works), None
-            rates.velocity_by_differences(
-                q, velocity, corrected, *given, self._spare[0], self._one, found
-            )
-        return found
+    def step_out(
+        self, goal: Array, velocity: Array, elapsed: float, longest: float, memory: Array,
+        limits: Array, active: Array, speeds: Array, span: Array, bounds: Array, tcp: Array,
+        figures: Array,
+    ) -> float:  # fmt: skip
+        """Correct one target of a stream and put it out, see `stepping.step_out`."""
+        return stepping.step_out(
+            goal, velocity, elapsed, longest, memory, limits, active, speeds, span, bounds, tcp,
+            self._largest, self._free, self._works, self._reports, figures,
+        )  # fmt: skip
 
     def taught_velocity_one(self, corrected: Array, velocity: Array, q: Array) -> Array:
         """Velocities (n,) of one point's taught joints ``q``, of those of the corrected ones."""
@@ -143,7 +142,10 @@ class StagedCorrection:
         found, self._solved = np.empty(self.n), None
         whole = not self._one[:, self.n + solution.WEAK].any()
         if not (whole and self._by_chain(corrected, velocity, q, self._back_works, found)):
-            given, at_q = (self._largest, self._free, self._works), self._one[-1, : self.n].copy()
+            given, at_q = (
+                (self._largest, self._free, self._works),
+                self._one[-1, : self.n].copy(),
+            )
             rates.taught_velocity_by_differences(
                 q, velocity, at_q, *given, self._spare, self._one, found
             )
@@ -209,8 +211,6 @@ def load_kernels(arm: SerialArm) -> None:
     stage.correct_one(q[0], np.empty((stage.stages, arm.n + solution.REPORT)))
     stage.uncorrect(q)
     stage.uncorrect_one(q[0])
-    stage.velocity_one(q[0], q[0], q[0], whole=True)
-    stage.velocity_one(q[0], q[0], q[0], whole=False)
     stage.taught_velocity_one(q[0], q[0], q[0])
     given = np.ones((stage.stages, arm.n)), False, stage._works, np.zeros((2, arm.n))
     report = np.empty((stage.stages, arm.n + solution.REPORT))

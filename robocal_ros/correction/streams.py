@@ -3,20 +3,27 @@
 from collections import deque
 from dataclasses import replace
 from enum import Enum
-from statistics import median
 
 import numpy as np
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
+from robocal_ros.correction.clamping import ClampedCorrection
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import Array, Index, JointCommand
-from robocal_ros.correction.joint_correction import plain
-from robocal_ros.correction.limiter import DESIRED, LONGEST_STEP_S, OFFSET, OFFSET_RATE
-from robocal_ros.correction.output import ROUNDING, Output, hold_speeds
+from robocal_ros.correction.limiter import (
+    DESIRED,
+    LONGEST_STEP_S,
+    OFFSET,
+    OFFSET_RATE,
+    ROUNDING,
+    VELOCITY,
+)
+from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
+from robocal_ros.correction.stepping import TOO_FAST
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
@@ -56,10 +63,8 @@ class TargetStream:
         self._arm, self._config, self._state = arm, config, state
         self._desired, self._output = desired, output
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
-        fastest, lower, upper = (
-            plain(limit, (arm.n,)) for limit in (config.velocity_limits, arm.lower, arm.upper)
-        )
-        self._limits = fastest, lower, upper
+        self._speeds = np.tile(config.velocity_limits, (2, 1))  # of the joints, in a step and ever
+        self._velocity = np.zeros(arm.n)  # of the newest message
         self.phase, self.lag_s = Phase.IDLE, 0.0
         self._why: RefusedError | None = None
         self._active = np.zeros(arm.n)  # 1 where a joint is commanded
@@ -132,12 +137,15 @@ class TargetStream:
             self.period_s, interval = np.nan, 0.0
         if interval > 0.0:
             self._intervals.append(interval)
-            self.period_s = median(self._intervals)
+            self.period_s = sorted(self._intervals)[len(self._intervals) // 2]
         if index is not self._index or self.phase is Phase.IDLE:
             self._choose(index, q, now_s)
         self._last[:], self._interval_s = self._goal, interval
         self._goal[:] = q
         self._note_way(q, now_s)
+        self._velocity[:] = 0.0
+        if command.velocity is not None:
+            self._velocity[index] = command.velocity
         self._output.path = None
         self._came_s, self._command, self.phase = now_s, command, Phase.RUNNING
         self._advance(now_s)
@@ -192,18 +200,15 @@ class TargetStream:
         self.come_to_rest(now_s)
         elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
         self._spare[:] = output.out
-        limits = self._limits
         self._held_up = longest < elapsed or (self._held_up and self.lag_s > 0.0)
+        self._speeds[0] = self._fastest
         if self._held_up and self.lag_s < LATE * CATCH_UP_S:
-            limits = self._catching_up(elapsed, longest), *limits[1:]
-        q, fraction = self._goal, 1.0
+            self._speeds[0] = self._catching_up(elapsed, longest)
+        q, fraction, given = self._goal, 1.0, (output.limiter, self._active, self._speeds)
         for _ in range(TRIES):
-            desired = self._desired.at_one(q)
-            share, tried = output.limiter.put_out(
-                q, desired, elapsed, longest, self._active, limits, (output.taught, output.out)
-            )
+            share = self._desired.put_out(q, self._velocity, (elapsed, longest), *given)
             if share < 0.0:
-                require_limits(tried[None], self._arm)
+                require_limits(output.limiter.memory[-1:], self._arm)
             if share <= 1.0 + ROUNDING:
                 break
             if fraction == 1.0:
@@ -260,37 +265,34 @@ class TargetStream:
     def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""
         output, index, velocity = self._output, self._index, command.velocity
-        state = output.limiter.state
         if velocity is not None:
-            velocity = self._velocity(velocity)
-        if self.lag_s == 0.0 and not state[OFFSET].any():
+            velocity = self._velocity_out()
+        if self.lag_s == 0.0 and not output.limiter.memory[OFFSET].any():
             return command
         return JointCommand(command.names, output.out[index], velocity, command.stamp_ns, CORRECTED)
 
-    def _velocity(self, velocity: Array) -> Array:
+    def _velocity_out(self) -> Array:
         """Velocities (k,) that go out for those of the last target.
 
-        By the chain rule where the offset is the desired one, else by what went out, or the
+        Those of the correction where the offset is the desired one, else by what went out, or the
         limiter's rates.
         """
-        output, index = self._output, self._index
-        state, stage = output.limiter.state, output.stage
+        output, index, stage = self._output, self._index, self._output.stage
+        memory = output.limiter.memory
         if self.lag_s > 0.0 and self._step_s > 0.0:
             velocity = (output.out - self._before)[index] / self._step_s
-        elif stage is not None and state[OFFSET].tolist() == state[DESIRED].tolist():
-            speeds = np.zeros(self._arm.n)
-            speeds[index] = velocity
-            whole = self._desired.whole
-            velocity = stage.velocity_one(output.taught, speeds, output.out, whole)[index]
+        elif self._desired.fast:
+            velocity = memory[VELOCITY, index]
+            if not self._desired.figures[TOO_FAST]:
+                return velocity
+        elif isinstance(stage, ClampedCorrection) and np.array_equal(
+            memory[OFFSET], memory[DESIRED]
+        ):
+            velocity = stage.velocity_one(output.taught, self._velocity, output.out)[index]
         else:
-            velocity = velocity + state[OFFSET_RATE, index]
-        if (np.abs(velocity) > self._fastest[index] * (1.0 + ROUNDING)).any():
-            hold_speeds(
-                [self._arm.joint_names[i] for i in index],
-                velocity[None],
-                np.ones(1),
-                self._fastest[index],
-            )
+            velocity = self._velocity[index] + memory[OFFSET_RATE, index]
+        names = [self._arm.joint_names[i] for i in index]
+        hold_speeds(names, velocity[None], np.ones(1), self._fastest[index])
         return velocity
 
     # ---- without a message ----------------------------------------------------------------------

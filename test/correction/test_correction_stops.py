@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from correction_robot import HOME, LIMITS, NAMES, NOMINAL, Robot, large
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 
@@ -34,6 +34,9 @@ def program(strength: float, bend: float, seed: int, spacing_s: float = 0.01) ->
 @given(
     st.floats(0.1, 0.95), st.sampled_from([0.0, 0.1, 0.4]), st.integers(0, 50),
     st.floats(0.05, 0.97), st.floats(0.3, 4.0), st.booleans(), st.sampled_from([1.0, 0.5]),
+)  # fmt: skip
+@example(
+    strength=0.84375, bend=0.4, seed=0, when=0.97, brakes=1.0, corrected=False, scaling=1.0
 )  # fmt: skip
 def test_stops_anywhere(
     strength: float, bend: float, seed: int, when: float, brakes: float, corrected: bool,
@@ -78,7 +81,8 @@ def test_stops_anywhere(
     assert np.all(q <= ahead.max(axis=0) + 1e-5)
     assert np.all(q >= ahead.min(axis=0) - 1e-5)
     assert q[:, 0].max() <= NOMINAL.upper[0]
-    steps = np.diff(on[::50])
+    # 1e-6 rad before its end joint 1 still says within 0.1 ms where it is: it has 2e-4 rad/s there
+    steps = np.diff(on[q[:, 0] < ahead[-1, 0] - 1e-6][::50])
     assert np.all(steps >= -1e-4)  # never back
     assert np.all(np.diff(steps) <= 1e-3)  # nor faster on the way than before
     bends = np.abs(np.gradient(rates, c, axis=0)[3:-3]).max(axis=0) if len(c) > 9 else 0.0

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from correction_robot import DT, HOME, REST, ROUNDING, Robot, drifted, offer, refused
+from correction_robot import DT, HOME, NAMES, REST, ROUNDING, Robot, drifted, offer, refused
 
+from robocal_ros.correction.bounds import Policy, ShiftBounds
 from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.correction.refusals import Reason
 
@@ -13,6 +14,7 @@ SECOND = 1_000_000_000
 
 
 FAR = HOME + 0.1  # from where the robot stands
+TIGHT = ShiftBounds(0.2e-3, np.radians(0.1), np.radians(0.3))
 
 
 # ---- models that grow old ------------------------------------------------------------------------
@@ -90,3 +92,46 @@ def test_any_number_of_drivers_takes_no_more_room() -> None:
         robot.read(HOME, stamp_ns=SECOND + i)
     assert len(robot.session._stamps) <= 100
     refused(Reason.TIME_BACKWARDS, robot.read, HOME, stamp_ns=SECOND)
+
+
+# ---- the velocities that go out ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", ["regular", "weak", "clamped"])
+def test_the_velocities_that_go_out_are_the_derivative_of_the_positions(at: str) -> None:
+    """Of a stream in motion whose offset is the wanted one: central differences over 2 ms."""
+    config = {"policy": Policy.CLAMP, "thermal": TIGHT} if at == "clamped" else {}
+    robot = Robot(rested=False, **config)
+    robot.session.offer_model(offer(drifted(3.0 if at == "clamped" else 1.0)))
+    home = HOME.copy()
+    if at == "weak":
+        home[4] = 0.01
+    robot.at = home
+    robot.rest()
+    robot.session.enable(True)
+    out, given, taught = [], [], []
+    reach = np.array([0.2, -0.1, 0.2, -0.3, 0.02, 0.3])
+    for k in range(5000):
+        t = max(k - 2000, 0) * 1e-3
+        q = home + reach * (1.0 - np.cos(t))
+        velocity = reach * np.sin(t)
+        robot.now += 1e-3
+        robot.read(robot.at)
+        message = robot.session.target(JointCommand(NAMES, q, velocity), robot.now)
+        robot.go(message)
+        if k > 2002 and not robot.session.output.limiter.withheld.any():
+            out.append((k, robot.at))
+            given.append(message.velocity)
+            taught.append(velocity)
+    k, out = np.array([k for k, _ in out]), np.array([q for _, q in out])
+    inner = np.flatnonzero((k[2:] - k[:-2]) == 2) + 1
+    assert len(inner) > 1000
+    status = robot.session.status()
+    assert (status.reduced > 0, bool(status.clamped)) == (at == "weak", at == "clamped")
+    numeric = (out[inner + 1] - out[inner - 1]) / 2e-3
+    made = np.array(given)[inner]
+    own = np.array(taught)[inner]
+    # central differences are off by a sixth of the third derivative, (1 ms)**2 * 0.3 rad/s**3
+    slack = 1e-6
+    assert np.abs(made - own).max() > 20.0 * slack
+    assert np.allclose(made, numeric, rtol=0.0, atol=slack), np.abs(made - numeric).max()
