@@ -26,7 +26,6 @@ from robocal_ros.correction.inputs import (
     OfferedModel,
     OfferedTool,
     TrajectoryCommand,
-    require_finite,
 )
 from robocal_ros.correction.limiter import MOST
 from robocal_ros.correction.offers import CorrectionGate
@@ -191,7 +190,7 @@ class CorrectionSession:
             index = self._state.index(command.names)
             self._state.require_positions(command.names, index, command.position[None])
             if command.velocity is not None:
-                require_finite(command.names, command.velocity[None])
+                self._state.require_velocities(command.names, index, command.velocity)
             q = self._state.complete(index, command.position[None], self._taught, now_s)[0]
             if self._config.shadow:
                 self._shadow(q[None])
@@ -411,7 +410,7 @@ class CorrectionSession:
         stamp = came.stamp_ns
         if not stamp:
             return
-        key = kind, tuple(sorted(names))
+        key = kind, tuple(sorted(names)) if names else names
         if key not in self._stamps and len(self._stamps) >= MOST_SOURCES:
             key = kind, ()
         last, came_s = self._stamps.get(key, (stamp, now_s))
