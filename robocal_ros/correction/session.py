@@ -246,15 +246,17 @@ class CorrectionSession:
         self._interrupted = path, self.stream.phase
         self.stream.phase = Phase.IDLE
         self._goal[:] = q[-1]
-        self._note_withheld(path)
+        self._note_withheld(path.withheld, q)
         return corrected
 
-    def _note_withheld(self, path: SentPath) -> None:
-        memory, withheld = self.output.limiter.memory, np.abs(path.withheld)
-        np.maximum(memory[MOST], withheld.max(axis=0), out=memory[MOST])
-        worst = int(np.argmax(withheld.sum(axis=1)))
-        if withheld[worst].sum() > np.abs(memory[WORST]).sum():
-            memory[WORST], memory[WORST_OUT] = path.withheld[worst], path.out[worst]
+    def _note_withheld(self, withheld: Array, q: Array) -> None:
+        """Of a path (r, n) to taught joints (m, n); what comes before the first leads there."""
+        memory, size = self.output.limiter.memory, np.abs(withheld)
+        np.maximum(memory[MOST], size.max(axis=0), out=memory[MOST])
+        worst = int(np.argmax(size.sum(axis=1)))
+        if size[worst].sum() > np.abs(memory[WORST]).sum():
+            memory[WORST] = withheld[worst]
+            memory[WORST_OUT] = q[max(worst - (len(withheld) - len(q)), 0)]
 
     def reject(self, path: SentPath) -> None:
         """The controller did not take a trajectory: what it took the place of goes on there."""
