@@ -1,6 +1,7 @@
 """The least that a relay of joint messages costs in rclpy: each goes out as it came.
 
-``python bench/bare_relay.py events`` or ``single``: the executor. ROS arguments may follow.
+``python bench/bare_relay.py events`` or ``single``: the executor; ``bytes``: events, and what is
+relayed is never made a message, as in joint_correction_node. ROS arguments may follow.
 """
 
 import sys
@@ -14,7 +15,11 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-EXECUTORS = {"events": EventsExecutor, "single": SingleThreadedExecutor}
+EXECUTORS = {
+    "events": EventsExecutor,
+    "bytes": EventsExecutor,
+    "single": SingleThreadedExecutor,
+}
 KINDS = {
     "joint_targets": JointState,
     "joint_states": JointState,
@@ -22,7 +27,7 @@ KINDS = {
 }
 
 
-def main(executor: str) -> None:
+def main(kind_of_relay: str) -> None:
     """Relay each topic to the same one below ``~/`` until the process is ended."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # a signal ends it at once
     node = rclpy.create_node("relay")
@@ -31,8 +36,9 @@ def main(executor: str) -> None:
     for topic, kind in KINDS.items():
         publisher = node.create_publisher(kind, f"~/{topic}", reliable)
         profile = sensor if topic == "joint_states" else reliable
-        node.create_subscription(kind, topic, publisher.publish, profile)
-    spinning = EXECUTORS[executor]()
+        raw = kind_of_relay == "bytes"
+        node.create_subscription(kind, topic, publisher.publish, profile, raw=raw)
+    spinning = EXECUTORS[kind_of_relay]()
     spinning.add_node(node)
     while rclpy.ok():
         spinning.spin_until_future_complete(Future(), timeout_sec=0.5)  # as nodes.run does

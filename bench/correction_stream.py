@@ -32,10 +32,11 @@ SECONDS = 60.0  # of each stream
 BLOCK_S = 2.0  # each in its turn
 DRIFT_M = 0.5e-3
 POINTS, PATHS, PATH_S = 10_000, 10, 3.0
-NODE, RELAY, SINGLE = "corrected", "relayed", "relayed_single"
+NODE, RELAY, BYTES, SINGLE = "corrected", "relayed", "relayed_bytes", "relayed_single"
 IN_WORDS = {
     NODE: "joint_correction_node",
     RELAY: "bare relay, EventsExecutor",
+    BYTES: "bare relay of bytes, EventsExecutor",
     SINGLE: "bare relay, SingleThreadedExecutor",
 }
 QUANTILES = (0.5, 0.99, 0.999)
@@ -133,6 +134,7 @@ def _subjects(folder: Path) -> "Iterator[tuple[Probe, list[Stream]]]":
     given = {
         NODE: ("joint_correction_node", node),
         RELAY: ("relay", [*relay, "events"]),
+        BYTES: ("relay", [*relay, "bytes"]),
         SINGLE: ("relay", [*relay, "single"]),
     }
     probe = Probe()
@@ -220,7 +222,7 @@ def _paths(probe: "Probe", streams: "list[Stream]") -> dict[str, list[float]]:
     from robocal_ros.nodes import qos
 
     came: list[float] = []
-    chosen = [stream for stream in streams if stream.subject.name != SINGLE]
+    chosen = [stream for stream in streams if stream.subject.name in (NODE, RELAY)]
     publishers = {}
     for stream in chosen:
         subject = stream.subject

@@ -36,11 +36,12 @@ Array = NDArray[np.float64]
 # rows of the limits (4, n) and of a limiter's state (5, n)
 REST_RATE, REST_ACCELERATION, RATE, ACCELERATION = range(4)
 OFFSET, OFFSET_RATE, DESIRED, DESIRED_RATE, SHARE = STATE = range(5)
-# rows of its memory (16, n) after those of the state: the last target, as it was followed, and what
-# went out; the most that was withheld; the offset wanted for a target, the velocities that go out
-# with it, scratch; and what is tried: a state, and what would go out
-TAUGHT, OUT, MOST, WANTED, VELOCITY = range(5, 10)
-TRIED, MEMORY = 11, 17
+# rows of its memory (19, n) after those of the state: the last target, as it was followed, and what
+# went out; the most that was withheld of each joint, and of all together, and what went out then;
+# the offset wanted for a target, the velocities that go out with it, scratch; and what is tried: a
+# state, and what would go out
+TAUGHT, OUT, MOST, WORST, WORST_OUT, WANTED, VELOCITY = range(5, 12)
+TRIED, MEMORY = 13, 19
 # A desired rate may have so much of its limit before less of the offset is aimed at; all of it
 # comes back in so long, s.
 FULL_RATE, WHOLE_S = 0.5, 0.5
@@ -178,7 +179,7 @@ def put_out(
 
     Parameters
     ----------
-    memory : (17, n) of the limiter.
+    memory : (19, n) of the limiter.
     elapsed, longest : time since the last output, and what of it a step may use.
     active : (n,) 1 for the joints that go out.
     fastest, span : (n,) speeds of the joints, (2, n) their limits.
@@ -209,12 +210,20 @@ def put_out(
                 share = max(share, step / (fastest[j] * longest) if longest > 0.0 else np.inf)
     if not (inside and share <= 1.0 + ROUNDING):
         return share if inside else -1.0
+    now, worst = 0.0, 0.0
     for j in range(n):
         for row in range(SHARE + 1):
             memory[row, j] = tried[row, j]
         if active[j] != 0.0:
             taught[j], out[j] = goal[j], would[j]
-            memory[MOST, j] = max(memory[MOST, j], abs(memory[OFFSET, j] - memory[DESIRED, j]))
+            withheld = abs(memory[OFFSET, j] - memory[DESIRED, j])
+            memory[MOST, j] = max(memory[MOST, j], withheld)
+            now += withheld
+        worst += abs(memory[WORST, j])
+    if now > worst:
+        for j in range(n):
+            memory[WORST, j] = (memory[OFFSET, j] - memory[DESIRED, j]) * active[j]
+            memory[WORST_OUT, j] = out[j]
     return share
 
 
@@ -260,7 +269,7 @@ class OffsetLimiter:
 
     Attributes
     ----------
-    memory : (17, n) its rows are those named above.
+    memory : (19, n) its rows are those named above.
     limits : (4, n).
     """
 

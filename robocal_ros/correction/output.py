@@ -74,6 +74,8 @@ class SentPath:
     def time(self, now_s: float) -> float:
         """Where the controller's clock is on it, s from its begin."""
         now_s = min(now_s, self._stopped_s)
+        if now_s == np.inf:  # when it has been driven, at whatever speed
+            return np.inf
         since = max(self._since_s, self.begin_s)
         lost = self._lost_s + (1.0 - self._scaling) * max(now_s - since, 0.0)
         return now_s - self.begin_s - lost

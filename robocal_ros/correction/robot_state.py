@@ -42,12 +42,14 @@ class RobotState:
         self.names, self.count = arm.joint_names, arm.n
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._indices: dict[tuple[str, ...], Index] = {}
+        self._all = np.arange(arm.n, dtype=np.int64)
         self._columns: dict[tuple[str, ...], tuple[tuple[str, ...], Index, Index]] = {}
         self._age_limit_s, self._near = age_limit_s, near
         limit = np.maximum(np.abs(arm.lower), np.abs(arm.upper))
         turns = np.where(np.isfinite(limit), np.maximum(limit, MOST_TURNS), np.inf)
         self._turns, self._tenfold = np.where(arm.prismatic, np.inf, turns), 10.0 * limit
         self._doubtful = np.minimum(self._turns, self._tenfold)
+        self._endless = np.full(arm.n, np.finfo(np.float64).max)
         self._continuous = ~arm.prismatic & ~(np.isfinite(arm.lower) & np.isfinite(arm.upper))
         self.measured = np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
@@ -67,7 +69,8 @@ class RobotState:
                 raise RefusedError(Reason.UNKNOWN_JOINT, detail)
             _require_single(names)
             index = np.array([self._number[name] for name in names], dtype=np.int64)
-            self._indices = {names: index}
+            self._indices = {names: self._all if names == self.names else index}
+            index = self._indices[names]
         return index
 
     def require_positions(self, names: tuple[str, ...], index: Index, position: Array) -> None:
@@ -88,12 +91,19 @@ class RobotState:
         if np.any(np.all(size > self._tenfold[index], axis=1)):
             raise RefusedError(Reason.DEGREES, "all joints are beyond ten times their limits")
 
+    def require_velocities(self, names: tuple[str, ...], index: Index, velocity: Array) -> None:
+        """Refuse velocities (k,) that are not finite."""
+        if len(velocity) != len(index) or not ordinary(plain(velocity), self._endless, index):
+            require_finite(names, velocity[None])
+
     def complete(self, index: Index, position: Array, taught: Array, now_s: float) -> Array:
         """All joints (m, n) of a command (m, k); those that it leaves out stay where they are.
 
         ``taught`` (n,): un-corrected readings. Raises `RefusedError` where one that is left out
         was never read, or not lately.
         """
+        if index is self._all:
+            return position.copy()
         if len(index) == self.count:
             q = np.empty_like(position)
         else:

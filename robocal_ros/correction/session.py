@@ -26,9 +26,8 @@ from robocal_ros.correction.inputs import (
     OfferedModel,
     OfferedTool,
     TrajectoryCommand,
-    require_finite,
 )
-from robocal_ros.correction.limiter import MOST
+from robocal_ros.correction.limiter import MOST, WORST, WORST_OUT
 from robocal_ros.correction.offers import CorrectionGate
 from robocal_ros.correction.output import Output, SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
@@ -191,7 +190,7 @@ class CorrectionSession:
             index = self._state.index(command.names)
             self._state.require_positions(command.names, index, command.position[None])
             if command.velocity is not None:
-                require_finite(command.names, command.velocity[None])
+                self._state.require_velocities(command.names, index, command.velocity)
             q = self._state.complete(index, command.position[None], self._taught, now_s)[0]
             if self._config.shadow:
                 self._shadow(q[None])
@@ -247,9 +246,17 @@ class CorrectionSession:
         self._interrupted = path, self.stream.phase
         self.stream.phase = Phase.IDLE
         self._goal[:] = q[-1]
-        most = self.output.limiter.memory[MOST]
-        np.maximum(most, np.abs(path.withheld).max(axis=0), out=most)
+        self._note_withheld(path.withheld, q)
         return corrected
+
+    def _note_withheld(self, withheld: Array, q: Array) -> None:
+        """Of a path (r, n) to taught joints (m, n); what comes before the first leads there."""
+        memory, size = self.output.limiter.memory, np.abs(withheld)
+        np.maximum(memory[MOST], size.max(axis=0), out=memory[MOST])
+        worst = int(np.argmax(size.sum(axis=1)))
+        if size[worst].sum() > np.abs(memory[WORST]).sum():
+            memory[WORST] = withheld[worst]
+            memory[WORST_OUT] = q[max(worst - (len(withheld) - len(q)), 0)]
 
     def reject(self, path: SentPath) -> None:
         """The controller did not take a trajectory: what it took the place of goes on there."""
@@ -411,7 +418,7 @@ class CorrectionSession:
         stamp = came.stamp_ns
         if not stamp:
             return
-        key = kind, tuple(sorted(names))
+        key = kind, tuple(sorted(names)) if names else names
         if key not in self._stamps and len(self._stamps) >= MOST_SOURCES:
             key = kind, ()
         last, came_s = self._stamps.get(key, (stamp, now_s))
@@ -424,6 +431,7 @@ class CorrectionSession:
     def status(self, now_s: float | None = None) -> CorrectionStatus:
         """What the session does; ``now_s``: while a trajectory is under way, at which instant."""
         desired, tools, output = self._desired, self._gate.tools, self.output
+        memory, places = output.limiter.memory, self._places()
         at_s = np.inf if now_s is None else now_s
         stage, withheld = output.correction(at_s)
         settled = stage is desired.stage and bool(np.all(np.abs(withheld) <= SETTLED))
@@ -445,9 +453,9 @@ class CorrectionSession:
             largest_shift=float(desired.figures[LARGEST]),
             remaining_m=float(desired.figures[REMAINING]),
             withheld=withheld,
-            withheld_most=output.limiter.memory[MOST].copy(),
-            withheld_m=self._at_tool(withheld),
-            withheld_most_m=self._at_tool(output.limiter.memory[MOST]),
+            withheld_most=memory[MOST].copy(),
+            withheld_m=self._at_tool(withheld, places[:1]),
+            withheld_most_m=self._at_tool(memory[WORST], memory[[WORST_OUT]]),
             lag_s=self.stream.lag_s,
             overtaken=self._overtaken,
             mismatch=output.mismatch,
@@ -462,12 +470,11 @@ class CorrectionSession:
             last_refusal=self._last_refusal,
         )
 
-    def _at_tool(self, withheld: Array) -> float:
-        """How far the tool is moved by small offsets (n,) where the robot is, m."""
-        places = self._places()
-        if not len(places) or not withheld.any():
+    def _at_tool(self, withheld: Array, place: Array) -> float:
+        """How far the tool is moved by small offsets (n,) at a place (1 or 0, n), m."""
+        if not len(place) or not withheld.any():
             return 0.0
-        moved = self._reference.fk(np.stack([places[0], places[0] + withheld]))
+        moved = self._reference.fk(np.vstack([place, place + withheld]))
         tips = (moved @ self._reference.T_flange_tool)[:, :3, 3]
         return float(np.linalg.norm(tips[1] - tips[0]))
 

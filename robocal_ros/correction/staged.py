@@ -142,10 +142,8 @@ class StagedCorrection:
         found, self._solved = np.empty(self.n), None
         whole = not self._one[:, self.n + solution.WEAK].any()
         if not (whole and self._by_chain(corrected, velocity, q, self._back_works, found)):
-            given, at_q = (
-                (self._largest, self._free, self._works),
-                self._one[-1, : self.n].copy(),
-            )
+            given = self._largest, self._free, self._works
+            at_q = self._one[-1, : self.n].copy()
             rates.taught_velocity_by_differences(
                 q, velocity, at_q, *given, self._spare, self._one, found
             )

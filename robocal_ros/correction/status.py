@@ -58,7 +58,7 @@ class CorrectionStatus:
     withheld: Array  # (n,) what the limiter withholds now
     withheld_most: Array  # (n,) and has at most since the start
     withheld_m: float  # the same at the tool
-    withheld_most_m: float
+    withheld_most_m: float  # when that of all joints together was largest
     lag_s: float  # how far a stream's output lags what came in
     overtaken: int  # messages that came after a newer one
     mismatch: str  # why nothing is put out until it is acknowledged; empty: nothing is wrong

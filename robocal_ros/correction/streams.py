@@ -23,7 +23,7 @@ from robocal_ros.correction.limiter import (
 from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
-from robocal_ros.correction.stepping import TOO_FAST
+from robocal_ros.correction.stepping import ADDS, TOO_FAST
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
@@ -265,10 +265,13 @@ class TargetStream:
     def _message(self, command: JointCommand) -> JointCommand:
         """What goes out for a command; itself where nothing is added."""
         output, index, velocity = self._output, self._index, command.velocity
+        memory = output.limiter.memory
         if velocity is not None:
             velocity = self._velocity_out()
-        if self.lag_s == 0.0 and not output.limiter.memory[OFFSET].any():
-            return command
+        if self.lag_s == 0.0:
+            adds = self._desired.figures[ADDS] if self._desired.fast else memory[OFFSET].any()
+            if not adds:
+                return command
         return JointCommand(command.names, output.out[index], velocity, command.stamp_ns, CORRECTED)
 
     def _velocity_out(self) -> Array:

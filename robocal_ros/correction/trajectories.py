@@ -90,13 +90,13 @@ class TrajectoryCorrector:
             self._require_speeds(command, index, out, velocity, times, led_from)
         finally:
             limiter.state[:], limiter.limits = kept, limits
-        known_times, sent = command.time_from_start_s, np.stack([offsets, rates, bends])
-        withheld = sent_withheld = offsets - desired
+        known_times = command.time_from_start_s
+        sent = np.stack([offsets, rates, bends, offsets - desired])
         if led_from is not None:  # until its first point: from the offset that there is now
             known_times = np.append(-starts_in_s, known_times)
-            first = np.stack([begin[OFFSET], begin[OFFSET_RATE], 0.0 * begin[OFFSET]])
+            offset, rate = begin[OFFSET], begin[OFFSET_RATE]
+            first = np.stack([offset, rate, 0.0 * rate, offset - begin[DESIRED]])
             sent = np.concatenate([first[:, None], sent], axis=1)
-            sent_withheld = np.vstack([begin[OFFSET] - begin[DESIRED], withheld])
         path = SentPath(
             index=index,
             begin_s=now_s + starts_in_s,
@@ -105,10 +105,7 @@ class TrajectoryCorrector:
             velocity=velocity,
             acceleration=acceleration,
             known_times=known_times,
-            offsets=sent[0],
-            rates=sent[1],
-            bends=sent[2],
-            withheld=sent_withheld,
+            **dict(zip(("offsets", "rates", "bends", "withheld"), sent, strict=True)),
             stage=self._desired.stage if result is not None else None,
             led_from=out[0, index] if led_from is None else led_from,
             put_s=now_s,

@@ -51,13 +51,16 @@ class JointPlan:
         spline = CubicHermiteSpline(self.time_s, self.q, self.qd)
         return spline, spline.derivative()
 
+    def places(self, time_s: ArrayLike) -> Array:
+        """Joints (..., n) alone, as `at`."""
+        t = np.clip(np.asarray(time_s, dtype=np.float64), 0.0, self.duration_s)
+        return np.asarray(self._cubics[0](t))
+
     def at(self, time_s: ArrayLike) -> tuple[Array, Array]:
         """Joints (..., n) and their velocity; before the start as there, after the end at rest."""
         t = np.asarray(time_s, dtype=np.float64)
-        position, velocity = self._cubics
-        inside = np.clip(t, 0.0, self.duration_s)
-        moving = (t <= self.duration_s)[..., None]
-        return np.asarray(position(inside)), np.where(moving, velocity(inside), 0.0)
+        velocity = self._cubics[1](np.clip(t, 0.0, self.duration_s))
+        return self.places(t), np.where((t <= self.duration_s)[..., None], velocity, 0.0)
 
     def peaks(self) -> tuple[Array, Array]:
         """Largest speed and acceleration (n,) of each joint, exactly, between points too."""

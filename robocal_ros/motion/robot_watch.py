@@ -86,6 +86,7 @@ class RobotWatch:
         self._moved_to_s = self._moved_s = 0.0  # the plan's clock when it last came further
         self._ended_s = np.inf  # since when the plan is over, with the robot at its end
         self._over = False
+        self._away: tuple[float, float] | None = None  # by what is known now
 
     # ---- what comes in --------------------------------------------------------------------------
 
@@ -98,7 +99,7 @@ class RobotWatch:
                 return  # a clock that stands still is heard as silence
             self._readings.clear()
         self._readings.append((stamp_s, np.clip(q, -FARTHEST, FARTHEST)))
-        self._heard_s = now_s
+        self._heard_s, self._away = now_s, None
         self.silence.heard(now_s)
 
     def scaled(self, factor: float, now_s: float) -> None:
@@ -106,7 +107,7 @@ class RobotWatch:
         if not 0.0 <= factor < np.inf:
             return
         self._driven_s, self._at_s = self.driven_s(now_s), now_s
-        self.scaling, self._scaled_s = factor, now_s
+        self.scaling, self._scaled_s, self._away = factor, now_s, None
 
     def controller(self, q: Array, qd: Array, now_s: float) -> None:
         """Where the controller is on its trajectory: joints and unscaled velocities (n,)."""
@@ -117,13 +118,13 @@ class RobotWatch:
             return
         here_s = self.driven_s(now_s)
         times = here_s + np.linspace(-UNSAID_S, UNSAID_S, 41)
-        away = np.max(np.abs(self._plan.at(times)[0] - q), axis=1)
+        away = np.max(np.abs(self._plan.places(times) - q), axis=1)
         if away[nearest := int(np.argmin(away))] < NEAR_REFERENCE_RAD:
-            self._driven_s, self._at_s = float(times[nearest]), now_s
+            self._driven_s, self._at_s, self._away = float(times[nearest]), now_s, None
 
     def follow(self, plan: JointPlan, cell: MotionCell, now_s: float) -> None:
         """A plan was sent."""
-        self._plan, self._cell = plan, cell
+        self._plan, self._cell, self._away = plan, cell, None
         self._driven_s = self._reached_s = self._moved_s = self._moved_to_s = 0.0
         self._at_s = self._looked_s = now_s
         self._ended_s, self._over = np.inf, False
@@ -131,6 +132,7 @@ class RobotWatch:
     def sent(self, now_s: float) -> None:
         """When the plan really was sent."""
         self._at_s = self._looked_s = now_s
+        self._away = None
 
     def ended(self) -> None:
         """The controller says that it is through with the plan."""
@@ -141,10 +143,11 @@ class RobotWatch:
         self._at_s += for_s
         self._heard_s += for_s
         self._looked_s += for_s
+        self._away = None
 
     def forget(self) -> None:
         """No plan is in force any more."""
-        self._plan = None
+        self._plan = self._away = None
 
     # ---- where it is ----------------------------------------------------------------------------
 
@@ -227,13 +230,15 @@ class RobotWatch:
         plan, cell = self._plan, self._cell
         if plan is None or cell is None or not self._readings:
             return 0.0, 0.0
+        if self._away is not None:
+            return self._away
         q, heard_s = self._readings[-1][1], self._heard_s
         first_s = max(self._reached_s - JITTER_S, 0.0)
         last_s = self._reached_s + max(heard_s - self._looked_s, 0.0) + UNSAID_S
         last_s = min(last_s, self.driven_s(heard_s) + UNSAID_S * self.scaling_known(heard_s))
         last_s = max(min(last_s, plan.duration_s), first_s)
         times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / APART_S)) + 1)
-        planned, _ = plan.at(times)
+        planned = plan.places(times)
         joints = np.max(np.abs(planned - q) * ~self._arm.prismatic, axis=1)
         T = cell.arm.fk(np.vstack([planned, q]))
         tips = T[:, :3, :3] @ cell.tool.p_tip + T[:, :3, 3]
@@ -249,7 +254,7 @@ class RobotWatch:
             self._reached_s = float(times[nearest])
             if self._reached_s > self._moved_to_s + JITTER_S:
                 self._moved_to_s, self._moved_s = self._reached_s, self.driven_s(heard_s)
-        self._looked_s = max(heard_s, self._looked_s)
+        self._looked_s, self._away = max(heard_s, self._looked_s), found
         return found
 
     def keeps(self, tip_m: float, joint_rad: float) -> bool:

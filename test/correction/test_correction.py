@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from correction_robot import (
     DT,
     HOME,
@@ -15,8 +16,10 @@ from correction_robot import (
     bent_tool,
     distance,
     drifted,
+    large,
     offer,
     pose,
+    swing,
 )
 
 from robocal_ros.correction.bounds import CorrectionConfig
@@ -101,3 +104,27 @@ def test_a_pause_does_not_let_the_blend_jump(robot: Robot) -> None:
     robot.session.offer_model(offer(drifted(2.0)))
     robot.session.enable(True)
     assert np.abs(robot.stream(dt=100.0) - HOME).max() <= REST * 0.02 + ROUNDING
+
+
+def test_what_was_withheld_at_most_is_that_of_one_instant_at_the_tool() -> None:
+    """The largest of each joint are of different instants, and do not add up at the tool."""
+    robot = large()
+    robot.stream()
+    first = robot.session.status()
+    assert first.withheld_m > 1e-3
+    assert first.withheld_most_m == pytest.approx(first.withheld_m, rel=1e-2)
+    robot.settle()
+    settled = robot.session.status()
+    assert settled.withheld_m == 0.0
+    assert settled.withheld_most_m == pytest.approx(first.withheld_most_m, rel=1e-2)
+
+
+@pytest.mark.parametrize("joints", [6, 5])
+def test_what_a_trajectory_withholds_is_told_at_the_tool(joints: int) -> None:
+    robot = large()
+    path = swing(first_s=1.0, duration=9.0)
+    names, q = NAMES[:joints], path.position[:, :joints]
+    robot.session.trajectory(TrajectoryCommand(names, q, path.time_from_start_s), robot.now)
+    told = robot.session.status()
+    assert told.withheld_most.max() > 1e-4
+    assert 1e-4 < told.withheld_most_m < 4e-3  # of a tool that is bent by 2 mm

@@ -195,7 +195,9 @@ def test_trajectories_through_anything(
         way = 0.1 * seed * (3.0 * s**2 - 2.0 * s**3)
         speed = 0.1 * seed * 6.0 * (s - s**2) / duration
         times = first_s + np.linspace(0.0, duration, m)
-        command = TrajectoryCommand(NAMES, begin + way, times, speed * np.ones(6))
+        k = 4 if count % 3 == 0 else 6  # joints
+        q, rates = (begin + way)[:, :k], (speed * np.ones(6))[:, :k]
+        command = TrajectoryCommand(NAMES[:k], q, times, rates)
         try:
             out = robot.session.trajectory(command, robot.now)
         except RefusedError as error:
@@ -204,10 +206,10 @@ def test_trajectories_through_anything(
             raise
         offset, dt = out.position - command.position, np.diff(times)[:, None]
         if first_s == 0.0:
-            assert np.abs(out.position[0] - robot.at).max() <= ROUNDING
+            assert np.abs(out.position[0] - robot.at[:k]).max() <= ROUNDING
         else:
-            steps = np.abs(out.position[0] - robot.at)
-            assert np.all(steps <= LIMITS["velocity_limits"] * first_s)
+            steps = np.abs(out.position[0] - robot.at[:k])
+            assert np.all(steps <= LIMITS["velocity_limits"][:k] * first_s)
         rate = np.diff(offset, axis=0) / dt
         assert np.all(np.abs(rate) <= FASTEST + ROUNDING)
         if seed == 0:
@@ -215,11 +217,12 @@ def test_trajectories_through_anything(
         if m > 2 and dt[0, 0] <= 0.02:
             assert np.all(np.abs(np.diff(rate, axis=0)) <= LARGEST_A * dt[1:] + ROUNDING)
         assert out.velocity is None or np.abs(out.velocity[-1]).max() <= ROUNDING
-        robot.at = out.position[-1]
+        assert robot.session.status().withheld_most_m < 0.03
+        robot.at = np.append(out.position[-1], robot.at[k:])
         robot.now += times[-1]
         robot.rest()
         taught = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
-        assert np.allclose(taught, command.position[-1], rtol=0.0, atol=1e-9)
+        assert np.allclose(taught[:k], command.position[-1], rtol=0.0, atol=1e-9)
 
 
 def test_at_rest_the_offset_comes_in_as_fast_as_it_may_and_no_faster() -> None:

@@ -169,7 +169,8 @@ def test_whether_a_robot_follows_its_path(late_s):
     path = SentPath(
         index=np.arange(6), begin_s=began_s - late_s, times=np.array([0.0, lasts_s]),
         out=np.stack([HOME, HOME + lasts_s * SPEED]), velocity=None,
-        known_times=np.array([0.0, lasts_s]), offsets=rows, rates=rows, withheld=rows, stage=None,
+        acceleration=None, known_times=np.array([0.0, lasts_s]), offsets=rows, rates=rows,
+        bends=rows, withheld=rows, stage=None,
         led_from=HOME, put_s=began_s, at_once=True,
     )  # fmt: skip
     assert robot.track.follows(path, robot.now_s)  # nothing tells otherwise
