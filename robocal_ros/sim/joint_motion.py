@@ -157,12 +157,14 @@ class JointMotion:
         return float(self._past_s[row]), self._rows[row]
 
     def pass_to(self, now_s: float) -> None:
-        """Let the cycles up to a time pass, and undo what was computed beyond it."""
+        """Let the cycles up to a time pass for good, and undo what was computed beyond it."""
         count = int(np.floor(now_s / CYCLE_S * (1.0 + 1e-12))) + 1
-        if self._count > count >= self._before[0]:
+        if count < self._before[0]:
+            return
+        if self._count > count:
             self._count, self.controller, self._sent = self._before
-            self._before = self._snapshot()
         self._run(count)
+        self._before = self._snapshot()
 
     # ---- cycles ---------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ What the maintenance asks is carried out by calling the sessions themselves, as 
 from typing import Any
 
 import numpy as np
-from driven_robot import HOUSING, PERIOD_S, Robot
+from driven_robot import HOUSING, PERIOD_S, AheadMotion, Robot
 from maintenance_cell import BEAT_S, HOME, Shelf
 from shift import BALL, NOISE_M, T_SENSOR_BASE, warmed
 from tool_driver import TAUGHT
@@ -19,7 +19,6 @@ from robocal_ros.motion.travel import joint_way
 from robocal_ros.sessions.events import CAPTURE_REFERENCE, Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.sim.joint_motion import JointMotion
 
 TICKS = 2  # of the robot, between two looks of the maintenance
 OFFSETS_DEG = [
@@ -50,7 +49,7 @@ class MaintainedCell(Robot):
         self.now_s = from_s
         self.history = history
         self.arm = self.cell.arm
-        self.motion, self.q = JointMotion(HOME), HOME.copy()
+        self.motion, self.q = AheadMotion(HOME), HOME.copy()
         driving = DrivingConfig(HOUSING, 0.1, 0.008, 0.05)
         settings: dict[str, Any] = {
             "home": HOME,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from driven_robot import AheadMotion
 from shift import warmed
 from tool_driver import TAUGHT, noisy_cell
 from tool_driver import config_of as tool_config
@@ -26,7 +27,6 @@ from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import STATION, Ways
 from robocal_ros.sessions.tool_config import made_with
-from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.tool_cell import joints_at
 
 TICK_S = 0.02
@@ -142,7 +142,7 @@ class Cell:
 
     def __post_init__(self) -> None:
         self.now_s = 10.0
-        self.motion = JointMotion(HOME)
+        self.motion = AheadMotion(HOME)
         self.coming: list[tuple[float, JointPlan]] = []
         self.due: list[tuple[float, int, Answer]] = []
         self.tool = ToolNode()
@@ -242,7 +242,7 @@ class Cell:
             at_s, plan = self.coming.pop(0)
             time_s, q, qd = plan.points()
             self.motion.follow(self.now_s, time_s + at_s, q, qd)
-        q = self.motion.joints(np.array([self.now_s]))[0]
+        q = self.motion.now(self.now_s)
         if np.max(np.abs(q - self.q)) > 1e-7:
             self.moved_s = self.now_s
         self.q = q

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from driven_robot import AheadMotion
 from maintenance_cell import (
     CELL,
     DOWN,
@@ -38,7 +39,6 @@ from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance import requests as ask
 from robocal_ros.sessions.maintenance.accuracy import Drift
 from robocal_ros.sessions.maintenance.mover import Mover
-from robocal_ros.sim.joint_motion import JointMotion
 
 SMALL = ToolError(1e-4, 1.5e-4)
 
@@ -179,7 +179,7 @@ def test_after_a_fault_the_ways_begin_at_home_again(cell):
     cell.is_open = False
     cell.pass_time(1.5)
     assert cell.state is State.FAULT
-    cell.motion = JointMotion(HOME)
+    cell.motion = AheadMotion(HOME)
     cell.open_gap()
     cell.pass_time(0.5)
     cell.session.acknowledge("me")

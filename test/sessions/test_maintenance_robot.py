@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from driven_robot import AheadMotion
 from maintenance_cell import (
     ARM,
     DRIVING,
@@ -31,7 +32,6 @@ from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance.hands import Hands
 from robocal_ros.sessions.maintenance.requests import Answer
 from robocal_ros.sessions.maintenance.ways import Ways
-from robocal_ros.sim.joint_motion import JointMotion
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def pushed(cell: Cell, joint: int = 1, by_deg: float = 25.0) -> None:
     """Somebody else has moved the robot; it rests."""
     q = cell.q.copy()
     q[joint] += np.radians(by_deg)
-    cell.motion = JointMotion(q)
+    cell.motion = AheadMotion(q)
 
 
 @pytest.mark.parametrize("by_deg", [3.0, 25.0])
@@ -162,7 +162,7 @@ def test_a_fault_away_from_home_is_not_acknowledged(cell):
     words = r"joint states are silent for 0.5. s"
     assert refused(lambda: cell.session.acknowledge("me"), words) is Code.TOO_FEW_SAMPLES
     assert cell.session.status(cell.now_s).fault == fault
-    cell.silent, cell.motion = False, JointMotion(HOME)
+    cell.silent, cell.motion = False, AheadMotion(HOME)
     cell.pass_time(0.5)
     cell.session.acknowledge("me")
     assert cell.state is State.IDLE
@@ -181,7 +181,7 @@ def test_a_robot_that_left_its_plan_in_a_tool_run_is_not_driven_on(cell, mode):
     assert held.message in status.fault
     asked = kinds(cell)
     assert "Move" not in asked[len(asked) - asked[::-1].index("Measure") :]
-    cell.motion = JointMotion(HOME)  # brought there by hand
+    cell.motion = AheadMotion(HOME)  # brought there by hand
     cell.pass_time(0.5)
     cell.session.acknowledge("me")
     cell.session.drift(KNOWN, cell.now_s)
@@ -205,7 +205,7 @@ def test_a_tool_run_that_ends_beside_home_is_brought_to_it(cell):
 
 def test_a_robot_that_never_left_is_not_moved(cell):
     """A programme may stop a little beside the taught home."""
-    cell.motion = JointMotion(HOME + np.radians(0.1))
+    cell.motion = AheadMotion(HOME + np.radians(0.1))
     cell.services["thermal"] = SILENT
     cell.run("c1", LONG_S)
     cell.finish()
@@ -236,7 +236,7 @@ def test_an_acknowledgement_that_cannot_be_kept_is_none(cell, monkeypatch):
 
 
 def test_a_reading_that_is_older_does_not_count(cell):
-    cell.motion = JointMotion(POSES[0])
+    cell.motion = AheadMotion(POSES[0])
     cell.pass_time(0.5)
     cell.session.reading(cell.now_s - 0.3, HOME, cell.now_s)
     assert not cell.session.status(cell.now_s).at_home
@@ -291,7 +291,7 @@ def test_a_fault_ends_after_the_joints_clock_began_anew(cell):
     cell.silent = True
     cell.pass_time(5.0)
     cell.silent, cell.clock_s = False, -cell.now_s  # the controller was switched off and on
-    cell.motion = JointMotion(HOME)
+    cell.motion = AheadMotion(HOME)
     cell.pass_time(1.0)
     cell.session.acknowledge("me")
     assert cell.state is State.IDLE

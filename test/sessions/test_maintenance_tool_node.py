@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from driven_robot import AheadMotion
 from maintenance_cell import (
     BEAT_S,
     DRIVING,
@@ -30,7 +31,6 @@ from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.sessions.maintenance import State
 from robocal_ros.sessions.maintenance.hands import DEAF_S
 from robocal_ros.sessions.tool_driving import SETTLED_S
-from robocal_ros.sim.joint_motion import JointMotion
 
 GONE_S = 6.0  # the tool node is looked for as long
 
@@ -94,7 +94,7 @@ def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
     cell.tool_dies()
     cell.is_open = False
     over(cell, fault=True)
-    cell.motion = JointMotion(HOME)  # brought home by hand
+    cell.motion = AheadMotion(HOME)  # brought home by hand
     cell.pass_time(2.0 * GONE_S)
     with pytest.raises(ConflictError, match="not confirmed"):
         cell.session.acknowledge("me")
@@ -107,10 +107,10 @@ def test_a_tool_node_that_died_where_it_moved_the_robot_is_not_let_go(cell):
 def test_a_tool_node_is_let_go_only_while_the_robot_stands_at_home(history):
     cell = Cell(history)
     cell.tool_dies()
-    cell.motion = JointMotion(POSES[0])
+    cell.motion = AheadMotion(POSES[0])
     cell.pass_time(2.0 * GONE_S)
     assert not cell.session.status(cell.now_s).disarmed
-    cell.motion = JointMotion(HOME)
+    cell.motion = AheadMotion(HOME)
     cell.pass_time(1.0)
     assert cell.session.status(cell.now_s).disarmed
 
@@ -230,7 +230,7 @@ def test_a_tool_node_that_hears_is_left_to_stop_by_itself(cell, how):
     if how == "closed":
         cell.is_open = False
         cell.pass_time(3.0)
-        cell.motion = JointMotion(HOME)  # brought home by hand
+        cell.motion = AheadMotion(HOME)  # brought home by hand
         cell.open_gap()
         cell.session.acknowledge("me")
     else:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from driven_robot import LAG_S, PERIOD_S, Robot
+from driven_robot import LAG_S, PERIOD_S, AheadMotion, Robot
 from tool_driver import TAUGHT, TRUTH
 
 from robocal_ros.core.codes import Code
@@ -13,7 +13,6 @@ from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.sessions.events import MEASURE_TOOL, Command
 from robocal_ros.sessions.tool_driving import Phase
 from robocal_ros.sim.beams import bent
-from robocal_ros.sim.joint_motion import JointMotion
 from robocal_ros.sim.tool_cell import joints_at
 
 
@@ -196,7 +195,7 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
     robot = Robot(history)
     beside = robot.cell.pose(TAUGHT, 0.0)
     beside[:3, 3] += [0.1, 0.0, 0.0]
-    robot.motion = JointMotion(joints_at(robot.cell.arm, beside[None], robot.cell.q_near)[0])
+    robot.motion = AheadMotion(joints_at(robot.cell.arm, beside[None], robot.cell.q_near)[0])
     robot.run(0.4)
     robot.driver.arm(robot.now_s)
     robot.measure()
@@ -210,7 +209,7 @@ def test_a_robot_without_a_way_is_refused_before_anything_is_sent(history):
 @pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.MEASURE])
 def test_a_robot_that_is_held_has_left_its_plan(robot, phase):
     driving(robot, phase)
-    robot.motion = JointMotion(robot.q)
+    robot.motion = AheadMotion(robot.q)
     robot.edges.clear()
     robot.run(10.0)
     assert robot.driver.armed  # it may pause, and nobody tells

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from driven_robot import HOUSING, LAG_S, PERIOD_S, Robot
+from driven_robot import HOUSING, LAG_S, PERIOD_S, AheadMotion, Robot
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -208,7 +208,18 @@ def test_a_preempted_motion_is_stopped_from_where_the_robot_is(robot):
 def test_an_end_that_is_no_arrival_is_seen(robot):
     """A topic trajectory takes a goal over, and the goal still succeeds."""
     driven(robot, Phase.APPROACH, 0.6)
-    robot.motion = JointMotion(robot.q)
+    robot.motion = AheadMotion(robot.q)
     robot.driver.reported(MotionReport(ended=True), robot.now_s)
     robot.run(3.0, until=lambda: not robot.driver.armed)
     assert robot.outcomes[-1].left_plan
+
+
+def test_cycles_that_are_computed_ahead_change_nothing():
+    """A motion, a stop on its way, and one just after it: to the last bit."""
+    plain, ahead = JointMotion(HOME), AheadMotion(HOME)
+    sent = {0.304: HOME + 0.3, 1.008: HOME + 0.1, 1.016: HOME, 40.0: HOME + 0.2}
+    for now_s in PERIOD_S * np.arange(1, 5300):
+        for at_s in [one for one in sent if now_s - PERIOD_S < one <= now_s]:
+            for motion in (plain, ahead):
+                motion.follow(at_s, [at_s + 1.0], sent[at_s][None], np.zeros((1, 6)))
+        assert np.array_equal(ahead.now(now_s), plain.joints(np.array([now_s]))[0]), now_s
