@@ -206,8 +206,9 @@ def put_out(
         if active[j] != 0.0:
             inside &= span[0, j] - ROUNDING <= would[j] <= span[1, j] + ROUNDING
             step = abs(would[j] - out[j])
-            if step > ROUNDING:
-                share = max(share, step / (fastest[j] * longest) if longest > 0.0 else np.inf)
+            if not step <= ROUNDING:  # also where it is not known what went out
+                known = longest > 0.0 and step < np.inf
+                share = max(share, step / (fastest[j] * longest) if known else np.inf)
     if not (inside and share <= 1.0 + ROUNDING):
         return share if inside else -1.0
     now, worst = 0.0, 0.0

@@ -249,7 +249,7 @@ class JointCorrectionNode(HouseNode):
 
     def _on_acknowledge(self, _: Any, response: Any) -> Any:
         """End a START_MISMATCH, and take note of a damaged history."""
-        self._session.acknowledge()
+        self._session.acknowledge(time.monotonic())
         self._report.log.acknowledge()
         return self._answer("acknowledge", "", response)
 

@@ -303,12 +303,14 @@ class Output:
         self.mismatch = f"{detail}; call ~/acknowledge when it may begin there"
         return RefusedError(Reason.START_MISMATCH, self.mismatch)
 
-    def acknowledge(self) -> None:
-        """The next command may begin where the robot stands."""
-        if self.mismatch:
-            self.mismatch, self.path = "", None
-            self._track.clear()
-            self.taught[:], self.out[:] = np.nan, np.nan
+    def acknowledge(self, now_s: float) -> None:
+        """The next command may begin where the robot stands; readings are what they were."""
+        self.take_up(now_s)
+        if self.path is not None:
+            self.stage = self.path.stage
+        self.mismatch, self.path = "", None
+        self._track.clear()
+        self.taught[:], self.out[:] = np.nan, np.nan
 
     # ---- what goes out --------------------------------------------------------------------------
 

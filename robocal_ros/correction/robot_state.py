@@ -92,8 +92,11 @@ class RobotState:
             raise RefusedError(Reason.DEGREES, "all joints are beyond ten times their limits")
 
     def require_velocities(self, names: tuple[str, ...], index: Index, velocity: Array) -> None:
-        """Refuse velocities (k,) that are not finite."""
-        if len(velocity) != len(index) or not ordinary(plain(velocity), self._endless, index):
+        """Refuse velocities (k,) that are not finite, or of another number."""
+        if len(velocity) != len(index):
+            detail = f"{len(names)} names but {len(velocity)} velocities"
+            raise RefusedError(Reason.WRONG_SIZE, detail)
+        if not ordinary(plain(velocity), self._endless, index):
             require_finite(names, velocity[None])
 
     def complete(self, index: Index, position: Array, taught: Array, now_s: float) -> Array:

@@ -115,9 +115,18 @@ class CorrectionSession:
         self._enabled = on
         self._want()
 
-    def acknowledge(self) -> None:
-        """End a START_MISMATCH: the next command may begin where the robot stands."""
-        self.output.acknowledge()
+    def acknowledge(self, now_s: float) -> None:
+        """End a START_MISMATCH: the next command may begin where the robot stands.
+
+        What moves the robot goes on, and the next command must begin on it.
+        """
+        path, stands = self.output.path, self._state.stands(np.arange(self._reference.n), now_s)
+        driven = path is not None and path.live(now_s)
+        if self.stream.runs(now_s) or (driven and not (stands and self._state.scaling == 1.0)):
+            self.output.mismatch = ""
+        elif self.output.mismatch:
+            self.output.acknowledge(now_s)
+            self.stream.phase = Phase.IDLE
         self._stamps.clear()
 
     def take_over(self) -> None:
@@ -353,8 +362,10 @@ class CorrectionSession:
         index = self._state.index(tuple(names[i] for i in known)) if known else np.zeros(0, int)
         before = self._state.scaling
         self._state.controller(index, position[known], scaling, now_s)
-        if self.output.path is not None and self._state.scaling != before:
-            self.output.path.scale(self._state.scaling, now_s)
+        path = self.output.path if self._state.scaling != before else None
+        while path is not None:  # the one that it may go on with, too
+            path.scale(self._state.scaling, now_s)
+            path = path.replaced
 
     # ---- what is said of it ---------------------------------------------------------------------
 

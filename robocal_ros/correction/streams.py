@@ -174,7 +174,8 @@ class TargetStream:
             speed = np.abs(self._goal - self._last) / self._interval_s
         spare = np.maximum(self._fastest - speed, 0.0)[chosen] * CATCH_UP_S
         ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
-        if pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):
+        known = np.isfinite(ahead).all() and np.isfinite(moved).all()
+        if not known or pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):
             self.phase = Phase.IDLE
 
     def _begin(self, new: Index, q: Array, now_s: float) -> None:
@@ -330,14 +331,15 @@ class TargetStream:
         """What must go out now without a message; None when nothing must."""
         if self._command is None:
             return None
-        if self.phase is Phase.ENDING:
-            return self._slowed(self._command, now_s)
         if self.phase is Phase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
             command = replace(self._command, position=self._goal[self._index], velocity=None)
             self._note_way(self._goal.copy(), now_s)
-            self._advance(now_s)
-            return self._message(command)
-        return None
+            try:
+                self._advance(now_s)
+                return self._message(command)
+            except RefusedError as error:  # another model has come, or the bounds are narrower
+                self.end(error, now_s)
+        return self._slowed(self._command, now_s) if self.phase is Phase.ENDING else None
 
     def _slowed(self, command: JointCommand, now_s: float) -> JointCommand | None:
         """The slow-down, as far as it is by the time since the last output."""

@@ -208,12 +208,22 @@ class EndpointNode(LifecycleNode):
     ) -> Timer:
         """Call back every ``period_s`` of ROS time while active, until cleanup.
 
-        ``steady``: of the steady clock, which runs on when a simulation stops.
+        A defect in the callback is logged; it does not end the node. ``steady``: of the steady
+        clock, which runs on when a simulation stops.
         """
+
+        def tick() -> None:
+            if not self.is_active:
+                return
+            try:
+                callback()
+            except Exception as error:
+                words = f"{''.join(traceback.format_exception(error))}"
+                if self._log_limit.allows("timer", words, time.monotonic()):
+                    self.get_logger().error(f"a defect of this software, please report:\n{words}")
+
         clock = Clock(clock_type=ClockType.STEADY_TIME) if steady else None
-        timer = self.create_timer(
-            period_s, lambda: callback() if self.is_active else None, clock=clock
-        )
+        timer = self.create_timer(period_s, tick, clock=clock)
         self._release.append(lambda: self.destroy_timer(timer))
         return timer
 

@@ -71,7 +71,7 @@ def test_after_a_mismatch_nothing_goes_out_until_it_is_acknowledged() -> None:
     assert np.array_equal(robot.read(HOME).position, HOME)
     robot.session.enable(True)  # is no look at the robot
     assert robot.session.status().mismatch
-    robot.session.acknowledge()
+    robot.session.acknowledge(robot.now)
     assert not robot.session.status().mismatch
     assert np.array_equal(robot.stream(), HOME)
     assert robot.session.status().refused[Reason.START_MISMATCH] == 3

@@ -165,7 +165,7 @@ def test_streams_through_anything(
             except RefusedError:
                 slow_down(robot, watch)
                 robot.rest()
-                robot.session.acknowledge()
+                robot.session.acknowledge(robot.now)
                 # a program that begins anew, where the robot stands by its un-corrected readings
                 here = robot.session.reading(JointCommand(NAMES, robot.at), robot.now).position
                 centre, t = here.copy(), 0.0

@@ -60,7 +60,7 @@ def test_time_that_goes_backwards(warm: Robot) -> None:
     command = replace(command, time_from_start_s=np.array([-0.1, 1.0, 2.0]))
     refused(Reason.TIME_BACKWARDS, session.trajectory, command, warm.now)
     # after a look by the operator any source time will do
-    session.acknowledge()
+    session.acknowledge(warm.now)
     warm.stream(stamp_ns=5)
 
 

@@ -16,6 +16,7 @@ from correction_robot import (
     Robot,
     bent_tool,
     drifted,
+    good_here_only,
     large,
     offer,
     refused,
@@ -25,7 +26,7 @@ from correction_robot import (
 
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
-from robocal_ros.correction.refusals import Reason
+from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.session import CorrectionSession
 
 PAUSES_S = 0.2, 0.5, 0.8
@@ -104,7 +105,7 @@ def test_a_turn_that_the_controller_counts_is_no_start() -> None:
     session.controller(NAMES, HOME, 1.0, 100.0)
     turned = HOME + 4.0 * np.pi * free
     refused(Reason.START_MISMATCH, session.target, JointCommand(NAMES, turned), 100.0)
-    session.acknowledge()
+    session.acknowledge(100.0)
     refused(Reason.START_MISMATCH, session.trajectory, still(turned), 100.0)
 
 
@@ -153,3 +154,92 @@ def test_a_goal_that_was_rejected_breaks_no_stream() -> None:
     q[0] += np.radians(20.0) * DT
     step = robot.stream(q) - before
     assert step[0] == pytest.approx(np.radians(20.0) * DT, rel=0.01)
+
+
+# ---- what a person acknowledges while something moves --------------------------------------------
+
+
+def elsewhere() -> TrajectoryCommand:
+    return TrajectoryCommand(NAMES, HOME + 0.9 + np.zeros((2, 6)), np.array([0.0, 5.0]))
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.05, 0.3, 0.8])
+def test_acknowledged_in_a_stream_the_next_target_does_not_jump(pause_s: float) -> None:
+    robot = Robot()
+    for _ in range(30):
+        robot.stream()
+    refused(Reason.START_MISMATCH, robot.session.trajectory, elsewhere(), robot.now)
+    robot.session.acknowledge(robot.now)
+    if pause_s:
+        robot.rest(pause_s)
+    before = robot.at.copy()
+    far = HOME + np.radians(25.0)
+    with pytest.raises(RefusedError):
+        robot.stream(far)
+    assert np.array_equal(robot.at, before)
+
+
+def test_acknowledged_on_a_path_the_robot_can_still_be_stopped() -> None:
+    robot = large()
+    session = robot.session
+    session.trajectory(swing(), robot.now)
+    path = session.output.path
+    for _ in range(280):
+        robot.now += DT
+        robot.at = path.place(robot.now)
+        before = robot.read(robot.at).position
+    refused(Reason.START_MISMATCH, session.trajectory, elsewhere(), robot.now)
+    session.acknowledge(robot.now)
+    robot.now += DT
+    robot.at = path.place(robot.now)
+    assert np.abs(robot.read(robot.at).position - before).max() < 4e-3  # 1 rad/s
+    assert session.stop(robot.now, 0.06) is not None
+
+
+def test_acknowledged_at_rest_readings_are_what_they_were() -> None:
+    robot = large()
+    session = robot.session
+    path = still(HOME, 0.0, 20.0)
+    robot.at = session.trajectory(path, robot.now).position[-1]
+    robot.now += 20.0
+    robot.rest()
+    refused(Reason.START_MISMATCH, session.trajectory, elsewhere(), robot.now)
+    session.acknowledge(robot.now)
+    assert np.abs(robot.at - HOME).max() > 1e-3
+    assert robot.read(robot.at).position == pytest.approx(HOME, abs=1e-9)
+    assert robot.stream(HOME) == pytest.approx(robot.at, abs=1e-3)
+
+
+def test_a_stream_that_catches_up_where_the_model_is_too_large_is_ended() -> None:
+    arm, far = good_here_only()
+    robot = Robot()
+    session = robot.session
+    session.offer_model(offer(arm))
+    step = (far - HOME) / np.linalg.norm(far - HOME) * np.radians(60.0)
+    q = HOME.copy()
+    robot.stream(q)
+    for _ in range(300):
+        q = q + step * DT
+        robot.stream(q)
+    q = q + step * 0.06
+    robot.now += 0.056
+    robot.stream(q)
+    assert session.stream.lag_s > 0.0
+    session.enable(True)
+    speeds = []
+    for _ in range(400):
+        robot.now += DT
+        robot.read(robot.at)
+        if (command := session.stream.tail(robot.now)) is not None:
+            before = robot.at.copy()
+            robot.go(command)
+            speeds.append(np.abs(robot.at - before).max() / DT)
+    assert not session.stream.runs(robot.now)
+    assert speeds
+    assert speeds[-1] < 0.1 * max(speeds)
+
+
+def test_velocities_of_another_number_are_refused() -> None:
+    robot = Robot()
+    robot.stream()
+    refused(Reason.WRONG_SIZE, robot.stream, HOME, velocity=np.zeros(5))
