@@ -303,11 +303,8 @@ class Output:
         self.mismatch = f"{detail}; call ~/acknowledge when it may begin there"
         return RefusedError(Reason.START_MISMATCH, self.mismatch)
 
-    def acknowledge(self, now_s: float) -> None:
-        """The next command may begin where the robot stands; readings are what they were."""
-        self.take_up(now_s)
-        if self.path is not None:
-            self.stage = self.path.stage
+    def acknowledge(self) -> None:
+        """The next command may begin where the robot stands."""
         self.mismatch, self.path = "", None
         self._track.clear()
         self.taught[:], self.out[:] = np.nan, np.nan

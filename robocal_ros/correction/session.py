@@ -125,7 +125,7 @@ class CorrectionSession:
         if self.stream.runs(now_s) or (driven and not (stands and self._state.scaling == 1.0)):
             self.output.mismatch = ""
         elif self.output.mismatch:
-            self.output.acknowledge(now_s)
+            self.output.acknowledge()
             self.stream.phase = Phase.IDLE
         self._stamps.clear()
 

@@ -196,20 +196,6 @@ def test_acknowledged_on_a_path_the_robot_can_still_be_stopped() -> None:
     assert session.stop(robot.now, 0.06) is not None
 
 
-def test_acknowledged_at_rest_readings_are_what_they_were() -> None:
-    robot = large()
-    session = robot.session
-    path = still(HOME, 0.0, 20.0)
-    robot.at = session.trajectory(path, robot.now).position[-1]
-    robot.now += 20.0
-    robot.rest()
-    refused(Reason.START_MISMATCH, session.trajectory, elsewhere(), robot.now)
-    session.acknowledge(robot.now)
-    assert np.abs(robot.at - HOME).max() > 1e-3
-    assert robot.read(robot.at).position == pytest.approx(HOME, abs=1e-9)
-    assert robot.stream(HOME) == pytest.approx(robot.at, abs=1e-3)
-
-
 def test_a_stream_that_catches_up_where_the_model_is_too_large_is_ended() -> None:
     arm, far = good_here_only()
     robot = Robot()
