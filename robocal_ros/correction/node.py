@@ -174,10 +174,14 @@ class JointCorrectionNode(HouseNode):
                 )
             self._proxy.open(self.settings[ACTION], self._session)
         commands = {self._outputs[topic].topic_name: 1 for topic in (TRAJECTORY, TARGETS, COMMANDS)}
+        actions = {} if self._proxy is None else self._proxy.clients
+        # A controller takes trajectories beside its action, on a topic that nobody here publishes.
+        beside = {f"{name.rpartition('/')[0]}/{TRAJECTORY}": 0 for name in actions}
+        beside.pop(self.resolve_topic_name(TRAJECTORY), None)  # the program's, which comes in here
         self._graph = GraphWatch(
             self,
-            commands,
-            {} if self._proxy is None else self._proxy.clients,
+            beside | commands,
+            actions,
             JointSources(self, self.resolve_topic_name(STATES), self._arm_names),
             self._leases,
             self.resolve_topic_name(LEASE),

@@ -241,12 +241,15 @@ class Output:
     def begin_at(self, index: Index, q: Array, begins: Array, now_s: float) -> Array:
         """Offsets (k,) with which joints may begin at once at taught ones ``q`` (n,).
 
-        The controller must be where they begin with an offset between the last one and those that
-        a robot may show, ``begins`` (r, n). Raises `RefusedError` as `place`, and when it is
-        elsewhere.
+        The controller must be where they begin with an offset between the last one, the one that
+        readings are un-corrected with, and those that a robot may show, ``begins`` (r, n). Raises
+        `RefusedError` as `place`, and when it is elsewhere.
         """
         place, exact = self.place(index, q[index], now_s)
-        offset, beside = self._taken_up(index, place - q[index], begins, exact=exact)
+        here = self._state.measured.copy()
+        here[index] = place
+        known = np.vstack([begins, here - self.uncorrected(here, now_s)])  # as readings are told
+        offset, beside = self._taken_up(index, place - q[index], known, exact=exact)
         if np.any(beside > 1.0):
             j = int(np.argmax(beside))
             raise self.refuse(
@@ -303,9 +306,12 @@ class Output:
         self.mismatch = f"{detail}; call ~/acknowledge when it may begin there"
         return RefusedError(Reason.START_MISMATCH, self.mismatch)
 
-    def acknowledge(self) -> None:
-        """The next command may begin where the robot stands."""
+    def acknowledge(self, now_s: float) -> None:
+        """The next command may begin where the robot stands; readings are told as before."""
+        self.take_up(now_s)
+        self.stage, _ = self.correction(now_s)
         self.mismatch, self.path = "", None
+        self.limiter.state[OFFSET_RATE] = 0.0
         self._track.clear()
         self.taught[:], self.out[:] = np.nan, np.nan
 

@@ -46,6 +46,9 @@ AHEAD_S = 0.02  # a source's clock may run ahead by so much from one message to 
 # What is dropped without ending a stream, as it is not the stream's: unless nothing came for so
 # many periods, and it is in the place of the next message.
 INSTEAD = 0.75
+# What less of the offset is withheld between the points of a path, rad (prismatic: m), is below
+# what a robot repeats: 10 um at 1 m.
+COME_IN = 1e-5
 DROPPED = {Reason.TIME_BACKWARDS, Reason.OWN_OUTPUT}
 
 
@@ -125,7 +128,7 @@ class CorrectionSession:
         if self.stream.runs(now_s) or (driven and not (stands and self._state.scaling == 1.0)):
             self.output.mismatch = ""
         elif self.output.mismatch:
-            self.output.acknowledge()
+            self.output.acknowledge(now_s)
             self.stream.phase = Phase.IDLE
         self._stamps.clear()
 
@@ -445,9 +448,10 @@ class CorrectionSession:
         memory, places = output.limiter.memory, self._places()
         at_s = np.inf if now_s is None else now_s
         stage, withheld = output.correction(at_s)
-        settled = stage is desired.stage and bool(np.all(np.abs(withheld) <= SETTLED))
-        if output.path is None and not np.isfinite(output.out).any():  # nothing was put out
-            settled = True
+        come_in = SETTLED if output.path is None else COME_IN
+        settled = stage is desired.stage and bool(np.all(np.abs(withheld) <= come_in))
+        if output.path is None and stage is None and not withheld.any():  # nothing was put out
+            settled = settled or not np.isfinite(output.out).any()
         return CorrectionStatus(
             enabled=self._enabled,
             active=desired.stage is not None or stage is not None or not settled,

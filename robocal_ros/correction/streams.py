@@ -24,6 +24,7 @@ from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.stepping import ADDS, TOO_FAST
+from robocal_ros.storage.robots import FULL_SPEED_IN_S
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
@@ -33,6 +34,7 @@ INTERVALS = 15  # whose median is the period
 # no less than this share of the joints' speeds, which counts where the stream stands.
 CATCH_UP, LEAST = 1.05, 0.1
 SPEED_S = 0.2  # in which the stream's own speed is looked at
+SPARE = 1.0  # rad/s (prismatic: m/s): so much faster than its stream a joint without a limit may be
 LATE = 0.8  # of `CATCH_UP_S`: one that lags more catches up at the joints' speeds
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
 
@@ -63,6 +65,7 @@ class TargetStream:
         self._arm, self._config, self._state = arm, config, state
         self._desired, self._output = desired, output
         self._fastest, self._slowdown = config.velocity_limits, config.acceleration_limits
+        self._unlimited = ~np.isfinite(self._fastest)
         self._speeds = np.tile(config.velocity_limits, (2, 1))  # of the joints, in a step and ever
         self._velocity = np.zeros(arm.n)  # of the newest message
         self.phase, self.lag_s = Phase.IDLE, 0.0
@@ -172,7 +175,8 @@ class TargetStream:
         speed = np.zeros(self._arm.n)
         if self._interval_s > 0.0:
             speed = np.abs(self._goal - self._last) / self._interval_s
-        spare = np.maximum(self._fastest - speed, 0.0)[chosen] * CATCH_UP_S
+        fastest = np.where(self._unlimited, speed + SPARE, self._fastest)
+        spare = np.maximum(fastest - speed, 0.0)[chosen] * CATCH_UP_S
         ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
         known = np.isfinite(ahead).all() and np.isfinite(moved).all()
         if not known or pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):
@@ -203,8 +207,9 @@ class TargetStream:
         self._spare[:] = output.out
         self._held_up = longest < elapsed or (self._held_up and self.lag_s > 0.0)
         self._speeds[0] = self._fastest
-        if self._held_up and self.lag_s < LATE * CATCH_UP_S:
-            self._speeds[0] = self._catching_up(elapsed, longest)
+        if self._held_up:
+            late = self.lag_s >= LATE * CATCH_UP_S
+            self._speeds[0] = self._pace() if late else self._catching_up(elapsed, longest)
         q, fraction, given = self._goal, 1.0, (output.limiter, self._active, self._speeds)
         for _ in range(TRIES):
             share = self._desired.put_out(q, self._velocity, (elapsed, longest), *given)
@@ -224,8 +229,7 @@ class TargetStream:
         output.stage = self._desired.stage if self._desired.made else None
         self.lag_s = 0.0
         if fraction < 1.0:
-            ahead = np.abs(self._goal - output.taught) * self._active / self._fastest
-            self.lag_s = float(np.max(ahead))
+            self.lag_s = self._ahead_s()
 
     def _note_way(self, q: Array, now_s: float) -> None:
         """Keep a target; of several in a burst the last one, at the time of the first."""
@@ -237,25 +241,38 @@ class TargetStream:
         while len(way) > 2 and way[1][0] <= now_s - SPEED_S:
             way.popleft()
 
+    def _own_speed(self) -> Array:
+        """How fast its targets moved lately (n,)."""
+        (begin_s, begin), (end_s, end) = self._way[0], self._way[-1]
+        return np.abs(end - begin) / (end_s - begin_s) if end_s > begin_s else 0.0 * end
+
+    def _pace(self) -> Array:
+        """The joints' speeds (n,); of those without a limit what is taken for one."""
+        if not self._unlimited.any():
+            return self._fastest
+        return np.where(self._unlimited, self._own_speed() + SPARE, self._fastest)
+
+    def _ahead_s(self) -> float:
+        """How long the joints need from what was put out to what came in."""
+        way = np.abs(self._goal - self._output.taught) * self._active
+        return float(np.max(way / self._pace()))
+
     def _catching_up(self, elapsed_s: float, longest_s: float) -> Array:
         """Speeds (n,) of a step, so that what a controller's cycle adds up is no burst.
 
         Messages that were late or early share their time, but none uses more than a period.
         """
-        (begin_s, begin), (end_s, end) = self._way[0], self._way[-1]
-        speed = np.abs(end - begin) / (end_s - begin_s) if end_s > begin_s else 0.0 * end
         period = self._step_period_s()
         credit = longest_s if longest_s < elapsed_s else self._credit_s + elapsed_s
         usable = min(credit, period)
         self._credit_s = min(credit, 1.5 * period) - usable
-        speed = np.maximum(CATCH_UP * speed, LEAST * self._fastest)
+        speed = np.maximum(CATCH_UP * self._own_speed(), LEAST * self._pace())
         share = usable / longest_s if longest_s > 0.0 else 0.0
         return np.minimum(speed * share, self._fastest)
 
     def _require_near(self, longest_s: float) -> None:
         """Refuse a target that the joints do not come near: none of the way there goes out."""
-        ahead = np.abs(self._goal - self._output.taught) * self._active / self._fastest
-        ahead_s = float(np.max(ahead)) - longest_s
+        ahead_s = self._ahead_s() - longest_s
         if ahead_s > CATCH_UP_S:
             raise RefusedError(
                 Reason.VELOCITY_LIMIT,
@@ -314,7 +331,10 @@ class TargetStream:
         if self._step_s > 0.0 and not self._holds(now_s - output.out_s):
             # a message that came early is no faster motion
             speed = (output.out - self._before)[index] / max(self._step_s, self._step_period_s())
-        lasts = np.max(np.abs(speed) / self._slowdown[index], initial=0.0)
+        slowdown = self._slowdown
+        if self._unlimited.any():
+            slowdown = np.where(np.isfinite(slowdown), slowdown, self._pace() / FULL_SPEED_IN_S)
+        lasts = np.max(np.abs(speed) / slowdown[index], initial=0.0)
         self.lag_s = 0.0
         if not 0.0 < lasts < np.inf:
             self.phase = Phase.IDLE

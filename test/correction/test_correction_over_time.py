@@ -1,5 +1,7 @@
 """Whatever happens in whatever order: offset and commands move within their limits in time."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from correction_robot import (
@@ -236,23 +238,55 @@ def test_at_rest_the_offset_comes_in_as_fast_as_it_may_and_no_faster() -> None:
     assert np.array_equal(out[-1], out[-2])
 
 
-def test_a_stall_is_not_made_up_for_in_a_burst() -> None:
+NO_LIMITS = {"velocity_limits": np.array([np.inf]), "acceleration_limits": np.array([np.inf])}
+
+
+@pytest.mark.parametrize("stall_s", [0.05, 0.06, 0.084])
+@pytest.mark.parametrize("limits", [LIMITS, NO_LIMITS], ids=["limits", "no limits"])
+def test_a_stall_is_not_made_up_for_in_a_burst(
+    limits: dict[str, np.ndarray], stall_s: float
+) -> None:
     """Only the newest of what waited is heard; no step is much longer than the stream's own."""
     speed = np.radians(60.0)
-    robot, q = under_way(speed)
-    for stall in (0.05, 0.06):
-        q[0] += speed * stall
-        before = robot.at[0]
-        robot.stream(q, dt=stall)
-        assert 0.0 < robot.at[0] - before <= 1.06 * speed * DT
-        steps = 0
-        while robot.at[0] != q[0]:
-            q[0] += speed * DT
-            before, steps = robot.at[0], steps + 1
-            robot.stream(q)
-            assert robot.at[0] - before <= 1.06 * speed * DT
-        assert steps * DT < 1.3
-        assert robot.session.status().lag_s == 0.0
+    robot, q = under_way(speed, **limits)
+    q[0] += speed * stall_s
+    before = robot.at[0]
+    robot.stream(q, dt=stall_s)
+    assert 0.0 < robot.at[0] - before <= 1.06 * speed * DT
+    steps = 0
+    while robot.at[0] != q[0]:
+        q[0] += speed * DT
+        before, steps = robot.at[0], steps + 1
+        robot.stream(q)
+        assert robot.at[0] - before <= 1.06 * speed * DT
+    assert steps * DT < 1.3 * stall_s / 0.05  # at 1.05 of the speed it takes 20 times the stall
+    assert robot.session.status().lag_s == 0.0
+
+
+def test_without_limits_nothing_is_enabled_and_a_stream_is_ended_in_order() -> None:
+    robot, q = under_way(**NO_LIMITS)
+    said = refused(Reason.NO_SPEED_LIMITS, robot.session.enable, True)
+    assert "joint_a1" in said
+    assert "velocity_limits" in said
+    assert not robot.session.status().enabled
+    refused(Reason.NOT_FINITE, robot.stream, np.full(6, np.nan))
+    speeds = [np.radians(60.0)]
+    while (command := robot.session.stream.tail(robot.now)) is not None:
+        speeds.append((command.position[0] - robot.at[0]) / DT)
+        robot.go(command)
+        robot.now += DT
+    assert len(speeds) * DT > 0.1
+    assert np.all(np.diff(speeds[1:]) < 0.0)
+    assert speeds[-1] < np.radians(5.0)
+
+
+def test_without_limits_a_stream_after_a_long_pause_does_not_jump() -> None:
+    robot, q = under_way(**NO_LIMITS)
+    q[0] += np.radians(60.0) * 0.5
+    before = robot.at.copy()
+    robot.rest(0.49)
+    refused(Reason.START_MISMATCH, robot.stream, q, dt=0.01)
+    assert np.array_equal(robot.at, before)
 
 
 def test_after_a_long_stall_the_stream_is_held_and_looked_at() -> None:
@@ -282,9 +316,9 @@ BAD = {
 }
 
 
-def under_way(speed: float = np.radians(60.0)) -> tuple[Robot, np.ndarray]:
+def under_way(speed: float = np.radians(60.0), **config: Any) -> tuple[Robot, np.ndarray]:
     """A stream at a constant speed of joint 1, and its last target."""
-    robot, q = Robot(rested=False), BEGIN.copy()
+    robot, q = Robot(rested=False, **config), BEGIN.copy()
     robot.at = q.copy()
     robot.rest()
     robot.stream(q)

@@ -230,6 +230,22 @@ def test_a_second_correction_node_by_accident_ends_the_stream(line: Moving) -> N
     assert f"{NODE} publishes {OUTPUT}" in seen[-1].commanders
 
 
+def test_beside_the_action_nobody_publishes_the_controller_s_own_topic(graph: Any) -> None:
+    """A controller takes trajectories there too, whatever a goal's correction is."""
+    beside = "/arm_controller/joint_trajectory"
+    action = "/arm_controller/follow_joint_trajectory"
+    told = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
+    graph.start("joint_correction_node", {"serial": "s1", "follow_joint_trajectory": action})
+    graph.spin_until(lambda: told and not told[-1].commanders, "nobody else commands", 20.0)
+    stranger = graph.probe.create_publisher(JointTrajectory, beside, qos.RELIABLE)
+    graph.spin_until(
+        lambda: told[-1].state == CorrectionStatus.OTHER_COMMANDER, f"told of {beside}"
+    )
+    assert f"publishes {beside}" in told[-1].commanders
+    graph.probe.destroy_publisher(stranger)
+    graph.spin_until(lambda: not told[-1].commanders, "it has gone")
+
+
 @pytest.mark.parametrize("how", ["streams", "drives"])
 def test_a_lease_ends_the_programs_motion_and_is_over_when_it_is_not_renewed(
     line: Moving, how: str

@@ -43,8 +43,7 @@ class Stream:
     def __init__(self, graph: Any, controller: Controlled, profiles: Path) -> None:
         self.graph, self.controller, self._profiles = graph, controller, profiles
         probe = graph.probe
-        probe.destroy_publisher(controller.topic)  # the node alone commands the controller
-        controller.action.destroy()
+        controller.action.destroy()  # the node alone commands the controller
         self.sent: list[JointTrajectory] = graph.collect(
             JointTrajectory, f"{NODE}/joint_trajectory", qos.RELIABLE
         )

@@ -18,11 +18,15 @@ class Sleeper(HouseNode):
     def configure(self):
         self.add_service(Trigger, "~/ping", self.on_ping)
         self.add_service(Trigger, "~/break", self.on_break)
+        self.add_service(Trigger, "~/break_unguarded", self.on_break_unguarded)
     def on_ping(self, request, response):
         response.success = True
         return response
     def on_break(self, request, response):
         self.add_timer(0.01, lambda: 1 / 0)
+        return response
+    def on_break_unguarded(self, request, response):
+        self.create_timer(0.01, lambda: 1 / 0)
         return response
     def cleanup(self):
         print("released", flush=True)
@@ -47,9 +51,20 @@ def test_ends_cleanly_at_a_signal(graph: Any, script: Path, by: signal.Signals) 
     assert "Traceback" not in sleeper.output
 
 
-def test_a_bug_ends_the_process_and_says_where(graph: Any, script: Path) -> None:
+def test_a_bug_in_a_timer_is_told_and_the_node_lives_on(graph: Any, script: Path) -> None:
     sleeper = graph.start(script)
-    client = graph.probe.create_client(Trigger, "/sleeper/break")
+    graph.call(Trigger, "/sleeper/break")
+    graph.spin_until(lambda: "ZeroDivisionError" in sleeper.output, "the bug is logged")
+    assert graph.call(Trigger, "/sleeper/ping").success
+    assert sleeper.output.count("ZeroDivisionError") == 1, "told at every tick"
+    assert sleeper.stop() == 0
+
+
+def test_a_bug_that_nothing_catches_ends_the_process_and_says_where(
+    graph: Any, script: Path
+) -> None:
+    sleeper = graph.start(script)
+    client = graph.probe.create_client(Trigger, "/sleeper/break_unguarded")
     graph.spin_until(client.service_is_ready, "the service appears")
     client.call_async(Trigger.Request())
     graph.spin_until(lambda: sleeper.process.poll() is not None, "the process ends")

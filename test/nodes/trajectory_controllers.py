@@ -4,6 +4,7 @@ Real: ros2_control's node with mock hardware; simulated: `cell_sim_node`. Both u
 """
 
 from collections.abc import Iterable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +93,17 @@ class Controlled:
         graph = self.graph
         graph.spin_until(lambda: self.states and self.readings, "its state", 30.0)
         graph.spin_until(self.action.server_is_ready, "its action")
-        self.topic = graph.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
         self.scaling = graph.publisher(
             SpeedScalingFactor, f"{NODE}/speed_scaling_input", qos.LATCHED
         )
         graph.spin_for(0.3)
 
     # ---- commands -------------------------------------------------------------------------------
+
+    @cached_property
+    def topic(self) -> Any:
+        """Publisher of trajectories; from its first use on a stranger to who guards the action."""
+        return self.graph.publisher(JointTrajectory, f"{NODE}/joint_trajectory")
 
     def goal(self, message: JointTrajectory, **fields: Any) -> Any:
         """Send a goal; its handle once it is accepted or rejected."""
