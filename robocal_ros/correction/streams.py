@@ -24,7 +24,6 @@ from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.stepping import ADDS, TOO_FAST
-from robocal_ros.storage.robots import FULL_SPEED_IN_S
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
@@ -34,6 +33,7 @@ INTERVALS = 15  # whose median is the period
 # no less than this share of the joints' speeds, which counts where the stream stands.
 CATCH_UP, LEAST = 1.05, 0.1
 SPEED_S = 0.2  # in which the stream's own speed is looked at
+END_S = 0.5  # a joint without limits slows down so long from its full speed
 SPARE = 1.0  # rad/s (prismatic: m/s): so much faster than its stream a joint without a limit may be
 LATE = 0.8  # of `CATCH_UP_S`: one that lags more catches up at the joints' speeds
 TRIES = 8  # a step that is too long is shortened so often; each makes it shorter than the last
@@ -333,7 +333,7 @@ class TargetStream:
             speed = (output.out - self._before)[index] / max(self._step_s, self._step_period_s())
         slowdown = self._slowdown
         if self._unlimited.any():
-            slowdown = np.where(np.isfinite(slowdown), slowdown, self._pace() / FULL_SPEED_IN_S)
+            slowdown = np.where(np.isfinite(slowdown), slowdown, self._pace() / END_S)
         lasts = np.max(np.abs(speed) / slowdown[index], initial=0.0)
         self.lag_s = 0.0
         if not 0.0 < lasts < np.inf:

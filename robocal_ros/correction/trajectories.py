@@ -72,7 +72,7 @@ class TrajectoryCorrector:
         desired, result = self._desired.at(q)
         output.take_up(now_s)
         try:
-            led_from = self._begin(index, q, desired, times, now_s)
+            led_from, withheld = self._begin(index, q, desired, times, now_s)
             begin = limiter.state.copy()
             active = np.zeros(self._arm.n)
             active[index] = 1.0
@@ -95,7 +95,7 @@ class TrajectoryCorrector:
         if led_from is not None:  # until its first point: from the offset that there is now
             known_times = np.append(-starts_in_s, known_times)
             offset, rate = begin[OFFSET], begin[OFFSET_RATE]
-            first = np.stack([offset, rate, 0.0 * rate, offset - begin[DESIRED]])
+            first = np.stack([offset, rate, 0.0 * rate, withheld])
             sent = np.concatenate([first[:, None], sent], axis=1)
         path = SentPath(
             index=index,
@@ -124,9 +124,14 @@ class TrajectoryCorrector:
 
     def _begin(
         self, index: Index, q: Array, desired: Array, times: Array, now_s: float
-    ) -> Array | None:
-        """The offset that it begins with; returns where it leads in from (k,), None at once."""
+    ) -> tuple[Array | None, Array]:
+        """The offset that it begins with; where it leads in from (k,), None at once.
+
+        And what is withheld then (n,): where a path with this correction is left on its way, what
+        was on its way in there. That it went straight between its points is none of that.
+        """
         output, limiter = self._output, self._output.limiter
+        left, withheld = output.path, limiter.withheld
         if output.path is None and self._state.stands(index, now_s):  # a stream's that is over
             limiter.state[OFFSET_RATE] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
@@ -137,20 +142,22 @@ class TrajectoryCorrector:
             offset = output.begin_at(index, here, self._desired.begins(here), now_s)
             limiter.state[OFFSET, index] = offset
             limiter.state[DESIRED] = wanted
-            return None
+            return None, limiter.withheld
         self._state.require_fresh(index, now_s)
         found = output.lead_in(index, q[0], self._desired.begins(q[0]), now_s)
         if found is None:  # the controller leads in from wherever it is
             limiter.state[OFFSET], limiter.state[DESIRED] = desired[0], desired[0]
             limiter.state[OFFSET_RATE] = 0.0
-            return self._state.measured[index].copy()
+            return self._state.measured[index].copy(), limiter.withheld
         taught, offset = found
         limiter.state[OFFSET] = offset
         if taught is None:
             limiter.state[DESIRED] = desired[0]
-            return np.asarray((q[0] + offset)[index])
+            return np.asarray((q[0] + offset)[index]), limiter.withheld
         limiter.state[DESIRED] = self._desired.begins(taught)[0]
-        return np.asarray((taught + offset)[index])
+        if left is None or not left.live(now_s) or left.stage is not self._desired.stage:
+            withheld = limiter.withheld
+        return np.asarray((taught + offset)[index]), withheld
 
     def _require_end(self, withheld: Array, active: Array) -> None:
         """Refuse a path at whose last point the offset is not the desired one."""

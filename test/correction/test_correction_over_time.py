@@ -26,12 +26,17 @@ from correction_robot import (
 )
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 
 WIDE = {"thermal": CorrectionConfig().tool}  # bounds that let large drifts through
+
+
+BEGINS = np.inf  # for the rate of an offset
 
 
 class Watch:
@@ -41,7 +46,6 @@ class Watch:
         self.robot = robot
         self.last: dict[int, tuple[float, float]] = {}  # joint: when, out
         self.offsets: dict[int, tuple[float, float, float]] = {}  # when, offset, rate
-        self.steps = 0
 
     def out(self, names: tuple[str, ...], out: np.ndarray) -> None:
         """Positions that went out now: no joint is faster than it may be."""
@@ -65,12 +69,19 @@ class Watch:
                 dt = now - at
                 new = (offset - before) / dt
                 assert abs(new) <= FASTEST + ROUNDING / dt
-                if dt <= 1.5 * DT and np.isfinite(rate):
-                    assert abs(new - rate) <= LARGEST_A * dt + 2.0 * ROUNDING / dt, name
-                    self.steps += 1
-                self.offsets[j] = now, offset, new if dt <= 1.5 * DT else np.nan
+                # after two periods without a message the controller holds, and the robot stands
+                held = dt > 2.0 * DT + ROUNDING
+                if np.isfinite(rate):
+                    goes_on = abs(new - rate) <= LARGEST_A * dt + 2.0 * ROUNDING / dt
+                    from_rest = abs(offset - before) <= LARGEST_A * dt * dt + ROUNDING
+                    assert goes_on or (held and from_rest), name
+                self.offsets[j] = now, offset, 0.0 if rate == BEGINS else np.nan if held else new
             else:
                 self.offsets[j] = now, offset, 0.0
+
+    def ended(self) -> None:
+        """What comes next begins at rest with what offset it finds, which is no rate."""
+        self.offsets = {j: (at, offset, BEGINS) for j, (at, offset, _) in self.offsets.items()}
 
     def forget(self) -> None:
         """Nothing was commanded for a while: offsets are those of what begins anew."""
@@ -81,7 +92,8 @@ EVENT = st.tuples(
     st.sampled_from(
         [
             "on", "off", "model", "nominal", "tool", "nan", "beyond", "some", "stall",
-            "pause", "backwards", "held", "nothing", "path",
+            "pause", "backwards", "held", "nothing", "path", "late", "midway", "rejected",
+            "acknowledged", "stopped",
         ]
     ),
     st.integers(0, 5),
@@ -119,6 +131,62 @@ def happen(robot: Robot, watch: Watch, what: str, seed: int, revision: int, q: n
         session.hold(Reason.LEASED, "a measurement", robot.now)
         refused(Reason.LEASED, robot.stream, q)
         session.release(Reason.LEASED)
+    elif what == "late":
+        robot.now += (0.2 + 0.15 * seed) * DT
+    elif what == "rejected":
+        followed = session.output.taught.copy()
+        known = np.isfinite(followed).all()
+        path = begun(robot, still(followed, 0.0, 5.0)) if known else None
+        if path is not None:
+            session.reject(path)
+    elif what == "acknowledged":
+        refused(Reason.START_MISMATCH, session.trajectory, still(q + 0.5), robot.now)
+        session.acknowledge(robot.now)
+    elif what == "stopped":
+        assert session.stop(robot.now, 0.05) is None  # its tail does
+
+
+def begun(robot: Robot, command: TrajectoryCommand) -> SentPath | None:
+    """A trajectory that was put out now; None where there is no time for its offset."""
+    try:
+        robot.session.trajectory(command, robot.now, may_be_rejected=True)
+    except RefusedError as error:
+        if error.reason is not Reason.TOO_SHORT:
+            raise
+        return None
+    assert robot.session.output.path is not None
+    return robot.session.output.path
+
+
+def midway(robot: Robot, watch: Watch, seed: int, steps: int, q: np.ndarray) -> bool:
+    """A trajectory takes the stream's place, and is stopped on its way; whether it began."""
+    t = np.linspace(0.0, 3.0 + seed, 31)
+    u = (t / t[-1])[:, None]
+    way, speed = 3.0 * u**2 - 2.0 * u**3, 6.0 * (u - u**2) / t[-1]
+    reach = 0.05 * seed * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+    taught = TrajectoryCommand(NAMES, q + reach * way, t, reach * speed)
+    path = begun(robot, taught)
+    if path is None:
+        return False
+    begin_s, out = robot.now, TrajectoryCommand(NAMES, path.out, path.times, path.velocity)
+    splines = [CubicHermiteSpline(t, c.position, c.velocity) for c in (taught, out)]
+    for _ in range(steps):
+        robot.now += DT
+        at, robot.at = (spline(robot.now - begin_s) for spline in splines)
+        watch.out(NAMES, robot.at)
+        watch.offset(NAMES, at, robot.at)
+        robot.read(robot.at)
+    stop = robot.session.stop(robot.now, 0.05)
+    assert stop is not None
+    slows = CubicHermiteSpline(stop.time_from_start_s, stop.position, stop.velocity)
+    stopped_s, lasts_s = robot.now, stop.time_from_start_s[-1]
+    while robot.now < stopped_s + lasts_s:
+        robot.now += DT
+        t_s = robot.now - stopped_s
+        robot.at = slows(min(t_s, lasts_s)) if t_s >= 0.05 else splines[1](robot.now - begin_s)
+        watch.out(NAMES, robot.at)
+        robot.read(robot.at)
+    return True
 
 
 def slow_down(robot: Robot, watch: Watch) -> None:
@@ -146,6 +214,14 @@ def test_streams_through_anything(
     for revision, (what, seed, count) in enumerate(events, start=1):
         q = centre + 0.2 * np.sin(speed * t)
         happen(robot, watch, what, seed, revision, q)
+        if not robot.session.stream.runs(robot.now):
+            watch.ended()
+        if what == "midway" and np.isfinite(robot.session.output.out).all():
+            q = robot.session.output.taught.copy()
+            if midway(robot, watch, seed, count, q):
+                robot.rest()
+                centre, t = robot.read(robot.at).position, 0.0
+                watch.forget()
         if what == "path":
             slow_down(robot, watch)
             robot.rest()
@@ -264,7 +340,7 @@ def test_a_stall_is_not_made_up_for_in_a_burst(
 
 
 def test_without_limits_nothing_is_enabled_and_a_stream_is_ended_in_order() -> None:
-    robot, q = under_way(**NO_LIMITS)
+    robot, _ = under_way(**NO_LIMITS)
     said = refused(Reason.NO_SPEED_LIMITS, robot.session.enable, True)
     assert "joint_a1" in said
     assert "velocity_limits" in said

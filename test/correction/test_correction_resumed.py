@@ -229,3 +229,79 @@ def test_velocities_of_another_number_are_refused() -> None:
     robot = Robot()
     robot.stream()
     refused(Reason.WRONG_SIZE, robot.stream, HOME, velocity=np.zeros(5))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.02], ids=["come in", "on its way in"])
+@pytest.mark.parametrize("goes_on", ["stream", "trajectory"])
+def test_acknowledged_at_rest_readings_are_told_as_before(share: float, goes_on: str) -> None:
+    """And what begins where they say that the robot is begins there, without a step."""
+    robot = large()
+    session = robot.session
+    session.trajectory(swing(), robot.now)
+    path = session.output.path
+    assert path is not None
+    robot.now += 2.0 * share
+    robot.at = path.place(robot.now)
+    path.end(robot.now)  # somebody else stopped it there
+    robot.rest()
+    refused(Reason.START_MISMATCH, session.trajectory, elsewhere(), robot.now)
+    before = robot.read(robot.at).position
+    assert np.abs(before - robot.at).max() > np.radians(0.02)
+    session.acknowledge(robot.now)
+    taught = robot.read(robot.at).position
+    assert np.allclose(taught, before, rtol=0.0, atol=1e-12)
+    assert session.status(robot.now).settled == (share == 1.0)
+    at = robot.at.copy()
+    if goes_on == "stream":
+        robot.stream(taught)
+        assert np.abs(robot.at - at).max() <= REST * DT + ROUNDING
+    else:
+        out = session.trajectory(still(taught), robot.now)
+        assert np.abs(out.position[0] - at).max() <= ROUNDING
+
+
+@pytest.mark.parametrize("rates", [None, np.zeros((1, 6))], ids=["lines", "cubics"])
+def test_a_stream_of_single_points_has_its_offset_when_it_has_come_in(
+    rates: np.ndarray | None,
+) -> None:
+    """Each takes the last one's place on its way. Finding: it was on its way in for ever.
+
+    What is on its way in becomes less by a part of 0.04 / 0.5 with each; 0.0091 rad to 1e-5.
+    """
+    robot = large()
+    within = int(np.ceil(np.log(1e-5 / 0.0091) / np.log(1.0 - 0.04 / 0.5)))
+    for k in range(within + 30):
+        q = HOME + 0.01 * k * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+        robot.session.trajectory(
+            TrajectoryCommand(NAMES, q[None].copy(), np.array([0.5]), rates), robot.now
+        )
+        path = robot.session.output.path
+        assert path is not None
+        for _ in range(4):
+            robot.now += 0.01
+            robot.at = path.place(robot.now)
+            robot.read(robot.at)
+            if abs(k - within) > 5:
+                assert robot.session.status(robot.now).settled == (k > within)
+
+
+def test_a_pause_holds_the_path_that_goes_on_when_another_is_rejected() -> None:
+    robot = Robot()
+    session = robot.session
+    session.trajectory(swing(), robot.now)
+    first = session.output.path
+    assert first is not None
+    for _ in range(100):
+        robot.now += DT
+        robot.at = first.place(robot.now)
+        robot.read(robot.at)
+    again = replace(swing(), position=swing().position + (robot.at - HOME))
+    session.trajectory(again, robot.now, may_be_rejected=True)
+    second, paused_s = session.output.path, robot.now
+    session.controller(NAMES, robot.at, 0.0, paused_s)
+    session.controller(NAMES, robot.at, 1.0, paused_s + 10.0)
+    assert second is not None
+    session.reject(second)
+    assert session.output.path is first
+    assert np.allclose(first.place(paused_s + 10.0), robot.at, rtol=0.0, atol=1e-9)
+    assert first.live(paused_s + 10.0)
