@@ -40,7 +40,7 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import solution
-from robocal_ros.correction.rates import RATE_STEP_S
+from robocal_ros.correction.rates import RATE_STEP_S, STEP_AHEAD_S
 from robocal_ros.correction.room import work_size
 
 Array = NDArray[np.float64]
@@ -182,17 +182,23 @@ class JointCorrection:
 
 
 def path_rates(
-    corrected: Callable[[Array], Array], q: Array, velocity: Array, acceleration: Array
+    corrected: Callable[[Array], Array],
+    q: Array,
+    velocity: Array,
+    acceleration: Array | None,
+    here: Array,
 ) -> tuple[Array, Array]:
     """Rates (m, n) of ``corrected(q)`` along the path q + v t + a t^2 / 2 at t = 0.
 
-    Central differences of the shift over 0.2 ms each way.
+    ``here`` (m, n): the shift at q. Central differences of the shift over 0.2 ms each way; without
+    accelerations, of which then come none, from one side.
     """
+    if acceleration is None:
+        ahead = q + velocity * STEP_AHEAD_S
+        rate = (corrected(ahead) - ahead - here) / STEP_AHEAD_S
+        return velocity + rate, np.zeros_like(q)
     h = RATE_STEP_S
-    shift = []
-    for t in (-h, 0.0, h):
-        at = q + velocity * t + 0.5 * acceleration * t * t
-        shift.append(corrected(at) - at)
-    before, here, after = shift
+    ends = [q + velocity * t + 0.5 * acceleration * t * t for t in (-h, h)]
+    before, after = (corrected(at) - at for at in ends)
     rate = (after - before) / (2.0 * h)
     return velocity + rate, acceleration + (after - 2.0 * here + before) / h**2

@@ -176,9 +176,9 @@ class StagedCorrection:
         return q
 
     def rates(
-        self, q: Array, velocity: Array, acceleration: Array, result: StagedResult
+        self, q: Array, velocity: Array, acceleration: Array | None, result: StagedResult
     ) -> tuple[Array, Array]:
-        """Velocities and accelerations (m, n) of the corrected joints.
+        """Velocities and accelerations (m, n) of the corrected joints; without some, those alone.
 
         ``result`` is that of `correct` at ``q``. By the chain rule where all of the correction of
         six joints is made; with a weak direction, a free axis, or other numbers of joints, by
@@ -188,14 +188,20 @@ class StagedCorrection:
         out_v, out_a = np.empty(q.shape), np.empty(q.shape)
         rough = np.ones(len(q), dtype=np.bool_)
         if self.n == 6 and not self._free:
-            points, qd, qdd = plain(q), plain(velocity), plain(acceleration)
+            points, qd = plain(q), plain(velocity)
+            qdd = np.zeros_like(points) if acceleration is None else plain(acceleration)
             rates.rates_batch(
                 points, qd, qdd, plain(result.q), self._works[0], self._works[-1], out_v, out_a
             )
             rough = ~(result.whole & np.isfinite(out_v).all(axis=1))
         if np.any(rough):
+            bends = None if acceleration is None else acceleration[rough]
             out_v[rough], out_a[rough] = path_rates(
-                lambda at: self.correct(at).q, q[rough], velocity[rough], acceleration[rough]
+                lambda at: self.correct(at).q,
+                q[rough],
+                velocity[rough],
+                bends,
+                (result.q - q)[rough],
             )
         return out_v, out_a
 

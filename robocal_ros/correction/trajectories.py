@@ -181,14 +181,15 @@ class TrajectoryCorrector:
         """Derivatives (1 or 2, m, n) of the desired offset, as many as the command has."""
         if command.velocity is None:
             return None
-        given = np.zeros((2, *q.shape))
-        given[0][:, index] = command.velocity
-        if command.acceleration is not None:
-            given[1][:, index] = command.acceleration
+        bends = command.acceleration is not None
+        given = np.zeros((1 + bends, *q.shape))
+        for rows, of_command in zip(given, (command.velocity, command.acceleration), strict=False):
+            rows[:, index] = of_command
         rates = np.zeros_like(given)
         if result is not None and self._desired.stage is not None:
-            rates = np.array(self._desired.stage.rates(q, given[0], given[1], result)) - given
-        return rates if command.acceleration is not None else rates[:1]
+            out = self._desired.stage.rates(q, given[0], given[1] if bends else None, result)
+            rates = np.array(out[: len(given)]) - given
+        return rates
 
     def _follow(
         self, desired: Array, follows: Array | None, times: Array, speed: Array, active: Array
