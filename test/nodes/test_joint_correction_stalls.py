@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from joint_correction_live import NODE
-from robocal_msgs.msg import CorrectionStatus
+from joint_correction_live import NODE, drifted, model_message
+from robocal_msgs.msg import CorrectionStatus, KinematicModel
 from sensor_msgs.msg import JointState
 from stream_parts import BEGIN, PERIOD_S, WAY_RAD
 
@@ -22,7 +22,7 @@ PARTS = Path(__file__).with_name("stream_parts.py")
 DIRECT_RUNS = 10
 MOST = 1.1  # of the largest step of the direct runs
 STALLED_AT = BEGIN[0] + 0.8
-STALLS_S = 0.05, 0.15, 0.5
+STALLS = (0.05, False), (0.15, False), (0.5, False), (0.05, True), (0.15, True)  # s, corrected
 
 
 def run(graph: Any, commands: str, node: Any = None, stall_s: float = 0.0) -> np.ndarray:
@@ -50,12 +50,18 @@ def test_no_step_is_larger_than_without_the_node(graph: Any) -> None:
     direct = [run(graph, "joint_targets") for _ in range(DIRECT_RUNS)]
     allowed = MOST * max(largest_step(places) for places in direct)
     status = graph.collect(CorrectionStatus, f"{NODE}/status", qos.LATCHED)
-    for stall_s in STALLS_S:
-        node = graph.start("joint_correction_node", {"serial": "s1"})
+    models = graph.probe.create_publisher(KinematicModel, "kinematic_model", qos.LATCHED)
+    models.publish(model_message(drifted()))
+    for stall_s, on in STALLS:
+        node = graph.start("joint_correction_node", {"serial": "s1", "enable_on_start": on})
         status.clear()
-        graph.spin_until(lambda: status, "the node's status", 20.0)
+        graph.spin_until(
+            lambda: status and status[-1].model_revision and status[-1].enabled == on,
+            "the node's status",
+            20.0,
+        )
         places = run(graph, f"{NODE}/joint_targets", node, stall_s)
-        assert largest_step(places) <= allowed
-        if stall_s == STALLS_S[0]:  # it goes on, and is there in the end
+        assert largest_step(places) <= allowed, (stall_s, on)
+        if stall_s == STALLS[0][0]:  # it goes on, and is there in the end
             assert np.ptp(places[:, 1]) == pytest.approx(WAY_RAD, abs=0.02)
         node.stop()
