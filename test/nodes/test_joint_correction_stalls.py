@@ -40,6 +40,18 @@ def run(graph: Any, commands: str, node: Any = None, stall_s: float = 0.0) -> np
     return np.array(json.loads(robot.output.splitlines()[-1]))
 
 
+def started(graph: Any, status: list[CorrectionStatus], on: bool) -> Any:
+    """The node, which has taken the model over."""
+    node = graph.start("joint_correction_node", {"serial": "s1", "enable_on_start": on})
+    status.clear()
+    graph.spin_until(
+        lambda: status and status[-1].model_revision and status[-1].enabled == on,
+        "the node's status",
+        20.0,
+    )
+    return node
+
+
 def largest_step(places: np.ndarray) -> float:
     """From one of the robot's cycles to the next; those that the machine left out count."""
     cycles = np.maximum(np.round(np.diff(places[:, 0]) / PERIOD_S), 1.0)
@@ -53,13 +65,7 @@ def test_no_step_is_larger_than_without_the_node(graph: Any) -> None:
     models = graph.probe.create_publisher(KinematicModel, "kinematic_model", qos.LATCHED)
     models.publish(model_message(drifted()))
     for stall_s, on in STALLS:
-        node = graph.start("joint_correction_node", {"serial": "s1", "enable_on_start": on})
-        status.clear()
-        graph.spin_until(
-            lambda: status and status[-1].model_revision and status[-1].enabled == on,
-            "the node's status",
-            20.0,
-        )
+        node = started(graph, status, on)
         places = run(graph, f"{NODE}/joint_targets", node, stall_s)
         assert largest_step(places) <= allowed, (stall_s, on)
         if stall_s == STALLS[0][0]:  # it goes on, and is there in the end
