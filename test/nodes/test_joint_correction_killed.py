@@ -43,7 +43,8 @@ class Stream:
     def __init__(self, graph: Any, controller: Controlled, profiles: Path) -> None:
         self.graph, self.controller, self._profiles = graph, controller, profiles
         probe = graph.probe
-        controller.action.destroy()  # the node alone commands the controller
+        probe.destroy_publisher(controller.topic)  # the node alone commands the controller
+        controller.action.destroy()
         self.sent: list[JointTrajectory] = graph.collect(
             JointTrajectory, f"{NODE}/joint_trajectory", qos.RELIABLE
         )
