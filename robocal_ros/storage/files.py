@@ -2,6 +2,7 @@
 
 import difflib
 import os
+import threading
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -67,6 +68,11 @@ def read_text(path: Path, what: str) -> str:
     return text
 
 
+def draft_beside(path: Path) -> Path:
+    """What is to become ``path``, of this thread alone: nodes in one process may share a file."""
+    return path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}")
+
+
 def write_text(path: Path, text: str, *, durable: bool = False) -> None:
     """Write a whole file or nothing: a reader never sees one that is half-written.
 
@@ -77,7 +83,7 @@ def write_text(path: Path, text: str, *, durable: bool = False) -> None:
     InputError
         When the file cannot be written.
     """
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = draft_beside(path)
     try:
         with draft.open("w", encoding="utf-8", newline="") as stream:
             stream.write(text)

@@ -7,7 +7,6 @@ the samples' names.
 """
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from robocal_ros.core.point_clouds import cloud_points
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.storage.bag_writer import BagWriter, ros_time
 from robocal_ros.storage.bags import BagInfo, BagMessage, BagReader
+from robocal_ros.storage.files import draft_beside
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]
@@ -60,7 +60,7 @@ def write_data_set(
     rows = [{name: row[name] for name in row if name not in apart} for row in samples]
     made_with = {"robot": arm.name, "model_hash": arm.model_hash, "sensor_frame": frame}
     text = json.dumps({**document, **made_with, "samples": rows}, allow_nan=False)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = draft_beside(path)
     try:
         with BagWriter(draft) as writer:
             start_ns = rows[0]["stamp_ns"] if rows else 0

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros.core.errors import InputError, StateLostError, StorageError
-from robocal_ros.storage.files import read_text, sync_folder, write_text
+from robocal_ros.storage.files import draft_beside, read_text, sync_folder, write_text
 from robocal_ros.storage.history_paths import made_folder_beside
+
+STATE = "state.json"
 
 
 class StateFile:
@@ -20,12 +22,28 @@ class StateFile:
     """
 
     def __init__(self, history: Path, name: str) -> None:
-        is_new = not (history.with_suffix("") / name).exists()
-        self.path = made_folder_beside(history, name) / "state.json"
-        if is_new:  # from now on a file that is missing was lost
-            self.save({})
-            for folder in (self.path.parent.parent, history.parent):
-                self._sync(folder)
+        folder = history.with_suffix("") / name
+        self.path = folder / STATE
+        if not folder.exists():  # from then on a file that is missing was lost
+            self._begin(history, folder)
+
+    def _begin(self, history: Path, folder: Path) -> None:
+        """Make the folder with the file in it, unless another does so first."""
+        draft = made_folder_beside(history, draft_beside(folder).name)
+        try:
+            write_text(draft / STATE, "{}", durable=True)
+            draft.rename(folder)
+        except InputError as error:
+            raise StorageError(str(error)) from error
+        except OSError as error:
+            if not folder.exists():
+                raise StorageError(f"{folder} cannot be made: {error.strerror}") from error
+        finally:
+            if draft.exists():
+                (draft / STATE).unlink(missing_ok=True)
+                draft.rmdir()
+        for parent in (folder.parent, history.parent):
+            self._sync(parent)
 
     def load(self) -> Mapping[str, Any] | None:
         """The document; None before the first.

@@ -1,6 +1,8 @@
 """The state of a robot beside its history: whole, on the disk, and missed when it is gone."""
 
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,24 @@ def test_a_document_comes_back(history):
     assert keeper.load() is None
     keeper.save({"a": 1})
     assert StateFile(history, "maintenance").load() == {"a": 1}
+
+
+def test_nodes_of_one_process_open_it_at_once(history):
+    """Finding: one took the other's draft away, and could not be configured."""
+    together = threading.Barrier(8)
+
+    def opened(number: int) -> dict[str, int] | None:
+        together.wait()
+        keeper = StateFile(history, "robot_file")
+        found = keeper.load()
+        keeper.save({"a": number})
+        return found
+
+    with ThreadPoolExecutor(8) as threads:
+        assert all(found is None or found["a"] < 8 for found in threads.map(opened, range(8)))
+    (file,) = StateFile(history, "robot_file").path.parent.iterdir()
+    assert file.name == "state.json"
+    assert [path.name for path in history.with_suffix("").iterdir()] == ["robot_file"]
 
 
 def test_a_power_cut_loses_nothing_that_was_saved(history, monkeypatch):
