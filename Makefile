@@ -34,8 +34,9 @@ help:  ## this list
 demo: setup  ## a simulated cell in closed loop through the live nodes, report in out/report/
 	$(ROS) python bags/demo.py
 
-# Live cells of up to six processes come first, one after the other; then the other node tests, three
-# at a time. Both mostly wait: what all others compute fills their pauses, and gives way at once.
+# Live cells of up to six processes, and motions that are judged by time, come first, one after the
+# other and alone; then the other node tests, three at a time. These mostly wait: what all others
+# compute fills their pauses, and gives way at once.
 # What failed is shown last. One of the three at a time that failed is run once again, as the others
 # may have starved it, and named; never one whose examples chance picks.
 GIVES_WAY := $(shell chrt --idle 0 true 2>/dev/null && echo chrt --idle 0 || echo nice -n 19)
@@ -43,10 +44,10 @@ PYTEST := $(ROS) python -m pytest -p no:cacheprovider
 test: setup  ## all tests; TESTS="test/core -k tool" for some
 	@if [[ -n "$(TESTS)" ]]; then exec $(ROS) python -m pytest $(TESTS); fi
 	mkdir -p out
-	$(GIVES_WAY) $(PYTEST) -n 2 --dist worksteal --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
-	trap 'kill $$others 2>/dev/null || true' EXIT
 	failed=0
 	$(PYTEST) -m cell test/nodes 2>&1 | tee out/test_cells.txt || failed=1
+	$(GIVES_WAY) $(PYTEST) -n 2 --dist worksteal --ignore=test/nodes >out/test_others.txt 2>&1 & others=$$!
+	trap 'kill $$others 2>/dev/null || true' EXIT
 	$(PYTEST) --reruns 1 -rR -m "not cell" -n 3 --dist worksteal test/nodes 2>&1 | tee out/test_nodes.txt || failed=1
 	wait $$others || failed=1
 	echo "== tests beside those of the nodes"

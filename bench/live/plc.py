@@ -30,7 +30,7 @@ from robocal_ros.sim.kr150_cell import poses
 from robocal_ros.sim.production import programme
 from robocal_ros.storage.robots import load_robot
 
-BEAT_S = 0.2
+BEAT_S = 0.05  # a PLC's program goes round many times for each beat
 GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free
 START_S = 120.0  # of all nodes, on a machine with much else to do
 ASK_S = 0.2  # between two calls of ~/status

@@ -27,6 +27,8 @@ from trajectory_controllers import (
 )
 from trajectory_msgs.msg import JointTrajectory
 
+pytestmark = pytest.mark.cell  # judged by time: nothing else may slow it down
+
 STEP = np.array([1.0, 0.3, -0.2, 0.5, -0.4, 0.1])
 ACTION = f"/{NODE}/follow_joint_trajectory"
 REST = np.zeros(6)
