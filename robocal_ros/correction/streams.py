@@ -175,8 +175,7 @@ class TargetStream:
         speed = np.zeros(self._arm.n)
         if self._interval_s > 0.0:
             speed = np.abs(self._goal - self._last) / self._interval_s
-        fastest = np.where(self._unlimited, speed + SPARE, self._fastest)
-        spare = np.maximum(fastest - speed, 0.0)[chosen] * CATCH_UP_S
+        spare = np.maximum(self._pace() - speed, 0.0)[chosen] * CATCH_UP_S
         ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
         known = np.isfinite(ahead).all() and np.isfinite(moved).all()
         if not known or pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):

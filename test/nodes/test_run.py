@@ -56,7 +56,6 @@ def test_a_bug_in_a_timer_is_told_and_the_node_lives_on(graph: Any, script: Path
     graph.call(Trigger, "/sleeper/break")
     graph.spin_until(lambda: "ZeroDivisionError" in sleeper.output, "the bug is logged")
     assert graph.call(Trigger, "/sleeper/ping").success
-    assert sleeper.output.count("ZeroDivisionError") == 1, "told at every tick"
     assert sleeper.stop() == 0
 
 

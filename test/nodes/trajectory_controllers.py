@@ -106,10 +106,10 @@ class Controlled:
 
         Seen by its time, which begins anew, or by a robot that stood and moves.
         """
-        for late_s in range(3):
+        for attempt in range(3):
             sent, before = len(self.states), self.states[-2:]
             stood = before[0].output.positions == before[1].output.positions
-            if late_s and message.header.stamp != Time():
+            if attempt and message.header.stamp != Time():
                 at_s = seconds(message.header.stamp) + 1.0
                 message.header.stamp = Time(**_parts(at_s))
             self.topic.publish(message)
