@@ -4,6 +4,7 @@ Needs rclpy, which the other benchmarks' venv has not: ``start_times`` runs this
 of the nodes, as ``tools/with_ros python -m bench.startup`` does.
 """
 
+import compileall
 import json
 import os
 import statistics
@@ -67,6 +68,7 @@ def start_times() -> Table:
 
 def measure() -> dict[str, list[float]]:
     """Start times by executable, taking turns."""
+    compileall.compile_dir(ROOT / "robocal_ros", quiet=1)  # as an installation does
     with tempfile.TemporaryDirectory() as folder:
         bag = _bag(Path(folder))
         commands = {"bare rclpy node": [sys.executable, "-c", BARE]}

@@ -2,7 +2,7 @@
 
 ``T_a_b`` maps coordinates in frame b to frame a: ``p_a = T_a_b @ p_b``.
 Quaternions are x, y, z, w. scipy's rotations are loaded when they are first used: a fifth of a
-second that the start of a node does not need.
+second that the start of a node does not need, which is why quaternions do without them.
 """
 
 import numpy as np
@@ -25,12 +25,20 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def transform_from_quat(xyz: ArrayLike, quat_xyzw: ArrayLike) -> Array:
-    """Assemble (..., 4, 4) from positions (..., 3), m, and unit quaternions (..., 4)."""
-    from scipy.spatial.transform import Rotation
+    """Assemble (..., 4, 4) from positions (..., 3), m, and quaternions (..., 4).
 
-    quat = np.array(quat_xyzw, dtype=np.float64)  # a copy: SciPy 1.11 refuses read-only arrays
-    R = Rotation.from_quat(quat.reshape(-1, 4)).as_matrix().reshape(*quat.shape[:-1], 3, 3)
-    return transform(R, xyz)
+    Raises
+    ------
+    ValueError
+        For a quaternion of length 0; all others are normalised.
+    """
+    quat = np.asarray(quat_xyzw, dtype=np.float64)
+    length = np.linalg.norm(quat, axis=-1, keepdims=True)
+    if np.any(length == 0.0):
+        raise ValueError("a quaternion has the length 0")
+    v, w = (quat / length)[..., :3], (quat / length)[..., 3, None, None]
+    V = skew(v)
+    return transform(np.eye(3) + 2.0 * (w * V + V @ V), xyz)
 
 
 def invert(T: Array) -> Array:
@@ -45,13 +53,24 @@ def apply(T: Array, points: Array) -> Array:
 
 
 def quat_xyzw(T: Array) -> Array:
-    """Unit quaternions (..., 4), w >= 0, of transforms (..., 4, 4) or rotations (..., 3, 3)."""
-    from scipy.spatial.transform import Rotation
+    """Unit quaternions (..., 4), w >= 0, of transforms (..., 4, 4) or rotations (..., 3, 3).
 
-    R = np.array(T[..., :3, :3], dtype=np.float64)  # a copy, as above
-    quat = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat()
-    quat = np.where(quat[:, 3:] < 0.0, -quat, quat)
-    return np.asarray(quat.reshape(*R.shape[:-2], 4))
+    Products of its numbers are sums of the rotation's (Bar-Itzhack 2000): the column of the
+    largest square is the quaternion, scaled.
+    """
+    R = np.asarray(T[..., :3, :3], dtype=np.float64)
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    products = np.empty((*R.shape[:-2], 4, 4))
+    products[..., :3, :3] = R + np.swapaxes(R, -1, -2)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        products[..., i, i] += 1.0 - trace
+        products[..., i, 3] = products[..., 3, i] = R[..., k, j] - R[..., j, k]
+    products[..., 3, 3] = 1.0 + trace
+    largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), axis=-1)
+    quat = np.take_along_axis(products, largest[..., None, None], axis=-1)[..., 0]
+    quat = quat / np.linalg.norm(quat, axis=-1, keepdims=True)
+    return np.asarray(np.where(quat[..., 3:] < 0.0, -quat, quat))
 
 
 def exp_rotation(rotvec: ArrayLike) -> Array:

@@ -2,11 +2,14 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 from robocal_ros.core.proposals import Head
-from robocal_ros.correction.bounds import Policy, Survey
 from robocal_ros.correction.inputs import Array
 from robocal_ros.correction.refusals import Reason
+
+if TYPE_CHECKING:  # who hears a status needs no compiled code
+    from robocal_ros.correction.bounds import Policy, Survey
 
 NODE = "joint_correction_node"
 
@@ -46,7 +49,7 @@ class CorrectionStatus:
     settled: bool  # the offset is the one that model and tool ask for
     revision: int | None  # of the model taken over
     serial: str  # the one it was made for; empty without one
-    survey: Survey  # its correction over the joint range
+    survey: "Survey"  # its correction over the joint range
     waiting_revision: int | None  # of a model that was refused, and that may be taken over
     new_tool: bool  # a tool other than the taught one was taken over
     tool_revision: int | None  # of the tool taken over
@@ -66,7 +69,7 @@ class CorrectionStatus:
     reduced: int  # points that were corrected in part, near a singularity
     clamped: dict[Reason, int]  # messages that were corrected in part, by what bound
     passed: dict[Reason, int]  # and those not at all
-    policy: Policy
+    policy: "Policy"
     reference: str  # name and hash of the model that the program was taught with
     shadow: bool  # commands pass as they came, and the correction is only shown
     refused: dict[Reason, int]  # how often

@@ -14,14 +14,19 @@ from robocal_ros.motion.stopping import stop
 
 
 def load_motion(arm: SerialArm) -> None:
-    """Call once what is compiled or imported at its first use: half a second."""
-    import scipy.special  # noqa: F401
-
+    """Call once what is compiled or imported at a motion's first use."""
     if (frame := inspect.currentframe()) is not None:
         inspect.getframeinfo(frame)  # rclpy's logger does: its first line would take 60 ms
     q = np.full(arm.n, 0.3)
-    time = np.linspace(0.0, 0.1, FEWEST_READINGS)
-    JointPath(arm, time, np.tile(q, (len(time), 1))).at(np.array([0.05]))
     stop(arm, MotionLimits(), q, np.full(arm.n, 0.01)).at(0.0)
     with suppress(LimitError):  # a posture that some arm does not have
         inverse(arm, arm.fk(q)[None], q)
+
+
+def load_measuring(arm: SerialArm) -> None:
+    """The same of measuring a tool in motion: a third of a second."""
+    import scipy.special  # noqa: F401
+
+    load_motion(arm)
+    time = np.linspace(0.0, 0.1, FEWEST_READINGS)
+    JointPath(arm, time, np.full((len(time), arm.n), 0.3)).at(np.array([0.05]))

@@ -12,7 +12,7 @@ from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.motion.loading import load_motion
+from robocal_ros.motion.loading import load_measuring
 from robocal_ros.motion.silence import Silence
 from robocal_ros.nodes import qos, tcf_motion
 from robocal_ros.nodes.base import POLL_S, HouseNode
@@ -65,7 +65,7 @@ class TcfNode(HouseNode):
             raise InputError("laser is empty: name the file that 'robocal tool beams' wrote")
         placed = read_laser_for(Path(settings["laser"]), self._nominal)
         taught = taught_tool(settings, self._nominal)
-        load_motion(self._nominal)
+        load_measuring(self._nominal)
         self._config = session_config(settings, placed.laser, placed.station, taught)
         self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
         frames = settings["base_frame"], settings["flange_frame"], settings["tool_frame"]

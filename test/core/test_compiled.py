@@ -26,18 +26,38 @@ walk(np.array([0.5]), links, np.eye(4), np.empty(24), np.empty((1, 2, 3)), T)
 print(float(T[0, 3]), sum(walk.stats.cache_hits.values()))
 """
 
+AGAIN = """
+import numba
+@numba.njit(error_model="numpy")
+def again(q, links, root, turns, frames, T):
+    walk(2.0 * q, links, root, turns, frames, T)
+    return T[0, 3]
+x = again(np.array([0.25]), links, np.eye(4), np.empty(24), np.empty((1, 2, 3)), T)
+print(float(x), sum(walk.stats.cache_hits.values()))
+"""
 
-def walk(folder: Path) -> tuple[float, int]:
+
+def walk(folder: Path, script: str = WALK) -> tuple[float, int]:
     """x of a link of 1 m at 0.5 rad, and how many compiled kernels were found on disk."""
-    told = subprocess.run(
-        [sys.executable, "-c", WALK],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "kept")},
-        stdout=subprocess.PIPE,
-        check=True,
-        text=True,
-    ).stdout.split()
+    told = (
+        subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(folder), "NUMBA_CACHE_DIR": str(folder / "kept")},
+            stdout=subprocess.PIPE,
+            check=True,
+            text=True,
+        )
+        .stdout.splitlines()[-1]
+        .split()
+    )
     return float(told[0]), int(told[1])
+
+
+def test_a_new_kernel_is_built_from_kept_code(tmp_path):
+    shutil.copytree(PACKAGE, tmp_path / "robocal_ros", ignore=shutil.ignore_patterns("__pycache__"))
+    fresh = walk(tmp_path)
+    assert walk(tmp_path, WALK + AGAIN) == (fresh[0], fresh[1] + 1)
 
 
 def test_an_edit_of_what_a_kernel_is_built_from_compiles_it_again(tmp_path):
