@@ -390,6 +390,7 @@ def _round_trip(case: Case, free: bool) -> Array:
 CROSSED = {"wrist": 4, "elbow": 2, "shoulder": 1}  # the joint that crosses it
 BENT = ((0.0, 0.0), (2e-3, 0.5), (9e-3, 3.5))  # m, deg
 CROSSINGS, CROSSING_S, CROSSING_SPEED, PERIOD_S = 100, 0.6, np.radians(60.0), 0.002
+DRIFT_CROSSINGS = 400  # of the wrist, with a drift alone
 BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])  # of a drift and of a tool, as in the node
 OFF_MM = 5.0  # more than uncorrected
 
@@ -448,7 +449,7 @@ def _cross(
     case, wanted, out, left, off, solved = make_case(name, 0.0, 0.0), 0.0, 0.0, [], 0.0, 0
     taught, turning = case.reference, np.zeros(6, dtype=np.bool_)
     t = np.arange(-CROSSING_S / 2, CROSSING_S / 2, PERIOD_S)
-    for _ in range(CROSSINGS):
+    for _ in range(count := DRIFT_CROSSINGS if drift_alone else CROSSINGS):
         share = 10.0 ** rng.uniform(np.log10(4e-6), np.log10(1.2e-4)) / DRIFT_M
         direction, axis = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
         turn = frames.exp_rotation(axis * np.radians(turn_deg))
@@ -473,7 +474,7 @@ def _cross(
         wanted, out = (max(a, b) for a, b in zip((wanted, out), rates, strict=True))
     rate, most, fastest = np.degrees(wanted), max(left) * 1e3, np.degrees(out)
     return (
-        CROSSINGS, solved, rate, Goal(rate, 2.0) if drift_alone else None,
+        count, solved, rate, Goal(rate, 2.0) if drift_alone else None,
         float(np.median(left)) * 1e3, most, Goal(most, 0.04) if drift_alone else None,
         off * 1e3, Goal(off * 1e3, shift_m * 1e3 + OFF_MM), fastest, Goal(fastest, 10.0 + 1e-6),
     )  # fmt: skip

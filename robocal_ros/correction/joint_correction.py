@@ -11,11 +11,15 @@ and of the tool's turn before its position. With e the twist that is left at the
 units of 0.3 m), J the Jacobian at q, and (A, B; B^T, C) the blocks of J J^T for position and turn,
 
     q' = q + J^T y,   e(q') = D y,   D = (P, 0; 0, R),                                    (2)
-    P = d(A),  R = d(C - B^T (A + P)^-1 B),  d(U S U^T) = U diag(d(s)) U^T,
+    P = d(A),  T = (A + P)^-1 B,  L L^T = I + T^T T,
+    R = L d(L^-1 (C - B^T T) L^-T) L^T,   d(U S U^T) = U diag(d(s)) U^T,
     d(s) = l^2 (1 - s / (3 l^2))^3 below s = 3 l^2, else exactly 0.
 
 C - B^T A^-1 B is how the joints turn the tool without moving it. So at a wrist singularity the
-position stays exact (P = 0), and of the turn one direction is left. To first order the shift is
+position stays exact (P = 0), and of the turn one direction is left. A turn w alone is the part w of
+the vector (-T w, w) that is as long as L^T w: L makes what is damped comparable with the
+eigenvalues of J J^T, so that the damping of a turn is as strong where the position is weak too,
+and takes over evenly from that of the position. To first order the shift is
 sigma / (sigma^2 + d) times the error along each singular direction. Directions with d = 0 are
 corrected exactly. The damping is as strong as the error asks for, that of the position (in P), or
 all of it (in R):
@@ -47,8 +51,8 @@ Array = NDArray[np.float64]
 
 LARGEST_SHIFT = 1.0
 # Of the shift per unit of a singular value: at 60 deg/s of the joints through a wrist singularity
-# a drift's correction moves by less than 2 deg/s; a tool's, which is larger, by more, so that in
-# most postures its turn is corrected too.
+# a drift's correction moves by less than 2 deg/s, with each shipped robot; a tool's, which is
+# larger, by more, so that in most postures its turn is corrected too.
 DRIFT_SLOPE, TOOL_SLOPE = 1.0 / 60.0, 1.0 / 10.0
 SHARED = 0.3  # square of 0.77, the most of sigma l / (sigma^2 + d), over two joints
 

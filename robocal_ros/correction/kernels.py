@@ -161,17 +161,69 @@ def damping(M: Array, position: float, rotation: float, D: Array, U: Array) -> i
 
     ``position`` and ``rotation`` are the squares l^2 of the two. ``M`` is used up.
     """
-    count = damped(M[:3, :3], position, D[:3, :3], D[3:, 3:], U)
+    A, B, C = M[:3, :3], M[:3, 3:], M[3:, 3:]
+    T, L, inverse = D[:3, 3:], D[3:, :3], D[3:, 3:]  # in what is not filled in yet
+    count = damped(A, position, D[:3, :3], inverse, U)
+    for i in range(3):
+        for c in range(3):
+            T[i, c] = inverse[i, 0] * B[0, c] + inverse[i, 1] * B[1, c] + inverse[i, 2] * B[2, c]
     for r in range(3):
         for c in range(3):
-            for i in range(3):
-                for k in range(3):
-                    M[3 + r, 3 + c] -= M[i, 3 + r] * D[3 + i, 3 + k] * M[k, 3 + c]
-    count += damped(M[3:, 3:], rotation, D[3:, 3:], D[:3, 3:], U)
+            C[r, c] -= B[0, r] * T[0, c] + B[1, r] * T[1, c] + B[2, r] * T[2, c]
+            L[r, c] = T[0, r] * T[0, c] + T[1, r] * T[1, c] + T[2, r] * T[2, c]
+        L[r, r] += 1.0
+    root(L)
+    between(L, C)
+    count += damped(C, rotation, D[3:, 3:], T, U)
+    around(L, D[3:, 3:], T)
     for r in range(3):
         for c in range(3):
             D[r, 3 + c], D[3 + r, c] = 0.0, 0.0
     return count
+
+
+@lean
+def root(L: Array) -> None:
+    """Lower factor of L L^T (3, 3), positive definite, in place; what is above it is zero."""
+    for c in range(3):
+        for r in range(c, 3):
+            value = L[r, c]
+            for k in range(c):
+                value -= L[r, k] * L[c, k]
+            L[r, c] = np.sqrt(value) if r == c else value / L[c, c]
+        for r in range(c):
+            L[r, c] = 0.0
+
+
+@lean
+def between(L: Array, C: Array) -> None:
+    """L^-1 C L^-T of symmetric C (3, 3), in place, with a lower triangle L."""
+    for _ in range(2):  # L^-1 C, turned over: the second time the whole
+        for c in range(3):
+            for r in range(3):
+                for k in range(r):
+                    C[r, c] -= L[r, k] * C[k, c]
+                C[r, c] /= L[r, r]
+        for r in range(3):
+            for c in range(r):
+                C[r, c], C[c, r] = C[c, r], C[r, c]
+
+
+@lean
+def around(L: Array, S: Array, scratch: Array) -> None:
+    """L S L^T (3, 3), in place of S, with a lower triangle L."""
+    for r in range(3):
+        for c in range(3):
+            value = 0.0
+            for k in range(r + 1):
+                value += L[r, k] * S[k, c]
+            scratch[r, c] = value
+    for r in range(3):
+        for c in range(3):
+            value = 0.0
+            for k in range(c + 1):
+                value += scratch[r, k] * L[c, k]
+            S[r, c] = value
 
 
 @lean

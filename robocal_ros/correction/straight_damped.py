@@ -170,6 +170,22 @@ def _times(m: Nine, n: Nine) -> Nine:
 
 
 @lean
+def _turned_over(m: Nine) -> Nine:
+    return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
+
+
+@lean
+def _root(T: Nine) -> Nine:
+    """Lower factor L of I + T^T T = L L^T."""
+    n = _times(_turned_over(T), T)
+    a = np.sqrt(1.0 + n[0])
+    b, c = n[1] / a, n[2] / a
+    d = np.sqrt(1.0 + n[4] - b * b)
+    e = (n[5] - b * c) / d
+    return a, 0.0, 0.0, b, d, 0.0, c, e, np.sqrt(1.0 + n[8] - c * c - e * e)
+
+
+@lean
 def _on(m: Nine, x: float, y: float, z: float) -> Three:
     return (
         m[0] * x + m[1] * y + m[2] * z, m[3] * x + m[4] * y + m[5] * z,
@@ -263,9 +279,13 @@ def _solve(c: Array, q: Six) -> tuple[Six, Six, Six, bool, bool]:
     turn = position + e[3] * e[3] + e[4] * e[4] + e[5] * e[5]
     A, B = _product(i, j, k, i, j, k), _product(i, j, k, l, m, n)
     P, weak = _damping(A, lambda_square(position, c[DAMPING], c[DAMPING + 1]))
-    C = _times(_product(l, m, n, i, j, k), _times(_inverse(_sum(A, 1.0, P)), B))
-    C = _sum(_product(l, m, n, l, m, n), -1.0, C)
+    T = _times(_inverse(_sum(A, 1.0, P)), B)
+    C = _sum(_product(l, m, n, l, m, n), -1.0, _times(_product(l, m, n, i, j, k), T))
+    L = _root(T)
+    inverse = _inverse(L)
+    C = _times(_times(inverse, C), _turned_over(inverse))
     R, more_weak = _damping(C, lambda_square(turn, c[DAMPING], c[DAMPING + 1]))
+    R = _times(_times(L, R), _turned_over(L))
     y = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     y, x, _, _, good = _again(c, q, aim, J, y, P, R)
     fine &= good

@@ -163,7 +163,10 @@ def test_many_weak_points_are_solved_at_once_by_the_equations() -> None:
     M, D = J @ np.swapaxes(J, 1, 2), np.zeros((len(q), 6, 6))
     D[:, :3, :3] = damping(M[:, :3, :3], square(e[:, :3]))
     turns = np.linalg.solve(M[:, :3, :3] + D[:, :3, :3], M[:, :3, 3:])
-    D[:, 3:, 3:] = damping(M[:, 3:, 3:] - M[:, 3:, :3] @ turns, square(e))
+    L = np.linalg.cholesky(np.eye(3) + np.swapaxes(turns, 1, 2) @ turns)
+    inverse = np.linalg.inv(L)
+    alone = inverse @ (M[:, 3:, 3:] - M[:, 3:, :3] @ turns) @ np.swapaxes(inverse, 1, 2)
+    D[:, 3:, 3:] = L @ damping(alone, square(e)) @ np.swapaxes(L, 1, 2)
     assert np.array_equal(found.weak, np.abs(D).max(axis=(1, 2)) > 0.0)
     regular = np.linalg.cond(J) < 1e4
     y = np.linalg.solve(np.swapaxes(J, 1, 2), found.joint_shift[..., None])
