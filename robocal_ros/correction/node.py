@@ -533,10 +533,12 @@ class JointCorrectionNode(HouseNode):
             else:
                 self._session.release(reason)
         if found is not None and (before is None or before.reason is not found.reason):
-            log = self.get_logger()
-            tell = log.info if found.reason is Reason.LEASED else log.error
-            tell(f"nothing goes out, {found.reason.value}: {found.detail}")
-            self._stop(f"{found.reason.value}: {found.detail}")
+            words = f"{found.reason.value}: {found.detail}"
+            if found.reason is Reason.LEASED:  # rclpy refuses one line of two severities
+                self.get_logger().info(f"nothing goes out, {words}")
+            else:
+                self.get_logger().error(f"nothing goes out, {words}")
+            self._stop(words)
         elif found is None and before is not None:
             self.get_logger().info(f"over: {before.reason.value}")
         if (found is None) is not (before is None):

@@ -101,7 +101,8 @@ class EndpointNode(LifecycleNode):
     ) -> Subscription:
         """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
 
-        ``raw``: the callback is given the serialized message.
+        A defect in the callback counts it too and is logged; it does not end the node. ``raw``:
+        the callback is given the serialized message.
         """
         count = self.inputs.setdefault(topic, InputCount())
 
@@ -116,6 +117,9 @@ class EndpointNode(LifecycleNode):
                 count.invalid += 1
                 if self._log_limit.allows(topic, str(error), time.monotonic()):
                     self.get_logger().warning(f"{topic}: {error}")
+            except Exception as error:
+                count.invalid += 1
+                self._log_defect(topic, error)
 
         def lose(event: Any) -> None:
             count.lost += event.total_count_change
@@ -218,9 +222,7 @@ class EndpointNode(LifecycleNode):
             try:
                 callback()
             except Exception as error:
-                words = f"{''.join(traceback.format_exception(error))}"
-                if self._log_limit.allows("timer", words, time.monotonic()):
-                    self.get_logger().error(f"a defect of this software, please report:\n{words}")
+                self._log_defect("timer", error)
 
         clock = Clock(clock_type=ClockType.STEADY_TIME) if steady else None
         timer = self.create_timer(period_s, tick, clock=clock)
@@ -232,6 +234,11 @@ class EndpointNode(LifecycleNode):
         self._takers.clear()
         while self._release:
             self._release.pop()()
+
+    def _log_defect(self, where: str, error: Exception) -> None:
+        words = "".join(traceback.format_exception(error))
+        if self._log_limit.allows(where, words, time.monotonic()):
+            self.get_logger().error(f"{where}: a defect of this software, please report:\n{words}")
 
     def _require_active(self, name: str) -> None:
         if not self.is_active:

@@ -25,6 +25,9 @@ from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sessions.ignored import MOST_REASONS
 
 
+BUG = 5e5  # of this number the callback has a defect
+
+
 class Doubler(HouseNode):
     """Doubles numbers; refuses negative ones."""
 
@@ -58,6 +61,8 @@ class Doubler(HouseNode):
     def on_number(self, message: Float64) -> None:
         if message.data < 0:
             raise InputError(f"{message.data} is negative")
+        if message.data == BUG:
+            raise KeyError("a bug")
         if message.data > 1e6:
             raise InputError(f"{message.data} is too large")
         self.output.publish(Float64(data=self.factor * message.data))
@@ -108,6 +113,17 @@ def test_starts_by_itself_and_works(graph: Any) -> None:
     graph.spin_until(lambda: doubled, "a doubled number")
     assert doubled[0].data == 42.0
     assert state_of(graph) == "active"
+
+
+def test_a_defect_in_a_callback_is_counted_and_the_node_lives_on(graph: Any) -> None:
+    node = graph.add(Doubler)
+    doubled = graph.collect(Float64, "/doubler/doubled")
+    number = graph.publisher(Float64, "number")
+    number.publish(Float64(data=BUG))
+    graph.spin_until(lambda: node.inputs["number"].invalid == 1, "the defect is counted")
+    number.publish(Float64(data=2.0))
+    graph.spin_until(lambda: doubled, "a doubled number")
+    assert doubled[0].data == 4.0
 
 
 def test_waits_for_commands_without_autostart_and_ignores_inputs_while_inactive(graph: Any) -> None:

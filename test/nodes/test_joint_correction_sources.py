@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from joint_correction_live import HOME, Line, joints, trajectory
+from joint_correction_live import HOME, NODE, NOMINAL, Line, joints, trajectory
 from rclpy.node import Node
-from robocal_msgs.msg import CorrectionStatus
+from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
@@ -84,3 +84,19 @@ def test_a_stream_whose_publisher_vanishes_is_told(graph: Any) -> None:
     line.target()
     told: CorrectionStatus = line.told(commanders="")
     assert list(told.refused) == []
+
+
+def test_a_stranger_and_then_a_lease_are_both_told(graph: Any) -> None:
+    line = Line(graph)
+    stranger = line.graph.probe.create_publisher(
+        JointTrajectory, f"{NODE}/joint_trajectory", qos.RELIABLE
+    )
+    line.told(state=CorrectionStatus.OTHER_COMMANDER)
+    graph.probe.destroy_publisher(stranger)
+    line.statuses.clear()
+    line.told(state=CorrectionStatus.OFF)
+    lease = graph.probe.create_publisher(MotionLease, "motion_lease", qos.LATCHED)
+    lease.publish(
+        MotionLease(robot=NOMINAL.name, serial="s1", holder="/h", held=True, purpose="tool")
+    )
+    line.told(state=CorrectionStatus.LEASED)

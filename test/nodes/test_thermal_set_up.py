@@ -10,7 +10,6 @@ from shift import BALL, T_SENSOR_BASE, Shift, built, postures
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import transform_message
 from robocal_ros.storage.robots import load_robot
 
 POSES = 10
@@ -47,7 +46,10 @@ def test_from_an_unmounted_sphere_to_planned_poses(graph):
     graph.spin_until(lambda: len(sensors) == 2, "the placed sensor is published")
     assert (sensors[-1].header.frame_id, sensors[-1].child_frame_id) == ("base", "sensor")
     inverse = frames.transform_from_quat([t.x, t.y, t.z], _quat(found.sensor_base.rotation))
-    assert sensors[-1].transform == transform_message(frames.invert(inverse))
+    published, q_xyzw = sensors[-1].transform, _quat(sensors[-1].transform.rotation)
+    x = published.translation
+    T = frames.transform_from_quat([x.x, x.y, x.z], q_xyzw)
+    assert np.abs(T - frames.invert(inverse)).max() < 1e-14  # to rounding
 
     own = [JointState(name=list(nominal.joint_names), position=row) for row in q[:6]]
     planned = graph.call(PlanPoses, "/thermal_node/plan_poses", own=own)
