@@ -5,6 +5,7 @@ context): what a process publishes shares them. The client of an action is a pub
 topic ``rq/<action>/_action/send_goalRequest``.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.node import Node
@@ -28,40 +29,74 @@ class CommandPath:
     Parameters
     ----------
     topic, action : resolved names by which this node commands it; an empty action is none.
-    ours : topics that the cell's own nodes publish, who may command it too.
+    cell : topics whose publishers may command it too: each waits while another holds the lease.
+    mine : topic that one node of this kind publishes for each robot; empty: `cell` tells all.
 
     Attributes
     ----------
-    second : that another node does the same work, and which; empty: none does.
-    strangers : who commands the robot and is none of the cell's nodes; empty: nobody.
+    violation : who else commands the robot; empty: nobody.
     """
 
-    def __init__(self, node: Node, topic: str, action: str, *ours: str) -> None:
-        self._node, self._paths = node, [(topic, "publishes", topic, False)]
+    def __init__(
+        self, node: Node, topic: str, action: str, cell: Sequence[str], mine: str = ""
+    ) -> None:
+        self._node, self._mine = node, mine
+        # A controller takes trajectories on the topic beside its action too.
+        topics = {topic, *([f"{action.rpartition('/')[0]}/joint_trajectory"] if action else [])}
+        self._paths = [(each, "publishes", each, False) for each in sorted(topics)]
         if action:
             dds = f"rq{action}/_action/send_goalRequest"
             self._paths.append((action, "is a client of", dds, True))
-        self._ours = [node.resolve_topic_name(each) for each in (*ours, "motion_lease")]
-        self.second = self.strangers = ""
+        self._cell = [node.resolve_topic_name(each) for each in cell]
+        self.violation = ""
 
-    def look(self, mine: str) -> None:
-        """Look now; ``mine``: a topic that one node of this kind publishes for each robot."""
-        node = self._node
-        same = publishers(node, mine)
-        self.second = ""
+    def look(self) -> str:
+        """Look now, before anything begins to move and twice a second; the violation."""
+        found = []
+        same = publishers(self._node, self._mine) if self._mine else {}
         if len(same) > 1:
             who = ", ".join(f"{name} [{gid.hex()[:24]}]" for gid, name in sorted(same.items()))
-            self.second = (
-                f"{mine} has {len(same)} publishers ({who}): one maintenance node for each robot; "
-                "end the others. One that was killed counts until DDS gives it up, after up to 20 s"
+            found.append(
+                f"{self._mine} has {len(same)} publishers ({who}): one node of this kind for each "
+                "robot; end the others"
             )
-        ours = {gid[:PREFIX] for each in self._ours for gid in publishers(node, each)}
-        found = []
+        cell = {
+            (gid[:PREFIX], who)
+            for each in self._cell
+            for gid, who in publishers(self._node, each).items()
+        }
         for name, does, topic, dds in self._paths:
-            others = publishers(node, topic, dds=dds).items()
-            found += [f"{who} {does} {name}" for gid, who in others if gid[:PREFIX] not in ours]
-        self.strangers = ""
+            found += [f"{who} {does} {name}" for who in self._strangers(topic, dds, cell)]
+        self.violation = "; ".join(found)
         if found:
-            self.strangers = (
-                f"{'; '.join(sorted(found))}: while a cycle runs nobody else may command the robot"
+            self.violation += (
+                ": nobody else may command the robot while the cell moves it; one that was killed "
+                "counts until DDS gives it up, after up to 20 s"
             )
+        return self.violation
+
+    def _strangers(self, topic: str, dds: bool, cell: set[tuple[bytes, str]]) -> list[str]:
+        """Names of who neither is this node nor one of the cell's."""
+        found = publishers(self._node, topic, dds=dds)
+        rest = [who for gid, who in found.items() if not _is_of((gid[:PREFIX], who), cell)]
+        own = self._node.get_fully_qualified_name()
+        if own in rest:
+            rest.remove(own)
+        return sorted(
+            "a node that is not discovered yet" if who.endswith(UNKNOWN)
+            else f"a second {own}" if who == own
+            else who
+            for who in rest
+        )  # fmt: skip
+
+
+def _is_of(one: tuple[bytes, str], nodes: set[tuple[bytes, str]]) -> bool:
+    """Whether it is one of these nodes, as far as their names are discovered.
+
+    Another node of the same process is not: programs are composed of many.
+    """
+    return any(
+        one[0] == participant
+        and (one[1] == name or any(each.endswith(UNKNOWN) for each in (one[1], name)))
+        for participant, name in nodes
+    )

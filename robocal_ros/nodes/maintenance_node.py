@@ -33,7 +33,7 @@ from robocal_ros.nodes.steady_clock import SteadyClock
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State
-from robocal_ros.sessions.maintenance.requests import Answer, Request
+from robocal_ros.sessions.maintenance.requests import Answer, Move, Request
 from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
@@ -89,12 +89,13 @@ class MaintenanceNode(HouseNode):
             lambda: None if self._session is None else self._session.robot.watch,
             self._steady.now_s,
         )
-        self._motion = motion
+        self._motion, default_gap_s = motion, settings["default_gap_s"]
         self._driver = MaintenanceDriver(self, motion, self._answered, self._moves)
         self._lease = LeaseHolder(self, self._nominal.name, self._serial_in_use)
-        self._others = CommandPath(self, motion.topic.topic_name, motion.action, CORRECTION)
+        path, mine = (motion.topic.topic_name, motion.action), self._outputs.accuracy_topic
+        self._others = CommandPath(self, *path, ("motion_lease", CORRECTION), mine)
         self._calls = MaintenanceServices(
-            self, self._running, self._clocks, self._outputs, settings["default_gap_s"]
+            self, self._running, self._looked, self._clocks, self._outputs, default_gap_s
         )
         self._guard = SourceGuard(self, JOINTS)
         self.add_input(JointState, JOINTS, self._take_joints, qos.STREAM)
@@ -210,8 +211,10 @@ class MaintenanceNode(HouseNode):
         self._lease.hold(cycle or "a stop" * stops)
 
     def _carry_out(self, requests: list[Request]) -> None:
-        if self._driver is not None:
-            for request in requests:
+        for request in requests:
+            if isinstance(request, Move) and self._looked() and self._others.violation:
+                continue  # the cycle has ended by that
+            if self._driver is not None:
                 self._driver.carry_out(request)
 
     def _moves(self) -> None:
@@ -236,21 +239,20 @@ class MaintenanceNode(HouseNode):
         if session is None or self._calls is None:
             return
         session.doubt_gap(self._sources.doubt())
-        self._look_at_graph(session)
         now_s = self._steady.now_s()
+        if now_s >= self._look_s:
+            self._looked()
         status = session.status(now_s)  # which may take its time: the history is read
         status = replace(status, beat=session.beat(self._steady.now_s()))
         self._outputs.status(status, self.now_ns())
         self._calls.look(status)
 
-    def _look_at_graph(self, session: MaintenanceSession) -> None:
-        """Twice a second: a second maintenance node, and who else commands the robot."""
-        now_s = self._steady.now_s()
-        if now_s < self._look_s:
-            return
+    def _looked(self) -> MaintenanceSession:
+        """Who else commands the robot ends a cycle, and lets none begin."""
+        session, now_s = self._running(), self._steady.now_s()
         self._look_s = now_s + LOOK_S
-        self._others.look(self._outputs.accuracy_topic)
-        session.second(self._others.second, now_s)
+        session.second(self._others.look(), now_s)
+        return session
 
     def _show_accuracy(self) -> None:
         if self._session is None:
@@ -279,13 +281,11 @@ class MaintenanceNode(HouseNode):
         health.values = values
         if status.state is State.FAULT:
             health.worsen(ERROR, status.fault)
-        for words in (session.robot.trouble(self._steady.now_s()), self._others.strangers):
-            if words:
-                health.worsen(WARN, words)
-        faults = self._guard.fault, self._others.second, self._sources.doubt(), status.trouble
-        for words in faults:
-            if words:
-                health.worsen(ERROR, words)
+        if trouble := session.robot.trouble(self._steady.now_s()):
+            health.worsen(WARN, trouble)
+        faults = self._guard.fault, self._others.violation, self._sources.doubt(), status.trouble
+        for words in filter(None, faults):
+            health.worsen(ERROR, words)
         if self._history is not None:
             warn_of_history(health, self._history)
         return health

@@ -35,6 +35,7 @@ class MaintenanceServices:
     Parameters
     ----------
     session : the one that runs; raises `NotActiveError` without one.
+    starting : the same, for a cycle that is to begin, once it is known who else moves the robot.
     clocks : reads steady and wall clock.
     default_gap_s : of ``~/run_trigger``.
     """
@@ -43,11 +44,13 @@ class MaintenanceServices:
         self,
         node: EndpointNode,
         session: Callable[[], MaintenanceSession],
+        starting: Callable[[], MaintenanceSession],
         clocks: Callable[[], Now],
         outputs: MaintenanceOutputs,
         default_gap_s: float,
     ) -> None:
-        self._node, self._session, self._clocks = node, session, clocks
+        self._node, self._session, self._starting = node, session, starting
+        self._clocks = clocks
         self._outputs, self._default_gap_s = outputs, default_gap_s
         self._goals: list[ServerGoalHandle] = []
         add = node.add_service
@@ -82,7 +85,7 @@ class MaintenanceServices:
         try:
             if not self._node.is_active:
                 raise NotActiveError(f"the node is {self._node.state}")
-            self._session().run(request.cycle_id, request.gap_s, now.steady_s, now.wall_ns)
+            self._starting().run(request.cycle_id, request.gap_s, now.steady_s, now.wall_ns)
         except RobocalError as error:
             self._end(goal, CycleResult(request.cycle_id, error.code, str(error)), str(error))
             return
@@ -128,7 +131,7 @@ class MaintenanceServices:
 
     def _run(self, request: Any, response: Any) -> Any:
         now = self._clocks()
-        result = self._session().run(request.cycle_id, request.gap_s, now.steady_s, now.wall_ns)
+        result = self._starting().run(request.cycle_id, request.gap_s, now.steady_s, now.wall_ns)
         response.success, response.status = True, int(Code.ACCEPT)
         memory = self._session().memory
         response.before_start = result.cycle_id in memory.earlier
@@ -186,7 +189,7 @@ class MaintenanceServices:
         return trigger
 
     def _run_now(self) -> tuple[int, Code, str]:
-        now, session = self._clocks(), self._session()
+        now, session = self._clocks(), self._starting()
         if (running := session.running) is None:
             name = f"at {now.wall_ns}"
             session.run(name, self._default_gap_s, now.steady_s, now.wall_ns)

@@ -1,18 +1,20 @@
 """Motion of the tool node: it moves the robot, once armed (docs/tool_motion.md)."""
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from robocal_msgs.msg import MaintenanceStatus
 from std_srvs.srv import SetBool
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import ConflictError, InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import joint_sample
 from robocal_ros.core.tool.edge_samples import RESTORE
 from robocal_ros.motion.driver import CONTROLLER, LeaseHolder, MotionDriver
 from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.gap_sources import GAP_BOOL, SHORTEST_STALE_S, STATUS, GapSources
+from robocal_ros.motion.graph import CommandPath
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
 from robocal_ros.motion.settings import MOTION, NS, driving_config, require_limits
@@ -25,7 +27,9 @@ from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import ToolDriver
 
 TICK_S = 0.01
-
+LOOK_S = 0.5
+# What maintenance_node and joint_correction_node publish, who command the robot too.
+CELL = "accuracy_state", STATUS, "joint_correction_node/status"
 
 SETTINGS = (
     *MOTION,
@@ -84,6 +88,7 @@ class TcfMotion:
             self._steady.now_s,
         )
         self._lease = LeaseHolder(node, arm.name, serial)
+        self._others = CommandPath(node, self._motion.topic.topic_name, self._motion.action, CELL)
         stale_s = settings["gap_stale_s"]
         self._gap = Gap(stale_s) if stale_s > 0.0 else None
         if self._gap is not None:
@@ -106,6 +111,7 @@ class TcfMotion:
             When a limit is given for another number of joints, or the robot has none.
         """
         require_limits(session.nominal, self._config)
+        self._looked_s = -math.inf
         self.driver = ToolDriver(
             session, self._config, self._send, self._ask, self._closed, self._motion.hard_stop
         )
@@ -161,6 +167,11 @@ class TcfMotion:
         """What is to be warned of; empty: nothing."""
         return "" if self.driver is None else self.driver.trouble(self._steady.now_s())
 
+    @property
+    def fault(self) -> str:
+        """Who else commands the robot, so that this node does not; empty: nobody."""
+        return self._others.violation
+
     def on_its_way(self) -> bool:
         """Whether a step is being driven: a robot that rests then only pauses."""
         return self.driver is not None and self.driver.on_its_way(self._steady.now_s())
@@ -186,16 +197,20 @@ class TcfMotion:
 
     def _closed(self, now_s: float) -> str:
         """Why nothing may move, where somebody says so; a pause of this process is looked for."""
-        if self._gap is None:
-            return ""
-        self._gap.look(now_s)
-        return self._gap.closed(now_s)
+        if self._gap is not None:
+            self._gap.look(now_s)
+            if why := self._gap.closed(now_s):
+                return why
+        return self._others.violation
 
     def _tick(self) -> None:
         now_s = self._steady.now_s()
         if self._gap is not None:
             self._gap.look(now_s)
         if self.driver is not None:
+            if now_s >= self._looked_s + LOOK_S:
+                self._looked_s = now_s
+                self._others.look()
             self.driver.tick(now_s)
             self._lease.hold(f"tool: {self.driver.words()}" if self.driver.moves else "")
 
@@ -212,6 +227,7 @@ class TcfMotion:
             return response
         now_s = self._steady.now_s()
         if request.data:
+            self._others.look()
             self.driver.arm(now_s)
         else:
             self.driver.disarm("disarmed by a call", now_s)
@@ -221,6 +237,8 @@ class TcfMotion:
         return response
 
     def _send(self, plan: JointPlan, stop: bool) -> float:
+        if not stop and (why := self._others.look()):
+            raise ConflictError(why)  # at which the driver stops and disarms
         sent_s = self._steady.now_s()  # not after it: a robot ahead of its plan is off it
         self._motion.send(plan, stop=stop)
         return sent_s

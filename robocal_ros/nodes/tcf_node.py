@@ -275,15 +275,15 @@ class TcfNode(HouseNode):
         values: dict[str, object] = {"revision in force": session.in_force.revision}
         run = session.run
         values["run"] = "none" if run is None else f"{run.number}, {run.awaited.name} is awaited"
+        faults = [self._guard.fault, session.current.fault]
         if self._motion is not None:
-            values["motion"] = self._motion.words()
+            values["motion"], faults = self._motion.words(), [*faults, self._motion.fault]
             if trouble := self._motion.trouble():
                 health.worsen(WARN, trouble)
         values["last run"] = "none" if self._last is None else self._last.message
         values |= session.ignored.listed() | self._stamps.judge(health)
-        for fault in (self._guard.fault, session.current.fault):
-            if fault:
-                health.worsen(ERROR, fault)
+        for fault in filter(None, faults):
+            health.worsen(ERROR, fault)
         if self._outputs.missing:
             health.worsen(WARN, self._outputs.missing)
         warn_of_history(health, history)

@@ -86,7 +86,6 @@ class LiveCell:
         self.states = graph.collect(AccuracyState, "/accuracy_state", qos.LATCHED)
         self.events = graph.collect(SessionEvent, "/maintenance_node/session_events", EVENTS)
         graph.probe.create_subscription(JointState, "joint_states", self._joints, qos.STREAM)
-        self.drive = graph.probe.create_publisher(JointTrajectory, ROBOT, 10)
         self.sphere = graph.probe.create_publisher(PointStamped, "sphere_center", 10)
         self.gap = graph.probe.create_publisher(GapOpen, "gap_open", 10)
         threading.Thread(target=self._beats, daemon=True).start()
@@ -197,8 +196,10 @@ class LiveCell:
         limits = MotionLimits(tcp_speed_m_s=1.0)
         cell = MotionCell(self.arm, body, np.eye(4), housing, limits)
         plan: JointPlan = joint_way(cell, start, end)
-        self.drive.publish(trajectory_message(plan, self.arm.joint_names))
+        drive = self.graph.publisher(JointTrajectory, ROBOT, subscribers=2)  # the robot, and `sent`
+        drive.publish(trajectory_message(plan, self.arm.joint_names))
         self.graph.spin_for(plan.duration_s)
+        self.graph.probe.destroy_publisher(drive)  # nobody else commands while the cell measures
 
     # ---- calls ----------------------------------------------------------------------------------
 

@@ -4,12 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from maintenance_live import HOME_DEG, ROBOT, SERIAL, LiveCell
-from robocal_msgs.msg import CorrectionStatus
+from robocal_msgs.msg import CorrectionStatus, MaintenanceStatus
 from robocal_msgs.srv import RunMaintenanceCycle
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
+from test_correction_graph import Process
 from test_maintenance_calls import HOME_DEG as STANDING_DEG
 from test_maintenance_calls import Plc, process
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -18,6 +20,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.nodes import qos
 
 PROGRAM = "/program/joint_trajectory"
+STRANGER = f"/planner publishes {ROBOT}"
 
 
 def test_two_maintenance_nodes_of_two_hosts_refuse_until_one_is_gone(
@@ -47,7 +50,6 @@ def test_two_maintenance_nodes_of_two_hosts_refuse_until_one_is_gone(
 
 def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -> None:
     cell = LiveCell(graph, tmp_path)
-    graph.probe.destroy_publisher(cell.drive)
     settings = {"robot": "ur10", "serial": SERIAL}
     graph.start(
         "joint_correction_node",
@@ -84,3 +86,65 @@ def test_the_program_waits_while_the_cell_measures(graph: Any, tmp_path: Path) -
     to_program.publish(motion)
     graph.spin_until(lambda: len(cell.sent) == own + 1, "the program's motion goes out")
     graph.spin_until(lambda: np.max(np.abs(cell.q - target)) < 1e-3, "the robot is there")
+
+
+def error(said: list[DiagnosticArray], node: str, words: str) -> bool:
+    """Whether a node's diagnostics are ERROR with these words."""
+    return any(
+        node in status.name and status.level == b"\x02" and words in status.message
+        for array in said
+        for status in array.status
+    )
+
+
+@pytest.mark.parametrize("driver", ["tcf_node", "maintenance_node"])
+def test_who_else_commands_the_robot_stops_what_moves_it_and_lets_nothing_begin(
+    graph: Any, tmp_path: Path, driver: str
+) -> None:
+    cell = LiveCell(graph, tmp_path)
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    handle = cell.begin("c1", 150.0)
+    ended = handle.get_result_async()
+    graph.spin_until(lambda: len(cell.sent) == 2, "the first circle", within_s=30.0)
+    if driver == "maintenance_node":  # on its way home
+        assert graph.call(Trigger, "/maintenance_node/cancel_trigger").success
+        home = pytest.approx(np.radians(HOME_DEG), abs=1e-6)
+        graph.spin_until(lambda: cell.sent[-1].points[-1].positions == home, "its way", 30.0)
+        graph.spin_until(lambda: not cell.stands(0.1), "the robot moves")
+    before, planner = len(cell.sent), Process(graph.domain, "planner")
+    try:
+        planner.node.create_publisher(JointTrajectory, ROBOT, 10)
+        graph.spin_until(lambda: len(cell.sent) > before, "the stop", within_s=2.0)
+        graph.spin_until(ended.done, "the result")
+        result = ended.result().result
+        assert not result.success
+        assert STRANGER in result.message
+        graph.spin_until(lambda: cell.stands(0.2), "it has stopped")
+        assert cell.stands(1.0)
+        assert not cell.at_home()
+        assert cell.statuses[-1].state == MaintenanceStatus.FAULT
+        for node in ("tcf_node", "maintenance_node"):
+            graph.spin_until(lambda n=node: error(said, n, STRANGER), f"{node} says so")
+        answer = graph.call(SetBool, "/tcf_node/arm", data=True)
+        assert not answer.success
+        assert STRANGER in answer.message
+    finally:
+        planner.end()
+
+
+def test_no_cycle_begins_while_somebody_else_commands_the_robot(graph: Any) -> None:
+    plc = Plc(graph, lambda: process(graph))
+    said = graph.collect(DiagnosticArray, "/diagnostics")
+    path = "/maintenance_node/joint_trajectory"
+    planner = Process(graph.domain, "planner")
+    try:
+        planner.node.create_publisher(JointTrajectory, path, 10)
+        words = f"/planner publishes {path}"
+        graph.spin_until(lambda: error(said, "maintenance_node", words), "it says so")
+        answer = plc.run("c1")
+        assert (answer.success, answer.status) == (False, Code.CONFLICT)
+        assert words in answer.message
+        assert words in plc.trigger("run")
+    finally:
+        planner.end()
+    graph.spin_until(lambda: plc.run("c2").success, "it works again")

@@ -55,7 +55,6 @@ class Cell:
         self.truth = graph.collect(TransformStamped, "/cell_sim_node/truth", qos.LATCHED)
         self.joints = graph.collect(JointState, "joint_states")
         self.sent = graph.collect(JointTrajectory, "/tcf_node/joint_trajectory")
-        self.drive = graph.probe.create_publisher(JointTrajectory, "/tcf_node/joint_trajectory", 10)
         self.steps = graph.collect(ToolStep, "/tcf_node/next_step", qos.LATCHED)
         graph.start("cell_sim_node", simulated, remap)
         graph.spin_until(lambda: self.truth and csv.exists(), "the cell")
@@ -97,11 +96,13 @@ class Cell:
         """A person drives the robot to where it stood at first."""
         back = JointTrajectoryPoint(positions=self.joints[0].position, time_from_start=BACK)
         back.velocities = back.accelerations = [0.0] * len(back.positions)
-        self.drive.publish(JointTrajectory(joint_names=self.joints[0].name, points=[back]))
+        drive = self.graph.publisher(JointTrajectory, "/tcf_node/joint_trajectory", subscribers=2)
+        drive.publish(JointTrajectory(joint_names=self.joints[0].name, points=[back]))
         self.graph.spin_until(
             lambda: np.allclose(self.joints[-1].position, back.positions, rtol=0.0, atol=1e-6),
             "the robot is back",
         )
+        self.graph.probe.destroy_publisher(drive)  # nobody else commands while the node does
         self.graph.spin_for(0.5)
 
 

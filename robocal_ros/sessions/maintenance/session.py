@@ -100,7 +100,7 @@ class MaintenanceSession:
         self.robot.sent(now_s)
 
     def second(self, why: str, now_s: float) -> None:
-        """Another maintenance node drives this robot too; empty: none does."""
+        """Somebody else commands this robot, a second maintenance node too; empty: nobody."""
         self._second, self._hands.now_s = why, now_s
         self._conductor.give_up(why) if why else None
 
