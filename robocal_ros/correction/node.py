@@ -252,10 +252,12 @@ class JointCorrectionNode(HouseNode):
         return response
 
     def _on_acknowledge(self, _: Any, response: Any) -> Any:
-        """End a START_MISMATCH, and take note of a damaged history."""
+        """End a START_MISMATCH, else take note of a damaged history; the answer says of which."""
+        what = self._report.acknowledge()
         self._session.acknowledge(time.monotonic())
-        self._report.log.acknowledge()
-        return self._answer("acknowledge", "", response)
+        answer = self._answer("acknowledge", "", response)
+        answer.message += f"; acknowledged: {what}"
+        return answer
 
     def _on_take_over(self, _: Any, response: Any) -> Any:
         """Look again at what was refused for its revision or its size."""

@@ -41,7 +41,7 @@ SAME = ("enabled", "stale", "mismatch", "lag_s", "overtaken", "reduced", "last_r
 RETRY_S = 5.0
 CLOSE_S = 5.0  # the end of the node waits so long for what is not yet written
 MOST_WAITING = 1000  # then the oldest are lost
-END, ACKNOWLEDGE = "end", "acknowledge"
+END = "end"
 ACKNOWLEDGED_BY = "joint_correction_node"
 
 
@@ -68,9 +68,9 @@ class CorrectionLog:
             self._last = record
             self._noted.put(record)
 
-    def acknowledge(self) -> None:
-        """Write down that somebody knows of the damage."""
-        self._noted.put(ACKNOWLEDGE)
+    def acknowledge(self, damage: str) -> None:
+        """Write down that somebody knows of this damage, and of no other one."""
+        self._noted.put(damage)
 
     def close(self) -> None:
         """Write what waits, if that is possible soon."""
@@ -84,15 +84,19 @@ class CorrectionLog:
                 noted = self._noted.get(timeout=RETRY_S)
             except queue.Empty:
                 noted = ""
+            known = ""
             if isinstance(noted, CorrectionRecord):
                 self._waiting.append(noted)
-            self._try(acknowledges=noted == ACKNOWLEDGE)
+            elif noted != END:
+                known = noted
+            self._try(known)
 
-    def _try(self, *, acknowledges: bool) -> None:
+    def _try(self, known: str) -> None:
         try:
-            if acknowledges:
-                acknowledge_history(self._settings, ACKNOWLEDGED_BY)
             self.damage = history_notice(self._settings)
+            if known and known == self.damage:
+                acknowledge_history(self._settings, ACKNOWLEDGED_BY)
+                self.damage = ""
             if self._waiting:
                 with open_history(self._settings, self._nominal, owner=False)[1] as history:
                     while self._waiting:
@@ -133,6 +137,7 @@ class CorrectionReport:
         }
         self._refusals = 0
         self._told: list[str] = []
+        self._damage = ""  # as the last status told it
         self._told_s = 0.0
         is_nominal, T = chosen == NOMINAL_CHOICE, reference.T_flange_tool
         self._record = partial(
@@ -177,7 +182,7 @@ class CorrectionReport:
         told = [str(getattr(message, name)) for name in names if name not in FIGURES]
         if only_news and told == self._told and now - self._told_s < TELL_S - 0.5 * LOOK_S:
             return
-        self._told, self._told_s = told, now
+        self._told, self._told_s, self._damage = told, now, message.history
         self.log.note(
             self._record(
                 wall_ns=time.time_ns(),
@@ -188,6 +193,17 @@ class CorrectionReport:
             )
         )
         self._statuses.publish(message)
+
+    def acknowledge(self) -> str:
+        """What a person acknowledges now, in words; damage of the history is noted as known.
+
+        One thing at a time: damage only where no mismatch waits, and where the status told it.
+        """
+        if self._session.status().mismatch:
+            return Reason.START_MISMATCH.value
+        if self._damage:
+            self.log.acknowledge(self._damage)
+        return self._damage or "nothing"
 
     def _message(self, status: CorrectionStatus) -> StatusMessage:
         return StatusMessage(

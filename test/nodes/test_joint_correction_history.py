@@ -7,7 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joint_correction_live import NODE, NOMINAL, Line, drifted, model_message, tool_message
+from joint_correction_live import (
+    HOME,
+    NODE,
+    NOMINAL,
+    Line,
+    drifted,
+    joints,
+    model_message,
+    tool_message,
+)
 from robocal_msgs.msg import CorrectionStatus
 from std_srvs.srv import Trigger
 
@@ -16,6 +25,7 @@ from robocal_ros.core import frames
 from robocal_ros.core.correction_record import CALIBRATED, CorrectionRecord
 from robocal_ros.core.correction_record import NOMINAL as AS_NOMINAL
 from robocal_ros.correction import report as correction_log
+from robocal_ros.nodes.history_settings import history_notice
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_description, save_robot
 
@@ -146,6 +156,50 @@ def test_a_damaged_history_is_told_until_a_person_acknowledges_it(
     graph.spin_until(lambda: line.statuses and line.statuses[-1].history, "the status says so")
     assert "was set aside as" in line.statuses[-1].history
     assert "was set aside as" in line.report(b"\x01", "set aside").message
-    assert graph.call(Trigger, f"{NODE}/acknowledge").success
+    answer = graph.call(Trigger, f"{NODE}/acknowledge")
+    assert answer.success
+    assert "; acknowledged: a damaged history was set aside as" in answer.message
     graph.spin_until(lambda: not line.statuses[-1].history, "it is acknowledged")
     assert len(list(graph.state.glob("*.damaged-*"))) == 1
+    assert graph.call(Trigger, f"{NODE}/acknowledge").message.endswith("; acknowledged: nothing")
+
+
+def test_who_acknowledges_a_mismatch_has_not_said_that_the_damage_is_known(
+    graph: Any, monkeypatch: Any
+) -> None:
+    """Finding: one call ended both, and every node fell silent about the damage."""
+    monkeypatch.setattr(correction_log, "RETRY_S", 0.1)
+    graph.state.mkdir(exist_ok=True)
+    (graph.state / "s1.sqlite").write_bytes(b"\xff" * 5000)
+    CalibrationHistory.open("s1", state_dir=graph.state).close()
+    line = Line(graph)
+    line.enable()
+    line.at = HOME + np.radians(2.0)
+    line.rest()
+    line.refused(line.to_target, joints(HOME), "joint_targets")
+    graph.spin_until(lambda: line.statuses[-1].mismatch and line.statuses[-1].history, "both")
+    answer = graph.call(Trigger, f"{NODE}/acknowledge")
+    assert "; acknowledged: START_MISMATCH" in answer.message
+    assert "damaged" not in answer.message
+    graph.spin_until(lambda: not line.statuses[-1].mismatch, "the mismatch has ended")
+    graph.spin_for(0.3)  # three looks of the log
+    assert "was set aside as" in line.node._report.log.damage
+    answer = graph.call(Trigger, f"{NODE}/acknowledge")
+    assert "; acknowledged: a damaged history" in answer.message
+    graph.spin_until(lambda: not line.statuses[-1].history, "it is known now")
+
+
+def test_damage_that_came_after_what_was_told_is_not_known(graph: Any) -> None:
+    graph.state.mkdir(exist_ok=True)
+    path = graph.state / "s1.sqlite"
+    settings = {"serial": "s1", "state_dir": ""}
+    log = correction_log.CorrectionLog(settings, NOMINAL)
+    told = []
+    for _ in range(2):
+        path.write_bytes(b"\xff" * 5000)
+        CalibrationHistory.open("s1", state_dir=graph.state).close()
+        told.append(history_notice(settings))
+    assert told[0] != told[1]
+    log.acknowledge(told[0])
+    log.close()
+    assert log.damage == history_notice(settings) == told[1]
