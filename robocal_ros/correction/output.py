@@ -275,29 +275,26 @@ class Output:
 
     def lead_in(
         self, index: Index, q: Array, begins: Array, now_s: float
-    ) -> tuple[Array | None, Array] | None:
+    ) -> tuple[Array | None, Array]:
         """Taught joints (n,) and offset (n,) from where a command leads in to ``q`` (n,).
 
-        The taught joints are None where the controller is at its first point already. None where
-        the robot is neither there nor where it was sent: no offset is taken up then.
+        The taught joints are None where the controller is at its first point already. Where it is
+        not known where the controller is, it is where the robot was read.
         """
-        everything = np.arange(self._state.count)
-        before = self.mismatch
+        everything, before = np.arange(self._state.count), self.mismatch
         try:
             place, exact = self.place(everything, q, now_s)
         except RefusedError:
             self.mismatch = before
-            return None
+            place, exact = self._state.measured.copy(), False
         offset, beside = self._taken_up(index, (place - q)[index], begins, exact=exact)
         if np.all(beside <= 1.0):
             whole = place - q
             whole[index] = offset
             return None, whole
-        if not exact:
-            return None
-        if self.path is not None and self.path.live(now_s):
+        if exact and self.path is not None and self.path.live(now_s):
             taught = place - self.path.offset(now_s)[0]
-        else:
+        else:  # with the offset that readings are told with
             taught = self.uncorrected(place, now_s)
         return taught, place - taught
 

@@ -17,7 +17,10 @@ Index = NDArray[np.int64]
 # A robot follows what it was sent within this: drives lag, messages travel, s.
 RESPONSE_S = 0.2
 TRACK_S = 0.01  # between two places that are kept, s
-REFERENCE_AGE_S = 0.1  # a controller's reference that is older is none, s
+# A controller's reference that is older is none, s; of one that moves, which is carried on at its
+# speed: one and a half periods of joint_trajectory_controller's default, 50 Hz.
+REFERENCE_AGE_S, MOVING_AGE_S = 0.1, 0.03
+STANDS = 1e-3  # rad/s (prismatic: m/s): a reference that is slower stands
 MOST_TURNS = 4.0 * np.pi  # of a joint, where its limits allow no more
 # Readings whose stamp is so far ahead of the clock come from one that is set wrongly, s.
 AHEAD_S = 0.1
@@ -55,6 +58,7 @@ class RobotState:
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
         self._reference, self._reference_s = np.full(arm.n, np.nan), np.full(arm.n, -np.inf)
+        self._reference_rate = np.zeros(arm.n)
         self.scaling = 1.0
 
     # ---- joints by name -------------------------------------------------------------------------
@@ -153,17 +157,36 @@ class RobotState:
                 track.popleft()
 
     def controller(
-        self, index: Index, reference: Array, scaling: float | None, now_s: float
+        self,
+        index: Index,
+        reference: Array,
+        velocity: Array | None,
+        scaling: float | None,
+        told_s: float,
     ) -> None:
-        """Where the controller is: its reference (k,); ``scaling``: how fast its clock runs."""
-        self._reference[index], self._reference_s[index] = reference, now_s
-        if scaling is not None:
+        """Where the controller was at ``told_s``: its reference (k,), and velocities as planned.
+
+        ``scaling``: how fast its clock runs. Without velocities those are as from the last
+        reference to this.
+        """
+        if scaling is not None and np.isfinite(scaling):
             self.scaling = float(np.clip(scaling, 0.0, 1.0))
+        if velocity is None:
+            since = told_s - self._reference_s[index]
+            lately = (since > 0.0) & (since <= REFERENCE_AGE_S)
+            moved = np.where(lately, reference - self._reference[index], 0.0)
+            self._reference_rate[index] = moved / np.where(lately, since, 1.0)
+        else:
+            self._reference_rate[index] = velocity * self.scaling
+        self._reference[index], self._reference_s[index] = reference, told_s
 
     def reference(self, index: Index, now_s: float) -> Array | None:
-        """The controller's own place (k,), where it is known and fresh."""
-        fresh = np.all(now_s - self._reference_s[index] <= REFERENCE_AGE_S)
-        return self._reference[index] if fresh else None
+        """Where the controller is by its own words (k,), where they are known and fresh."""
+        rate, age_s = self._reference_rate[index], now_s - self._reference_s[index]
+        moves = bool(np.any(np.abs(rate) > STANDS))
+        if not np.all(age_s <= (MOVING_AGE_S if moves else REFERENCE_AGE_S)):
+            return None
+        return np.asarray(self._reference[index] + rate * np.maximum(age_s, 0.0))
 
     def require_fresh(self, index: Index, now_s: float) -> None:
         """Refuse while one of these joints has not been read, or not lately."""
@@ -188,8 +211,9 @@ class RobotState:
         track = self._track
         if not track or track[0][0] > now_s - RESPONSE_S + TRACK_S or not self.fresh(index, now_s):
             return False
-        places = np.array([q[index] for _, q in track])
-        return bool(np.all(np.abs(places - self.measured[index]) < self._near[index]))
+        here = self.measured[index]
+        moved = [self.unwrapped(index, q[index], here) - here for _, q in track]
+        return bool(np.all(np.abs(moved) < self._near[index]))
 
     def unwrapped(self, index: Index, position: Array, q: Array) -> Array:
         """Positions (k,), those of joints without limits at the turn nearest to ``q`` (k,)."""

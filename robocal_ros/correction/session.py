@@ -354,17 +354,28 @@ class CorrectionSession:
         return taught, position, velocity
 
     def controller(
-        self, names: tuple[str, ...], position: Array, scaling: float | None, now_s: float
+        self,
+        names: tuple[str, ...],
+        position: Array,
+        scaling: float | None,
+        now_s: float,
+        velocity: Array | None = None,
+        age_s: float = 0.0,
     ) -> None:
-        """Where the controller says that it is, (k,) rad (prismatic: m), and its speed scaling.
+        """Where the controller says that it was ``age_s`` ago, and its speed scaling.
 
-        What is not finite, or of another's joint, is left out; so is a scaling of None.
+        ``position`` (k,) rad (prismatic: m), with the ``velocity`` (k,) as planned, where it tells
+        one. What is not finite, or of another's joint, is left out; so is a scaling of None.
         """
-        known = [i for i, name in enumerate(names) if name in self._reference.joint_names]
-        known = [i for i in known if i < len(position) and np.isfinite(position[i])]
+        arm = self._reference.joint_names
+        known = [i for i, name in enumerate(names) if name in arm and i < len(position)]
+        known = [i for i in known if np.isfinite(position[i])]
         index = self._state.index(tuple(names[i] for i in known)) if known else np.zeros(0, int)
+        rate = None
+        if velocity is not None and len(velocity) == len(position):
+            rate = velocity[known] if np.isfinite(velocity[known]).all() else None
         before = self._state.scaling
-        self._state.controller(index, position[known], scaling, now_s)
+        self._state.controller(index, position[known], rate, scaling, now_s - max(age_s, 0.0))
         path = self.output.path if self._state.scaling != before else None
         while path is not None:  # the one that it may go on with, too
             path.scale(self._state.scaling, now_s)

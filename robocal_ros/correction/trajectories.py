@@ -27,7 +27,7 @@ from robocal_ros.correction.limiter import (
     REST_RATE,
     STILL,
 )
-from robocal_ros.correction.output import Output, SentPath, hold_speeds, spline_terms
+from robocal_ros.correction.output import Output, SentPath, hold_speeds, spline, spline_terms
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
@@ -37,6 +37,7 @@ SPLINE_PEAK = 1.875
 SETTLED = 1e-9  # rad, m: of an offset that is the desired one
 LONGEST_WAIT_S = 60.0  # for which it is worked out how long an offset takes
 TRIES = 12
+LOOKED_AT = 33  # speeds of a spline, from point to point
 STOP_SPACING_S = 0.025  # of the points of a stop
 SHORTEST_STOP_S = 0.1
 OWN = 1.25  # of a path's own accelerations, where they are larger than the limits: a stop's
@@ -72,7 +73,7 @@ class TrajectoryCorrector:
         desired, result = self._desired.at(q)
         output.take_up(now_s)
         try:
-            led_from, withheld = self._begin(index, q, desired, times, now_s)
+            led_from, withheld = self._begin(command, index, q, desired, times, now_s)
             begin = limiter.state.copy()
             active = np.zeros(self._arm.n)
             active[index] = 1.0
@@ -87,7 +88,7 @@ class TrajectoryCorrector:
             if command.acceleration is not None:
                 acceleration = command.acceleration + bends[:, index]
             require_limits(out, self._arm)
-            self._require_speeds(command, index, out, velocity, times, led_from)
+            self._require_speeds(command, index, out, (velocity, acceleration), times, led_from)
         finally:
             limiter.state[:], limiter.limits = kept, limits
         known_times = command.time_from_start_s
@@ -123,7 +124,13 @@ class TrajectoryCorrector:
         return corrected, path
 
     def _begin(
-        self, index: Index, q: Array, desired: Array, times: Array, now_s: float
+        self,
+        command: TrajectoryCommand,
+        index: Index,
+        q: Array,
+        desired: Array,
+        times: Array,
+        now_s: float,
     ) -> tuple[Array | None, Array]:
         """The offset that it begins with; where it leads in from (k,), None at once.
 
@@ -135,21 +142,13 @@ class TrajectoryCorrector:
         if output.path is None and self._state.stands(index, now_s):  # a stream's that is over
             limiter.state[OFFSET_RATE] = 0.0
         if times[0] <= 0.0:  # the controller goes there in one cycle
-            here, wanted = (
-                np.array([np.interp(0.0, times, column) for column in rows.T])
-                for rows in (q, desired)
-            )
-            offset = output.begin_at(index, here, self._desired.begins(here), now_s)
-            limiter.state[OFFSET, index] = offset
-            limiter.state[DESIRED] = wanted
+            here = _place_now(command, index, q, times)
+            begins = self._desired.begins(here)
+            limiter.state[OFFSET, index] = output.begin_at(index, here, begins, now_s)
+            limiter.state[DESIRED] = begins[0]
             return None, limiter.withheld
         self._state.require_fresh(index, now_s)
-        found = output.lead_in(index, q[0], self._desired.begins(q[0]), now_s)
-        if found is None:  # the controller leads in from wherever it is
-            limiter.state[OFFSET], limiter.state[DESIRED] = desired[0], desired[0]
-            limiter.state[OFFSET_RATE] = 0.0
-            return self._state.measured[index].copy(), limiter.withheld
-        taught, offset = found
+        taught, offset = output.lead_in(index, q[0], self._desired.begins(q[0]), now_s)
         limiter.state[OFFSET] = offset
         if taught is None:
             limiter.state[DESIRED] = desired[0]
@@ -223,7 +222,8 @@ class TrajectoryCorrector:
             over = np.maximum(over, lead)
             if np.all(over <= 1.0 + SETTLED):
                 break
-            share *= np.where(over > 1.0, np.maximum(0.9 / np.maximum(over, 1.0), 0.25), 1.0)
+            # an offset that comes in within one step bends alike until the share is small enough
+            share *= np.where(over > 1.0, np.clip(0.9 / np.maximum(over, 1.0), 0.25, 0.7), 1.0)
         else:
             raise RefusedError(
                 Reason.TOO_SHORT, "between its points the offset would change too fast"
@@ -237,15 +237,18 @@ class TrajectoryCorrector:
         command: TrajectoryCommand,
         index: Index,
         out: Array,
-        velocity: Array | None,
+        rates: tuple[Array | None, Array | None],
         times: Array,
         led_from: Array | None,
     ) -> None:
         """Refuse what is too fast: between the points, as it says, or on the way to the first."""
-        fastest, names = self._fastest[index], command.names
-        hold_speeds(names, np.diff(out[:, index], axis=0), np.diff(times), fastest)
-        if velocity is not None:
+        fastest, names, (velocity, acceleration) = self._fastest[index], command.names, rates
+        if velocity is None:
+            hold_speeds(names, np.diff(out[:, index], axis=0), np.diff(times), fastest)
+        else:
             hold_speeds(names, velocity, np.ones(len(velocity)), fastest)
+            peaks = _peaks(out[:, index], velocity, acceleration, times, fastest)
+            hold_speeds(names, peaks, np.ones(len(peaks)), fastest)
         if led_from is None:
             return
         lead_s = float(times[0])
@@ -377,6 +380,47 @@ def _over(rows: Array, withheld: Array, h: Array, moves: NDArray[np.bool_], limi
         fast[None], limits[[ACCELERATION, RATE], None], limits[[REST_ACCELERATION, REST_RATE], None]
     )
     return np.array([np.max(np.abs(x) / m) for x, m in zip((bend, rate), most, strict=True)])
+
+
+def _place_now(command: TrajectoryCommand, index: Index, q: Array, times: Array) -> Array:
+    """Taught joints (n,) at time 0 of a path that has begun, between the points as it is driven."""
+    k = int(np.searchsorted(times, 0.0, side="right")) - 1
+    here, ends = q[k].copy(), slice(k, k + 2)
+    if k + 1 < len(times):
+        rates, bends = (
+            None if rows is None else rows[ends]
+            for rows in (command.velocity, command.acceleration)
+        )
+        here[index] = spline(times, q[ends, index], rates, bends, k, 0.0)[0]
+    return here
+
+
+def _peaks(
+    out: Array, velocity: Array, acceleration: Array | None, times: Array, fastest: Array
+) -> Array:
+    """Fastest (m - 1, k) between the points, of the cubics or quintics that are driven there.
+
+    These are no faster than the control points of their speed, which do where none is faster than
+    ``fastest`` (k,); elsewhere the spline itself is looked at.
+    """
+    h, v0, v1 = np.diff(times)[:, None], velocity[:-1], velocity[1:]
+    way = np.diff(out, axis=0)
+    bends = None
+    if acceleration is None:
+        control = [v0, 3.0 * way / h - v0 - v1, v1]
+    else:
+        bends = np.stack([acceleration[:-1], acceleration[1:]]) * h**2
+        middle = (5.0 * way + 0.25 * (bends[1] - bends[0])) / h - 2.0 * (v0 + v1)
+        control = [v0, v0 + 0.25 * bends[0] / h, middle, v1 - 0.25 * bends[1] / h, v1]
+    peaks = np.max(np.abs(control), axis=0)
+    over = np.flatnonzero((peaks > fastest).any(axis=1))
+    if len(over):
+        h, v0, v1 = h[over], v0[over] * h[over], v1[over] * h[over]
+        terms = spline_terms(way[over], v0, v1, None if bends is None else bends[:, over])
+        u = np.linspace(0.0, 1.0, LOOKED_AT)[:, None, None]
+        speed = v0 + sum(i * c * u ** (i - 1) for i, c in enumerate(terms, start=2))
+        peaks[over] = np.max(np.abs(speed), axis=0) / h
+    return np.asarray(peaks)
 
 
 def _speeds(q: Array, times: Array) -> Array:
