@@ -7,7 +7,7 @@ robot holds the cell's motion lease meanwhile (docs/tool_motion.md).
 
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,10 @@ CONTROLLER = (
     ),
 )
 LEASE_S = 0.2  # between two messages of a lease that is held
+VIOLATIONS = {
+    FollowJointTrajectory.Result.PATH_TOLERANCE_VIOLATED: "PATH_TOLERANCE_VIOLATED",
+    FollowJointTrajectory.Result.GOAL_TOLERANCE_VIOLATED: "GOAL_TOLERANCE_VIOLATED",
+}
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
 STAMP_LEAD_S = (
@@ -62,6 +66,7 @@ class MotionDriver:
     Parameters
     ----------
     reported : takes what the controller makes of the motion that was sent last.
+    tolerances : of motions, see `goal_tolerances`; a stop has the controller's own, and is watched.
     robot : where readings of the controller go now; None: nowhere.
     now : their steady clock.
 
@@ -76,11 +81,13 @@ class MotionDriver:
         names: Sequence[str],
         action: str,
         hard_stop: str,
+        tolerances: Mapping[str, Any],
         reported: Callable[[MotionReport], None],
         robot: Callable[[], RobotWatch | None],
         now: Callable[[], float],
     ) -> None:
         self._node, self._names, self._reported, self._robot = node, names, reported, robot
+        self._tolerances = dict(tolerances)
         self._index: dict[tuple[str, ...], list[int]] = {}
         self._now = now
         self.topic = node.add_output(JointTrajectory, "~/joint_trajectory", qos.RELIABLE)
@@ -134,7 +141,8 @@ class MotionDriver:
             self.topic.publish(message)
             self._say(f"the topic {self.topic.topic_name}; no rejection is seen")
             return
-        goal = FollowJointTrajectory.Goal(trajectory=message)
+        tolerances = {} if stop else self._tolerances
+        goal = FollowJointTrajectory.Goal(trajectory=message, **tolerances)
         future = self._client.send_goal_async(goal)
         future.add_done_callback(guarded(self._node, lambda done: self._answered(number, done)))
         self._say(f"the action {self.action}")
@@ -180,7 +188,8 @@ class MotionDriver:
     def _ended(self, number: int, future: Future) -> None:
         answer: Any = future.result()
         result, succeeded = answer.result, answer.status == GoalStatus.STATUS_SUCCEEDED
-        words = f"the controller ended the motion ({result.error_code}): {result.error_string}"
+        code = VIOLATIONS.get(result.error_code, result.error_code)
+        words = f"the controller ended the motion ({code}): {result.error_string}"
         self._report(number, ended=True, failed=not succeeded, words=words)
 
     def _report(self, number: int, **found: Any) -> None:

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Duration
+from control_msgs.msg import JointTolerance
+from numpy.typing import NDArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.errors import InputError
@@ -13,9 +15,11 @@ from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import UNSAID_S
 from robocal_ros.nodes.parameters import Setting, length
 
 NS = 1_000_000_000
+GOAL_TIME_S = 12  # the nodes wait less for a robot that does not come to rest where a motion ends
 
 
 def _of_joints(name: str, default: float, what: str, unit: str) -> Setting:
@@ -117,6 +121,27 @@ def require_limits(arm: SerialArm, config: DrivingConfig) -> None:
     config.limits.of_joints(arm)
     if not np.all(np.isfinite([arm.lower, arm.upper])):
         raise InputError(f"{arm.name} has joints without limits: add them to the robot file")
+
+
+def goal_tolerances(arm: SerialArm, config: DrivingConfig) -> dict[str, Any]:
+    """Tolerances of what moves, as fields of a FollowJointTrajectory goal; wider than `RobotWatch`.
+
+    A controller compares places of one instant: a robot that lags as much as is allowed is beside
+    its place by that way. They do not go by a plan's speeds, as joint_trajectory_controller 4.42.1
+    judges what comes on its topic later by those of the last goal.
+    """
+    near = np.where(arm.prismatic, config.deviation_m, config.deviation_rad)
+    lag = config.limits.of_joints(arm)[0] * (config.late_s + UNSAID_S)
+
+    def of_joints(allowed: NDArray[np.float64]) -> list[JointTolerance]:
+        named = zip(arm.joint_names, allowed.tolist(), strict=True)
+        return [JointTolerance(name=name, position=position) for name, position in named]
+
+    return {
+        "path_tolerance": of_joints(near + lag),
+        "goal_tolerance": of_joints(near),
+        "goal_time_tolerance": Duration(sec=GOAL_TIME_S),
+    }
 
 
 def trajectory_message(

@@ -17,6 +17,7 @@ from robocal_ros.motion.gap_sources import GapSources
 from robocal_ros.motion.graph import CommandPath
 from robocal_ros.motion.loading import load_motion
 from robocal_ros.motion.robot_watch import MotionReport
+from robocal_ros.motion.settings import goal_tolerances
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
 from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
@@ -85,6 +86,7 @@ class MaintenanceNode(HouseNode):
             self._nominal.joint_names,
             settings["follow_joint_trajectory"],
             settings["hard_stop_service"],
+            goal_tolerances(self._nominal, self._config.driving),
             self._reported,
             lambda: None if self._session is None else self._session.robot.watch,
             self._steady.now_s,

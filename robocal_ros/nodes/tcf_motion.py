@@ -17,7 +17,7 @@ from robocal_ros.motion.gap_sources import GAP_BOOL, SHORTEST_STALE_S, STATUS, G
 from robocal_ros.motion.graph import CommandPath
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
-from robocal_ros.motion.settings import MOTION, NS, driving_config, require_limits
+from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances, require_limits
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.endpoints import EndpointNode, NotActiveError
 from robocal_ros.nodes.parameters import Setting, length
@@ -83,6 +83,7 @@ class TcfMotion:
             arm.joint_names,
             settings["follow_joint_trajectory"],
             settings["hard_stop_service"],
+            goal_tolerances(arm, self._config),
             self._reported,
             lambda: None if self.driver is None else self.driver.robot,
             self._steady.now_s,

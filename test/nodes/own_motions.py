@@ -19,7 +19,7 @@ from robocal_ros.motion.driver import CONTROLLER, MotionDriver
 from robocal_ros.motion.loading import load_motion
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport
-from robocal_ros.motion.settings import MOTION, NS, driving_config
+from robocal_ros.motion.settings import MOTION, NS, driving_config, goal_tolerances
 from robocal_ros.motion.travel import joint_way
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import HouseNode
@@ -66,6 +66,7 @@ class OwnMotions(HouseNode):
             self._names,
             self.settings["follow_joint_trajectory"],
             self.settings["hard_stop_service"],
+            goal_tolerances(ARM, self._driving),
             self._reported,
             lambda: self.mover.watch,
             self._steady.now_s,

@@ -33,7 +33,9 @@ def test_the_clock_of_a_motion_is_read_before_it_goes_out(graph: Any) -> None:
         out_by_then.append(len(inbox))
 
     node = EndpointNode("driver", context=graph.context, use_global_arguments=False)
-    motion = MotionDriver(node, ("a",), "", "", lambda report: None, lambda: None, time.monotonic)
+    motion = MotionDriver(
+        node, ("a",), "", "", {}, lambda report: None, lambda: None, time.monotonic
+    )
     driver = MaintenanceDriver(node, motion, lambda number, answer: None, moves)
     node.trigger_configure()
     node.trigger_activate()
@@ -52,7 +54,9 @@ def test_a_controller_that_never_fills_its_scaling_is_not_paused(graph: Any) -> 
     graph.executor.add_node(node)
     robot = RobotWatch(ARM, DRIVING)
     names = ARM.joint_names
-    motion = MotionDriver(node, names, "", "", lambda report: None, lambda: robot, time.monotonic)
+    motion = MotionDriver(
+        node, names, "", "", {}, lambda report: None, lambda: robot, time.monotonic
+    )
     node.trigger_configure()
     node.trigger_activate()
     told = graph.publisher(JointTrajectoryControllerState, "controller_state")
