@@ -18,7 +18,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.cell_sim_messages import tolerances_of, trajectory_of
+from robocal_ros.nodes.cell_sim_messages import odd_length, tolerances_of, trajectory_of
 from robocal_ros.nodes.conversions import header
 from robocal_ros.nodes.deferred_action import DeferredActionServer
 from robocal_ros.nodes.endpoints import EndpointNode
@@ -185,7 +185,8 @@ class SimulatedController:
             feedback.velocities = array("d", qd.tobytes())
             error.velocities = array("d", bytes(qd.nbytes))  # not computed for position commands
         if "odd_lengths" in cell.faults:
-            feedback.velocities = array("d", qd[1:].tobytes())
+            missing = round(cell.faults.size("odd_lengths"))
+            feedback.velocities = array("d", odd_length(qd, missing).tobytes())
         return reference, feedback, error, output
 
 

@@ -136,11 +136,11 @@ def beam_event(edge: BeamEdge, stamp_ns: int, station: str) -> BeamEvent:
 
 
 def joint_state(
-    names: tuple[str, ...], stamp_ns: int, q: Array, qd: Array | None, odd: bool = False
+    names: tuple[str, ...], stamp_ns: int, q: Array, qd: Array | None, missing: int = 0
 ) -> JointState:
     """A reading as joint_state_broadcaster tells it: by alphabet, without effort.
 
-    ``qd`` None: hardware that has positions alone. ``odd``: a velocity is missing.
+    ``qd`` None: hardware that has positions alone. ``missing``: as `odd_length`.
     """
     order = sorted(range(len(names)), key=lambda i: names[i])
     nothing = np.full(len(names), np.nan)
@@ -149,9 +149,14 @@ def joint_state(
         header=header(stamp_ns, ""),
         name=[names[i] for i in order],
         position=array("d", q[order].tobytes()),
-        velocity=array("d", velocity[odd:].tobytes()),
+        velocity=array("d", odd_length(velocity, missing).tobytes()),
         effort=array("d", nothing.tobytes()),
     )
+
+
+def odd_length(values: Array, missing: int) -> Array:
+    """Values (n,) of which so many are missing; negative: there are so many more."""
+    return values[missing:] if missing >= 0 else np.concatenate([values, values[missing:]])
 
 
 def point(stamp_ns: int, frame: str, p: Array) -> PointStamped:

@@ -78,7 +78,7 @@ class CellOutputs:
     def tell(self, came: Happened, stamp_ns: Callable[[float], int]) -> None:
         """Publish what came; ``stamp_ns`` of a time of the cell."""
         settings, faults = self._settings, self._cell.faults
-        names, odd = self._cell.plan.arm.joint_names, "odd_lengths" in faults
+        names, missing = self._cell.plan.arm.joint_names, round(faults.size("odd_lengths"))
         for t, q, qd in zip(came.time_s.tolist(), came.q, came.qd, strict=True):
             at = stamp_ns(t)
             if "clock_reset" in faults:
@@ -87,7 +87,7 @@ class CellOutputs:
             else:
                 self._reset_ns = 0
             speed = qd if settings["velocities"] else None
-            self._send("joint_states", joint_state(names, at, q, speed, odd))
+            self._send("joint_states", joint_state(names, at, q, speed, missing))
         station = station_name(settings["station"], self._cell.faults)
         for edge in came.edges:
             self._send("beam_events", beam_event(edge, stamp_ns(edge.time_s), station))

@@ -73,6 +73,7 @@ SIZES: Mapping[AnyFault, tuple[float, float, str]] = {
     "commands_late": (200.0, 1e-3, "ms"),
     "protective_stop": (10.0, 1.0, "s"),
     "speed_scaling": (50.0, 1e-2, "%"),
+    "odd_lengths": (1.0, 1.0, ""),
     "station_knocked": (2.0, 1e-3, "mm"),
     "station_knocked_shift": (2.0, 1e-3, "mm"),
     "station_knocked_turn": (0.5, float(np.radians(1.0)), "deg"),
