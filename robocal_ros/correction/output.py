@@ -103,8 +103,13 @@ class SentPath:
 
     def at(self, rows: Array, now_s: float) -> Array:
         """Rows (r, n) of it now (n,)."""
-        t = self.time(now_s)
-        return np.array([np.interp(t, self.known_times, column) for column in rows.T])
+        t, times = self.time(now_s), self.known_times
+        k = int(np.searchsorted(times, t, side="right")) - 1
+        if not 0 <= k < len(times) - 1:
+            return rows[max(k, 0)].copy()
+        return np.asarray(
+            rows[k] + (t - times[k]) / (times[k + 1] - times[k]) * (rows[k + 1] - rows[k])
+        )
 
     def offset(self, now_s: float) -> tuple[Array, Array]:
         """Offset and its rate (n,) now, as the controller drives them between the points."""
