@@ -32,7 +32,8 @@ def stop(
     All joints slow down evenly and come to rest together, so that the way goes on in its
     direction: q(t) = q + qd (t - t^2 / 2 T). T is `stop_time`: the joint that needs longest slows
     down by ``stop_deceleration``. Where a joint would pass its limit on that way, T is what the
-    limit leaves, and all slow down harder; but never in less than ``shortest_s``.
+    limit leaves, and all slow down harder; but never in less than ``shortest_s``. A joint that
+    would still pass its limit begins slower: no stop leads beyond one.
 
     Raises
     ------
@@ -49,6 +50,8 @@ def stop(
         left = np.where(velocity != 0.0, 2.0 * room / np.abs(velocity), np.inf)
     needed = float(np.max(np.abs(velocity) / limits.of_joints(arm)[2]))
     duration = max(min(max(needed, shortest_s), float(np.min(left))), shortest_s)
+    most = 2.0 * np.maximum(room, 0.0) / duration
+    velocity = np.clip(velocity, -most, most)
     slowing = -velocity / duration
     return JointPlan(
         np.array([0.0, duration]),

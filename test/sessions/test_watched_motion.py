@@ -12,7 +12,7 @@ from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import LEAD_S, JointPlan
 from robocal_ros.motion.robot_watch import REST_RAD, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
-from robocal_ros.motion.watched_stop import WatchedStop
+from robocal_ros.motion.watched_stop import PAUSED_S, SEEN_S, STANDS_S, WatchedStop
 from robocal_ros.sessions.events import TOOL_STEP
 from robocal_ros.sessions.tool_driving import Phase
 from robocal_ros.sim.joint_motion import JointMotion
@@ -145,6 +145,60 @@ def test_a_paused_robot_is_stopped_where_it_is(robot):
     robot.speed = 1.0
     robot.run(1.0)
     assert np.max(np.abs(robot.q - here)) < 1e-4
+
+
+@pytest.mark.parametrize("lost", [1, 2, 1000])
+def test_a_stop_that_is_lost_in_a_pause_does_not_let_the_motion_go_on(lost):
+    """Finding: after 0.1 s it was over; with the pause the motion went on, 17 deg in 1 s."""
+    robot = RobotWatch(ARM, DrivingConfig(HOUSING, 0.1, 0.008, 0.05))
+    q, speed, held, now_s = HOME, 0.3 * np.eye(6)[0], False, 0.0
+    stopping = WatchedStop(ARM, MotionLimits())
+
+    def read(scaling: float) -> None:
+        nonlocal q, now_s
+        now_s += PERIOD_S
+        q = q if held else q + speed * PERIOD_S * scaling
+        robot.scaled(scaling, now_s)
+        robot.reading(now_s, q, now_s)
+        robot.silence.look(now_s)
+
+    for scaling in [1.0] * 60 + [0.0] * 60:
+        read(scaling)
+    paused = q
+    stopping.begin(stop(ARM, MotionLimits(), *robot.state(now_s, keeps=True)), now_s)
+    for _ in range(round(30.0 / PERIOD_S)):
+        read(0.0)
+        plan = stopping.look(robot, now_s)
+        if plan is not None:
+            assert np.max(np.abs(plan.q - paused)) < REST_RAD
+            held = held or stopping.sent > lost
+    assert stopping.under_way
+    assert not stopping.failed
+    assert 30.0 / PAUSED_S - 2.0 <= stopping.sent <= 30.0 / PAUSED_S + 2.0
+    went_on_s = now_s
+    while stopping.under_way:
+        read(1.0)
+        held = stopping.look(robot, now_s) is not None or held
+    assert not stopping.failed
+    assert now_s - went_on_s > STANDS_S
+    # of one that never came in: until the shortest stop is to be over, and the next one is sent
+    longest_s = SHORTEST_STOP_S + SEEN_S[False] + 2.0 * PERIOD_S
+    assert abs(q - paused)[0] <= (speed[0] * longest_s if lost == 1000 else 0.0)
+
+
+def test_a_stop_that_a_pausing_controller_is_seen_to_take_is_over():
+    robot = RobotWatch(ARM, DrivingConfig(HOUSING, 0.1, 0.008, 0.05))
+    stopping = WatchedStop(ARM, MotionLimits())
+    for number in range(200):
+        now_s = number * PERIOD_S
+        robot.scaled(float(number == 0), now_s)
+        robot.reading(now_s, HOME, now_s)
+        robot.silence.look(now_s)
+        robot.controller(HOME, 0.3 * np.eye(6)[0] * (number < 100), now_s)  # unscaled velocities
+        if number == 60:
+            stopping.begin(stop(ARM, MotionLimits(), HOME, np.zeros(6)), now_s)
+        stopping.look(robot, now_s)
+        assert stopping.under_way is (60 <= number < 100)
 
 
 # ---- stops --------------------------------------------------------------------------------------
