@@ -6,15 +6,13 @@ way of a message, which is also what names their fault.
 
 import math
 from array import array
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from builtin_interfaces.msg import Duration
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.correction.inputs import (
@@ -27,7 +25,7 @@ from robocal_ros.correction.inputs import (
     trajectory_command,
 )
 from robocal_ros.correction.wire import JointWire, SerializedPath, read_path
-from robocal_ros.nodes.conversions import NS, header
+from robocal_ros.nodes.conversions import header
 
 POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
 POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = FIELDS = range(4)
@@ -212,18 +210,3 @@ class PathMessage:
                 for point, row in zip(message.points, values, strict=True):
                     setattr(point, name, doubles(row))
         return message
-
-
-def stop_message(names: Sequence[str], times: Array, q: Array, qd: Array) -> JointTrajectory:
-    """Points (m, k) to rest, at once: a controller begins with a cubic from where it is."""
-    message = JointTrajectory(joint_names=list(names))
-    for after_s, position, velocity in zip(times.tolist(), q, qd, strict=True):
-        ns = round(after_s * NS)
-        message.points.append(
-            JointTrajectoryPoint(
-                positions=doubles(position),
-                velocities=doubles(velocity),
-                time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
-            )
-        )
-    return message

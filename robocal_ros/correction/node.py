@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NoReturn
 
@@ -16,6 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.codes import Code
+from robocal_ros.core.samples import stamp_ns
 from robocal_ros.correction.action import TrajectoryProxy
 from robocal_ros.correction.graph import (
     CommandSources,
@@ -29,13 +30,12 @@ from robocal_ros.correction.messages import (
     ArrayMessage,
     JointMessage,
     PathMessage,
-    stop_message,
     tail_message,
 )
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
-from robocal_ros.correction.robot_stop import REACTION_S, RobotStop, RobotTrack
+from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
 from robocal_ros.correction.session import CorrectionSession, load_kernels
 from robocal_ros.correction.settings import (
     SETTINGS,
@@ -46,6 +46,7 @@ from robocal_ros.correction.settings import (
 )
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
+from robocal_ros.motion.messages import REACTION_S, StatedController
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import qos
@@ -74,10 +75,10 @@ KINDS = {
     STATES: JointState,
 }
 ONE_SOURCE_S = 2.0  # of a stream: commands of another source within it are two at once
-AHEAD_S = 0.06  # where the controller is by then a stop begins to slow down
-# A stop's first point that is sent: the controller makes a cubic to it from where and as fast as it
-# is, which does not turn back where the message comes 60 ms late.
-FIRST_S = 0.12
+# First point of a stop that is not stamped: the controller makes a cubic to it from where and as
+# fast as it is, which does not turn back where the message comes 60 ms late.
+FIRST_S = 0.12 - REACTION_S
+TRUSTED = 2  # a stop that is sent more often is not stamped: the controller may reject what is
 TAIL_S = 0.01  # period of what goes out without messages, where that of the stream is not known
 ENDING_S = 0.5  # a deactivation waits so long for the robot to stand
 STOP_LOOK_S = 0.02
@@ -110,10 +111,17 @@ class JointCorrectionNode(HouseNode):
             self._session.enable(True)
         near = config.start_near(nominal)
         self._track = RobotTrack(nominal, near, config.joint_state_age_s)
+        self._arm_names = names = nominal.joint_names
+        self._controller, fastest = StatedController(), joint_limits(self.settings)
         self._stopping = RobotStop(
-            nominal, joint_limits(self.settings)[1], self._track, self._send_plan
+            nominal,
+            fastest[1],
+            self._track,
+            self._send_plan,
+            fastest[0],
+            lambda now: self._controller.reference(names, now, self._scaling),
         )
-        self._arm_names = nominal.joint_names
+        self._stop_path: SentPath | None = None  # what was put out last when a stop was sent
         self._streams = CommandSources(max(config.stream_gap_s, ONE_SOURCE_S))
         self._paths = CommandSources(config.stream_gap_s)
         self._senders = {TARGETS: self._streams, COMMANDS: self._streams, TRAJECTORY: self._paths}
@@ -410,33 +418,41 @@ class JointCorrectionNode(HouseNode):
             self._session.stream.end(RefusedError(Reason.STOPPED, why), now)
             sent = self._stop_by_readings(why, now)
         elif (planned := self._session.stop(now, AHEAD_S)) is not None:
-            times, q, qd = planned.time_from_start_s, planned.position, planned.velocity
-            assert qd is not None
-            k = min(int(np.searchsorted(times, FIRST_S)), len(times) - 1)
-            sent = self._send_stop(planned.names, times[k:] - REACTION_S, q[k:], qd[k:], why)
-            self._stopping.watch(why, times, np.abs(qd).max(axis=1), now)
+            times, speeds = planned.time_from_start_s, planned.velocity
+            assert path is not None
+            assert speeds is not None
+            plan = on_its_path(path, planned, now)
+            sent = self._send_stop(plan, planned.names, why, at_s=AHEAD_S)
+            self._stopping.watch(why, times, np.abs(speeds).max(axis=1), now)
         elif self._by_action and self._proxy is not None and self._proxy.busy:
             sent = self._stop_by_readings(why, now)
         self._arm_tail()
         if not sent and self._proxy is not None:
             self._proxy.cancel(why)
+        self._stop_path = self._session.output.path
         if self._stopping.why:
             self._stop_timer.reset()
 
     def _stop_by_readings(self, why: str, now_s: float) -> bool:
         """Stop a robot that is elsewhere than its path, which ends when the robot stands."""
         self._astray = self._session.output.path
-        sent = self._stopping.begin(why, now_s)
+        self._stop_path = self._astray
+        sent = self._stopping.begin(why, now_s, self._scaling)
         if sent:
             self._stop_timer.reset()
         return sent
 
     def _send_plan(self, plan: JointPlan) -> None:
-        end = plan.time_s[-1:], plan.q[-1:], plan.qd[-1:]
-        self._send_stop(self._arm_names, *end, self._stopping.why)
+        trusted = self._stopping.sent <= TRUSTED
+        self._send_stop(plan, self._arm_names, self._stopping.why, trusted=trusted)
 
-    def _send_stop(self, names: Any, times: Array, q: Array, qd: Array, why: str) -> bool:
-        message = stop_message(names, times, q, qd)
+    def _send_stop(self, plan: JointPlan, names: Sequence[str], why: str, **how: Any) -> bool:
+        """Send it, worded by what the controller says, else what the joint states do."""
+        now = time.monotonic()
+        self._controller.hear(self._track.velocity, len(self._arm_names), now)
+        message = self._controller.stop_message(
+            plan, names, now, self._scaling, first_s=FIRST_S, **how
+        )
         if self._by_action and self._proxy is not None:
             return self._proxy.stop(message, why)
         self._outputs[TRAJECTORY].publish(message)
@@ -453,7 +469,9 @@ class JointCorrectionNode(HouseNode):
     def _is_stopping(self) -> bool:
         """Let a stop go on; whether one is under way."""
         now = time.monotonic()
-        if self._stopping.look(now, self._scaling):
+        if self._session.output.path is not self._stop_path:
+            self._stopping.forget()
+        if self._stopping.look(now, self._scaling, self._controller.held_s):
             return True
         if self._astray is not None and not self._stopping.fault:
             self._astray.end(now)
@@ -490,12 +508,16 @@ class JointCorrectionNode(HouseNode):
         now = time.monotonic()
         self._scalings.controller(float(getattr(message, "speed_scaling_factor", math.nan)), now)
         self._rescale(now)
+        self._controller.take(message, self._scaling, now)
         position = np.array(message.reference.positions, dtype=np.float64)
+        stamp = stamp_ns(message.header.stamp)
         self._session.controller(
             tuple(message.joint_names),
             position if len(position) == len(message.joint_names) else np.empty(0),
             self._scaling,
             now,
+            np.array(message.reference.velocities, dtype=np.float64),
+            (self.now_ns() - stamp) * 1e-9 if stamp else 0.0,
         )
 
     def _on_scaling(self, message: Any) -> None:

@@ -2,29 +2,37 @@
 
 A controller has no order for "stop": one that is sent nothing, or a trajectory without points, goes
 on to where it was sent, and the cancel of a goal is a dead stop from any speed. What stops it
-smoothly is a cubic from where it is to rest, some tenths of a second ahead.
+smoothly is a motion from where it is to rest, some tenths of a second ahead.
 """
 
 from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.correction.inputs import Array, JointCommand
+from robocal_ros.correction.inputs import Array, JointCommand, TrajectoryCommand
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.robot_state import RESPONSE_S
 from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.messages import REACTION_S
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
 
 TRACK_S = 0.1  # readings of so long tell speed and standstill
 LEAST_TRACK_S = 0.02  # shorter ones tell no speed
-REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
+VELOCITY_S = 0.05  # span of the readings that give a velocity
+LEAST = 5  # of them: a single wild one is outvoted
+FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 LAG_S = 0.03  # by so much the robot, and what is known of it, may follow a stop late
 FOLLOWED = 25  # instants of a path that a place is compared with
 SEEN = 0.08  # of the fastest speed: a planned loss of so much must show, at least by half
+SLOW = 1e-3  # rad/s (m/s); a robot that was held, and moves faster, does not obey
 GIVE_UP_S = 5.0  # a robot that still moves then is stopped by a person
+PAUSED_S = 0.25  # so often a robot that pauses is sent its stop: what is lost shows when it goes on
+AHEAD_S = 0.06  # where the controller is by then a stop on its path begins to slow down
+SPACING_S = 0.01  # of the points until then
 DECELERATION = {False: 10.0, True: 1.0}  # turning rad/s^2, sliding m/s^2, where none is known
 
 
@@ -40,6 +48,8 @@ class RobotTrack:
     def __init__(self, arm: SerialArm, near: Array, age_limit_s: float) -> None:
         self._number = {name: i for i, name in enumerate(arm.joint_names)}
         self._near, self._age_limit_s = near, age_limit_s
+        changes = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
+        self._turned = 0.5 * VELOCITY_S * changes + near / LEAST_TRACK_S
         self._q, self._qd = np.full(arm.n, np.nan), np.full(arm.n, np.nan)
         self._read_s = np.full(arm.n, -np.inf)
         self._track: deque[tuple[float, Array]] = deque()
@@ -57,7 +67,9 @@ class RobotTrack:
         if len(state.position) != len(state.names) or not len(self._index):
             return
         was_silent = self._silent(now_s)
-        self._q[self._index] = state.position[self._column]
+        if was_silent:  # what it did meanwhile is not known
+            self._track.clear()
+        self._q[self._index] = np.clip(state.position[self._column], -FARTHEST, FARTHEST)
         self._qd[self._index] = np.nan
         if state.velocity is not None and len(state.velocity) == len(state.names):
             self._qd[self._index] = state.velocity[self._column]
@@ -71,21 +83,45 @@ class RobotTrack:
     def _silent(self, now_s: float) -> bool:
         return not now_s - float(np.min(self._read_s)) <= self._age_limit_s
 
+    @property
+    def velocity(self) -> Array:
+        """(n,) as read last; NaN where there is none."""
+        return self._qd
+
     def here(self, now_s: float) -> tuple[Array, Array] | None:
         """Joints and speeds (n,) now; None where they were not all read lately."""
         if self._silent(now_s):
             return None
-        age_s = now_s - float(np.min(self._read_s))
-        last_s = self._track[-1][0]
-        earlier = [place for place in self._track if last_s - place[0] >= LEAST_TRACK_S]
-        qd = self._qd
-        if not (np.isfinite(qd).all() and qd.any()):  # there are drivers that say 0 in motion
-            if not earlier:
-                return None
-            since_s, before = earlier[-1]
-            qd = (self._q - before) / (last_s - since_s)
-        here = self._q + qd * age_s
+        q, qd = self._newest()
+        here = q + qd * (now_s - float(np.min(self._read_s)))
         return (here, qd) if np.isfinite(here).all() else None
+
+    def _newest(self) -> tuple[Array, Array]:
+        """Joints and speeds (n,) as read last, where the readings of before bear them out.
+
+        Else those of most readings (Theil-Sen: the medians of the slopes of pairs, and of where
+        each reading puts it): a stop from a single wild reading would be a motion of its own.
+        """
+        read = self._qd if self._qd.any() else np.nan * self._qd  # some drivers say 0 in motion
+        since_s = self._track[-1][0] - VELOCITY_S
+        count = max(sum(at_s >= since_s for at_s, _ in self._track), LEAST)
+        recent = list(self._track)[-count:]
+        times, q = np.array([at_s for at_s, _ in recent]), np.array([place for _, place in recent])
+        i, j = np.triu_indices(len(times), 1)
+        apart = times[j] - times[i] >= LEAST_TRACK_S
+        if not apart.any():
+            return self._q, read
+        i, j = i[apart], j[apart]
+        slope = np.median((q[j] - q[i]) / (times[j] - times[i])[:, None], axis=0)
+        place = np.median(q + (times[-1] - times)[:, None] * slope, axis=0)
+        speed = np.where(np.abs(read - slope) <= self._turned, read, slope)
+        beside = self._turned * max(float(times[-1] - times[0]), LEAST_TRACK_S)
+        return np.where(np.abs(self._q - place) <= beside, self._q, place), speed
+
+    def behind(self, told: tuple[Array, Array], here: tuple[Array, Array]) -> bool:
+        """Whether the robot is where a controller has it, but for its lag."""
+        reach = LAG_S * (np.abs(told[1]) + np.abs(here[1])) + self._near
+        return bool(np.all(np.abs(told[0] - here[0]) < reach))
 
     def stands(self, now_s: float) -> bool:
         """Whether all joints were read lately, and have not moved for `TRACK_S`."""
@@ -116,8 +152,10 @@ class RobotStop:
 
     Parameters
     ----------
-    acceleration : (n,) largest, rad/s^2 (prismatic: m/s^2); NaN where none is known.
-    send : puts a plan out; the plan's first point after its begin is ahead of now.
+    acceleration, velocity : (n,) largest, rad/s^2, rad/s (prismatic: m/s^2 ...); NaN or infinite
+        where none is known.
+    send : puts a plan out, which goes on for `REACTION_S` from now.
+    reference : joints and unscaled velocities (n,) where the controller is; None: not known.
 
     Attributes
     ----------
@@ -132,27 +170,36 @@ class RobotStop:
         acceleration: Array,
         track: RobotTrack,
         send: Callable[[JointPlan], None],
+        velocity: ArrayLike = np.inf,
+        reference: Callable[[float], tuple[Array, Array] | None] = lambda now_s: None,
     ) -> None:
         assumed = np.where(arm.prismatic, DECELERATION[True], DECELERATION[False])
         known = np.isfinite(acceleration) & (acceleration > 0.0)
         self._limits = MotionLimits(stop_deceleration=np.where(known, acceleration, assumed))
-        self._arm, self._track, self._send = arm, track, send
-        self._began_s = self._sent_s = 0.0
+        self._fastest = np.where(np.isnan(velocity), np.inf, velocity)
+        self._arm, self._track, self._send, self._reference = arm, track, send, reference
+        self._began_s = self._first_s = self._sent_s = 0.0
+        self._paused_s = -np.inf  # when the controller's clock was last seen to stand
         self._times = self._speeds = np.zeros(1)
         self.why = self.fault = ""
         self.sent = 0
 
-    def begin(self, why: str, now_s: float) -> bool:
+    def begin(self, why: str, now_s: float, scaling: float = 1.0) -> bool:
         """Send a stop; False, with the fault, where the robot's place is not known."""
         if not self.why:
-            self._began_s, self.sent = now_s, 0
+            self._began_s = self._first_s = now_s
+            self.sent = 0
         self.why = why
-        if self._again(now_s):
+        if self._again(now_s, scaling):
             self.fault = ""
             return True
         self.why = ""
         self.fault = f"{why}: no stop can be planned, the joint states are missing or too old"
         return False
+
+    def forget(self) -> None:
+        """Another motion has been sent."""
+        self.why = ""
 
     def watch(self, why: str, times: Array, speeds: Array, now_s: float) -> None:
         """Watch a stop that was sent by others, and send one of its own where it is not obeyed.
@@ -161,20 +208,31 @@ class RobotStop:
         """
         here = self._track.here(now_s)
         measured = 0.0 if here is None else float(np.max(np.abs(here[1])))
-        self._began_s = self._sent_s = now_s
+        self._began_s = self._first_s = self._sent_s = now_s
         self._times = np.append(0.0, times * max(SHORTEST_STOP_S / times[-1], 1.0))
         self._speeds, self.sent = np.append(measured, speeds), 1
         self.why, self.fault = why, ""
 
-    def look(self, now_s: float, scaling: float = 1.0) -> bool:
+    def look(self, now_s: float, scaling: float = 1.0, held_s: float = -np.inf) -> bool:
         """Whether a stop is under way; sent again where the robot does not obey.
 
-        ``scaling``: how fast the controller's clock runs, 0 to 1.
+        ``scaling``: how fast the controller's clock runs, 0 to 1. While it pauses a robot stands
+        whatever it was sent last: the stop goes out again and again, and is not over before the
+        robot has stood with a clock that runs, or the controller was seen, at ``held_s``, to hold
+        in place of a motion.
         """
         if not self.why:
             return False
+        stands = self._track.stands(now_s)
+        if scaling == 0.0:
+            self._began_s = self._paused_s = now_s
+            if now_s - self._sent_s > TRACK_S and held_s > self._first_s and stands:
+                self.why = ""
+            elif now_s - self._sent_s >= PAUSED_S:
+                self._again(now_s, scaling)
+            return bool(self.why)
         since_s = now_s - self._sent_s
-        if since_s > TRACK_S and self._track.stands(now_s):
+        if now_s - max(self._sent_s, self._paused_s) > TRACK_S and stands:
             self.why = ""
             return False
         if now_s - self._began_s > GIVE_UP_S / max(scaling, 0.1):
@@ -183,21 +241,43 @@ class RobotStop:
             return False
         here = self._track.here(now_s)
         planned = float(np.interp((since_s - LAG_S) * scaling, self._times, self._speeds))
-        fastest = float(np.max(self._speeds))
-        if here is not None and planned < (1.0 - SEEN) * fastest:
+        fastest = max(float(np.max(self._speeds)), SLOW)
+        if here is not None and since_s > LAG_S and planned < (1.0 - SEEN) * fastest:
             speed = float(np.max(np.abs(here[1])))
-            if speed > 0.5 * (fastest + planned) and not self._track.stands(now_s):
-                self._again(now_s)
+            if speed > 0.5 * (fastest + planned) and not stands:
+                self._again(now_s, scaling)
         return True
 
-    def _again(self, now_s: float) -> bool:
-        here = self._track.here(now_s)
-        if here is None:
+    def _again(self, now_s: float, scaling: float) -> bool:
+        state = self._state(now_s)
+        if state is None:
             return False
-        q, qd = here
-        plan = stop(self._arm, self._limits, q + qd * REACTION_S, qd)
+        q, qd = state
+        qd = np.clip(qd, -self._fastest, self._fastest) if scaling > 0.0 else 0.0 * qd
+        plan = stop(self._arm, self._limits, q, qd)
         self._times, self._speeds = plan.time_s, np.abs(plan.qd).max(axis=1)
         self._sent_s = now_s
         self.sent += 1
-        self._send(plan)
+        self._send(plan.going_on(REACTION_S))
         return True
+
+    def _state(self, now_s: float) -> tuple[Array, Array] | None:
+        """Joints and speeds (n,) to stop from: the controller's, where the robot follows it."""
+        here, told = self._track.here(now_s), self._reference(now_s)
+        if here is None or told is None:
+            return here
+        return told if self._track.behind(told, here) else here
+
+
+def on_its_path(path: SentPath, planned: TrajectoryCommand, now_s: float) -> JointPlan:
+    """A stop ``planned`` on a path, with its way since `AHEAD_S` before now: so far it is now."""
+    at_s = now_s + np.arange(-AHEAD_S, AHEAD_S - 1e-9, SPACING_S)
+    h = 1e-4
+    before, q, after = (np.array([path.place(at + d) for at in at_s]) for d in (-h, 0.0, h))
+    assert planned.velocity is not None
+    return JointPlan(
+        np.concatenate([at_s - at_s[0], AHEAD_S + planned.time_from_start_s]),
+        np.concatenate([q, planned.position]),
+        np.concatenate([(after - before) / (2.0 * h), planned.velocity]),
+        np.zeros((len(at_s) + len(planned.position), q.shape[1])),
+    )

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 from action_msgs.msg import GoalStatus
-from builtin_interfaces.msg import Time
 from control_msgs.action import FollowJointTrajectory
 from control_msgs.msg import JointTrajectoryControllerState
-from numpy.typing import NDArray
 from rclpy.action import ActionClient
 from rclpy.task import Future
 from robocal_msgs.msg import MotionLease
@@ -24,10 +22,10 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import stamp_ns
+from robocal_ros.motion.messages import REACTION_S, StatedController
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
-from robocal_ros.motion.settings import NS, trajectory_message
+from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.endpoints import EndpointNode
@@ -52,12 +50,6 @@ VIOLATIONS = {
     FollowJointTrajectory.Result.PATH_TOLERANCE_VIOLATED: "PATH_TOLERANCE_VIOLATED",
     FollowJointTrajectory.Result.GOAL_TOLERANCE_VIOLATED: "GOAL_TOLERANCE_VIOLATED",
 }
-LINES_S = 0.01  # between points for a controller that has no velocities
-STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
-STAMP_LEAD_S = (
-    0.01  # at the present speed, until a stop that is stamped begins: it is taken by then
-)
-BESIDE = 1e-3  # rad (m); a plan that begins further from the controller's reference is not of it
 
 
 class MotionDriver:
@@ -100,11 +92,8 @@ class MotionDriver:
             JointTrajectoryControllerState, "controller_state", self._take_state, qos.SENSOR
         )
         node.add_input(Float64, "speed_scaling", self._take_scaling, qos.SENSOR)
-        self._stated_s = -np.inf  # when the controller told its state
-        self._stated: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
-        self._ahead_s = np.inf  # its clock, of this one, by its last stamp
+        self._controller = StatedController()
         self._scaling, self._rejected = SpeedScaling(), False
-        self._velocities = True  # whether the hardware has any, as far as the controller says
         self._newest = 0
         self.way = ""
 
@@ -119,22 +108,21 @@ class MotionDriver:
     def send(self, plan: JointPlan, *, stop: bool) -> None:
         """Send a motion, which takes the place of what the controller drives.
 
-        A stop is stamped with the controller's own time of the plan's begin, where the controller
-        tells its reference: then the command goes on along the plan without a step, whatever the
-        hardware tells and however it lags, and a stop that comes after its end is rejected. After
-        a rejection no stamp is trusted: then it begins when it arrives, where the robot is
-        measured; as lines, where the hardware tells no velocities: the controller would begin
-        cubics with a speed of 0 (Trajectory::set_point_before_trajectory_msg, ros2_controllers
-        4.42.1).
+        A stop is worded by what the controller says of itself (`StatedController`). After a
+        rejection no stamp is trusted.
         """
         self._rejected = self._rejected and stop
-        begins_ns = self._begin_ns(plan) if stop and not self._rejected else None
-        if begins_ns is not None:
-            message = trajectory_message(plan.going_on(STAMP_LEAD_S), self._names, at_once=True)
-            message.header.stamp = Time(sec=begins_ns // NS, nanosec=begins_ns % NS)
+        if stop:
+            now_s = self._now()
+            message = self._controller.stop_message(
+                plan.going_on(REACTION_S),
+                self._names,
+                now_s,
+                self._scaling.at(now_s),
+                trusted=not self._rejected,
+            )
         else:
-            spacing_s = LINES_S if stop and not self._velocities else 0.0
-            message = trajectory_message(plan, self._names, spacing_s=spacing_s)
+            message = trajectory_message(plan, self._names)
         self._newest += 1
         number = self._newest
         if self._client is None or not self._client.server_is_ready():
@@ -146,25 +134,6 @@ class MotionDriver:
         future = self._client.send_goal_async(goal)
         future.add_done_callback(guarded(self._node, lambda done: self._answered(number, done)))
         self._say(f"the action {self.action}")
-
-    def _begin_ns(self, plan: JointPlan) -> int | None:
-        """When the controller is where the plan begins, by its own clock; None: not known.
-
-        A scaled clock counts from a stamp on as if it were not.
-        """
-        now_s = self._now()
-        if self._stated is None or now_s - self._stated_s > STATED_S:
-            return None
-        if self._scaling.at(now_s) not in (None, 1.0):
-            return None
-        begin_ns, q, qd = self._stated
-        speed = float(np.linalg.norm(qd))
-        if not 0.0 < speed < np.inf:
-            return None
-        after_s = float((plan.q[0] - q) @ qd) / speed**2
-        beside = np.max(np.abs(plan.q[0] - q - after_s * qd))
-        known = abs(after_s) < STATED_S and beside < BESIDE
-        return begin_ns + round(after_s * NS) if known else None
 
     def _say(self, way: str) -> None:
         if way == self.way:
@@ -222,32 +191,20 @@ class MotionDriver:
                 raise InputError(f"no joint {', '.join(missing)} in this controller")
             self._index = {names: [names.index(name) for name in self._names]}
         index, count = self._index[names], len(names)
-        speeds = np.array(message.feedback.velocities, dtype=np.float64)
-        known = len(speeds) == count and bool(np.isfinite(speeds).all())
-        self._velocities = known and bool(speeds.any())
-        begin_ns, self._stated_s, self._stated = stamp_ns(message.header.stamp), now_s, None
-        before_s, self._ahead_s = self._ahead_s, begin_ns / NS - now_s
         self._scaling.controller(getattr(message, "speed_scaling_factor", np.nan), now_s)
+        self._controller.take(message, self._scaling.at(now_s), now_s)
         if robot is not None:
             self._tell_scaling(robot, now_s)
         reference = message.reference
         if len(reference.positions) != count or len(reference.velocities) != count:
             return  # a controller that holds may leave them out
         q, qd = np.array(reference.positions)[index], np.array(reference.velocities)[index]
-        if abs(self._ahead_s - before_s) < STATED_S:
-            self._stated = begin_ns, q, qd
         if robot is not None:
             robot.controller(q, qd, now_s)
 
     def hear(self, message: Any) -> None:
-        """Take a JointState: where the controller does not, it tells whether there are velocities.
-
-        Some hardware says 0 in motion; a stop of a robot that stands may be of either kind.
-        """
-        if self._now() - self._stated_s > 1.0:
-            speeds = np.array(message.velocity, dtype=np.float64)
-            known = len(speeds) == len(message.name) and bool(np.isfinite(speeds).all())
-            self._velocities = known and bool(speeds.any())
+        """Take a JointState, which may tell whether there are velocities."""
+        self._controller.hear(message.velocity, len(message.name), self._now())
 
     def _take_scaling(self, message: Any) -> None:
         robot, now_s = self._robot(), self._now()

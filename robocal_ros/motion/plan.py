@@ -87,17 +87,9 @@ class JointPlan:
         rates = (np.concatenate([part[:1], part]) for part in (self.qd, self.qdd))
         return JointPlan(np.concatenate([[0.0], self.time_s + lead_s]), further, *rates)
 
-    def points(self, spacing_s: float = 0.0) -> tuple[Array, Array, Array]:
-        """Times (k,), joints and velocities (k, n) that a controller is sent.
-
-        The first is `LEAD_S` ahead. ``spacing_s``: so close together, for a controller that makes
-        lines of positions; 0: those of the plan.
-        """
-        if spacing_s > 0.0:
-            count = max(int(np.ceil((self.duration_s - LEAD_S) / spacing_s)), 1)
-            time = np.linspace(LEAD_S, max(self.duration_s, 2.0 * LEAD_S), count + 1)
-        else:
-            time = np.concatenate([[LEAD_S], self.time_s[self.time_s > LEAD_S + 1e-4]])
+    def points(self) -> tuple[Array, Array, Array]:
+        """Times (k,), joints and velocities (k, n) that a controller is sent; first: `LEAD_S`."""
+        time = np.concatenate([[LEAD_S], self.time_s[self.time_s > LEAD_S + 1e-4]])
         q, qd = self.at(time)
         qd[-1] = 0.0  # exactly: a controller rejects a trajectory that does not end at rest
         return time, q, qd

@@ -7,13 +7,14 @@ import numpy as np
 from builtin_interfaces.msg import Duration
 from control_msgs.msg import JointTolerance
 from numpy.typing import NDArray
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.limits import MotionLimits
+from robocal_ros.motion.messages import joint_trajectory
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import UNSAID_S
 from robocal_ros.nodes.parameters import Setting, length
@@ -144,23 +145,6 @@ def goal_tolerances(arm: SerialArm, config: DrivingConfig) -> dict[str, Any]:
     }
 
 
-def trajectory_message(
-    plan: JointPlan, names: Sequence[str], *, spacing_s: float = 0.0, at_once: bool = False
-) -> JointTrajectory:
-    """A plan for a trajectory controller, which begins when it arrives.
-
-    ``spacing_s``: as `JointPlan.points`; then positions alone. ``at_once``: from the plan's begin
-    on, for a message whose stamp says when that is.
-    """
-    message = JointTrajectory(joint_names=list(names))
-    parts = (plan.time_s, plan.q, plan.qd) if at_once else plan.points(spacing_s)
-    for t, q, qd in zip(*(part.tolist() for part in parts), strict=True):
-        ns = round(t * NS)
-        message.points.append(
-            JointTrajectoryPoint(
-                positions=q,
-                velocities=[] if spacing_s else qd,
-                time_from_start=Duration(sec=ns // NS, nanosec=ns % NS),
-            )
-        )
-    return message
+def trajectory_message(plan: JointPlan, names: Sequence[str]) -> JointTrajectory:
+    """A plan for a trajectory controller, which begins when it arrives."""
+    return joint_trajectory(names, *plan.points())

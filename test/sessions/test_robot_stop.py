@@ -6,19 +6,37 @@ from scipy.interpolate import CubicHermiteSpline
 
 from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.correction.output import SentPath
-from robocal_ros.correction.robot_stop import RobotStop, RobotTrack
+from robocal_ros.correction.robot_stop import (
+    LAG_S,
+    PAUSED_S,
+    TRACK_S,
+    VELOCITY_S,
+    RobotStop,
+    RobotTrack,
+)
+from robocal_ros.motion.messages import REACTION_S
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.storage.robots import load_description
 
 ROBOT = load_description("kr150_r3100")
 ARM = ROBOT.arm
 CYCLE_S = 0.004
+STOP_LOOK_S = 0.02  # a node looks so often
 DELAY_S = 0.01  # of trajectories, and of readings
 SPEED = np.array([0.9, -0.4, 0.5, 1.0, -0.2, 0.3])
 HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])
 
 
+def lasts_s(plan: JointPlan) -> float:
+    """How long a stop lasts from its arrival on."""
+    return plan.duration_s - REACTION_S
+
+
 class SimulatedController:
     """Drives on at constant speed; a trajectory is a cubic from where it is, after `DELAY_S`.
+
+    It begins as fast as the drives are, which a scaled clock slows down.
 
     Parameters
     ----------
@@ -47,8 +65,10 @@ class SimulatedController:
         self.now_s += CYCLE_S
         while self._coming and self._coming[0][0] <= self.now_s:
             plan = self._coming.pop(0)[1]
-            ends = np.array([0.0, plan.duration_s])
-            self._spline = CubicHermiteSpline(ends, [self.q, plan.q[-1]], [self.qd, 0.0 * self.qd])
+            ends = np.array([0.0, lasts_s(plan)])
+            self._spline = CubicHermiteSpline(
+                ends, [self.q, plan.q[-1]], [self.scaling * self.qd, 0.0 * self.qd]
+            )
             self._clock_s = 0.0
         before = self.q
         if self._spline is None:
@@ -87,14 +107,14 @@ def test_a_stop_goes_on_in_its_direction_and_ends_at_rest(reports):
     robot = SimulatedController(reports=reports)
     robot.run(0.3)
     begin = len(robot.out)
-    lasts_s = robot.stops()
+    took_s = robot.stops()
     assert not robot.stop.fault
     assert robot.stop.sent == 1
-    assert lasts_s <= 1.05 * robot.plans[0].duration_s + DELAY_S + CYCLE_S
+    assert took_s <= 1.05 * lasts_s(robot.plans[0]) + DELAY_S + CYCLE_S
     ways = np.diff(robot.out[begin - 1 :], axis=0)
     assert np.all(ways * SPEED >= -1e-9)  # never back
     rates = ways / CYCLE_S
-    most = 2.0 * np.abs(SPEED) / robot.plans[0].duration_s  # a cubic's own is 1.5 at its steepest
+    most = 2.0 * np.abs(SPEED) / lasts_s(robot.plans[0])  # a cubic's own is 1.5 at its steepest
     assert np.all(np.abs(np.diff(rates, axis=0)) <= most * CYCLE_S)
 
 
@@ -102,10 +122,10 @@ def test_a_stop_goes_on_in_its_direction_and_ends_at_rest(reports):
 def test_a_stop_that_is_lost_is_sent_again(losses):
     robot = SimulatedController(losses)
     robot.run(0.3)
-    lasts_s = robot.stops()
+    took_s = robot.stops()
     assert robot.stop.sent == losses + 1
     assert not robot.stop.fault
-    assert lasts_s <= 1.5 * robot.plans[0].duration_s
+    assert took_s <= 1.5 * lasts_s(robot.plans[0])
 
 
 @pytest.mark.parametrize("scaling", [0.1, 0.5])
@@ -182,3 +202,114 @@ def test_whether_a_robot_follows_its_path(late_s):
     path.scale(0.0, robot.now_s)
     robot.run(1.0)
     assert not robot.track.follows(path, robot.now_s)
+
+
+# ---- pauses -------------------------------------------------------------------------------------
+
+
+def pauses(robot: SimulatedController, seconds: float, held_s: float = -np.inf) -> bool:
+    """Watch a stop while the controller's clock stands; whether it is still under way."""
+    robot.scaling = 0.0
+    for _ in range(round(seconds / CYCLE_S)):
+        robot.cycle()
+        robot.stop.look(robot.now_s, 0.0, held_s)
+    return bool(robot.stop.why)
+
+
+@pytest.mark.parametrize("losses", [1, 2, 10_000])
+def test_a_stop_that_is_lost_in_a_pause_is_sent_until_the_robot_stands_by_itself(losses):
+    """Finding: after 0.1 s it was over; with the pause the old motion went on."""
+    robot = SimulatedController()
+    robot.run(0.3)
+    robot.scaling = 0.0
+    robot.run(0.3)
+    paused, robot.losses = robot.q, losses
+    assert robot.stop.begin("a test", robot.now_s, 0.0)
+    assert pauses(robot, 60.0)  # longer than what still moves is given
+    assert not robot.stop.fault
+    assert 60.0 / PAUSED_S - 2 <= robot.stop.sent <= 60.0 / PAUSED_S + 2
+    robot.scaling, robot.losses = 1.0, 0
+    went_on_s = robot.now_s
+    while robot.stop.look(robot.now_s):
+        robot.cycle()
+    assert robot.now_s - went_on_s > TRACK_S
+    assert not robot.stop.fault
+    # Held in the pause it stays. Where each message was lost its motion goes on, is seen to within
+    # the time that readings take to tell a speed, and slows down as any stop that was lost once.
+    far = np.abs(robot.q - paused)
+    seen_s = VELOCITY_S + LAG_S + STOP_LOOK_S + DELAY_S
+    slows_s = 0.5 * max(np.max(np.abs(SPEED) / ROBOT.max_acceleration), SHORTEST_STOP_S)
+    assert np.all(far <= (np.abs(SPEED) * (seen_s + slows_s) if losses > 100 else 1e-9))
+
+
+def test_a_stop_that_a_controller_is_seen_to_take_in_a_pause_is_over():
+    robot = SimulatedController()
+    robot.run(0.3)
+    robot.scaling = 0.0
+    robot.run(0.3)
+    before_s = robot.now_s
+    assert robot.stop.begin("a test", robot.now_s, 0.0)
+    assert pauses(robot, 0.2, held_s=before_s - 0.1)  # that was an earlier motion
+    assert not pauses(robot, 0.2, held_s=robot.now_s)
+
+
+# ---- what is read -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("joint", "told"), [(0, 57.3), (2, 30.0), (5, 3.0), (5, -1e300), (1, np.inf), (0, 0.0)]
+)
+def test_a_velocity_that_the_positions_do_not_bear_out_is_not_stopped_from(joint, told):
+    """Finding: one velocity in degrees gave a stop that ended 230 deg ahead."""
+    robot = SimulatedController()
+    robot.qd = SPEED * [1, 1, 1, 1, 1, 0]
+    robot.run(0.3)
+    odd = robot.qd.copy()
+    odd[joint] = told
+    robot.track.read(JointCommand(ARM.joint_names, robot.q, odd), robot.now_s)
+    assert robot.stop.begin("a test", robot.now_s)
+    plan = robot.plans[0]
+    assert plan.qd[0] == pytest.approx(robot.qd, abs=1e-6)
+    assert plan.duration_s <= np.max(np.abs(SPEED) / ROBOT.max_acceleration) + REACTION_S
+
+
+@pytest.mark.parametrize("away", [-2.0, 0.3, 1e12])
+def test_a_single_wild_position_is_not_stopped_from(away):
+    robot = SimulatedController(reports="nan")
+    robot.run(0.3)
+    wild = robot.q + CYCLE_S * SPEED + away * np.eye(6)[3]
+    robot.track.read(JointCommand(ARM.joint_names, wild), robot.now_s + CYCLE_S)
+    assert robot.stop.begin("a test", robot.now_s + CYCLE_S)
+    assert robot.plans[0].q[0] == pytest.approx(robot.q + CYCLE_S * SPEED, abs=1e-3)
+    assert robot.plans[0].qd[0] == pytest.approx(SPEED, abs=1e-2)
+
+
+def test_a_stop_keeps_to_the_joints_speeds_and_limits():
+    """Even where all readings say that the robot is faster, and as good as at its limits."""
+    robot = SimulatedController()
+    robot.stop = RobotStop(
+        ARM, ROBOT.max_acceleration, robot.track, robot._take, ROBOT.max_velocity
+    )
+    robot.qd = 5.0 * ROBOT.max_velocity
+    robot.q = ARM.upper - 0.01 - 0.1 * robot.qd
+    robot.run(0.1)
+    assert robot.stop.begin("a test", robot.now_s)
+    plan = robot.plans[0]
+    assert np.all(plan.qd <= ROBOT.max_velocity + 1e-12)
+    between, _ = plan.at(np.linspace(0.0, plan.duration_s, 50))
+    assert np.all(between <= ARM.upper + REACTION_S * ROBOT.max_velocity)
+
+
+def test_a_stop_begins_where_the_controller_is_while_the_robot_follows_it():
+    robot = SimulatedController()
+    told = [HOME, SPEED]
+    robot.stop = RobotStop(
+        ARM, ROBOT.max_acceleration, robot.track, robot._take, reference=lambda now: tuple(told)
+    )
+    robot.run(0.3)
+    told[0] = robot.q + 0.014 * SPEED  # by which drives lag
+    assert robot.stop.begin("a test", robot.now_s)
+    assert robot.plans[0].q[0] == pytest.approx(told[0], abs=1e-12)
+    told[0] = robot.q + 0.3  # a robot that is held, or another one's controller
+    assert robot.stop.begin("a test", robot.now_s)
+    assert robot.plans[1].q[0] == pytest.approx(robot.q, abs=1e-6)

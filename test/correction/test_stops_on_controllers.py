@@ -1,0 +1,147 @@
+"""Stops of what was put out, on controllers as they are: judged by each cycle of their command."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from correction_robot import HOME, NAMES, NOMINAL, Robot
+
+from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
+from robocal_ros.correction.node import FIRST_S
+from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
+from robocal_ros.motion.messages import StatedController
+from robocal_ros.sim.joint_motion import CYCLE_S, LAG_S, JointMotion
+from robocal_ros.sim.trajectory import Trajectory
+from robocal_ros.sim.trajectory_goal import ControllerOptions
+from robocal_ros.storage.robots import load_description
+
+SPEED = 1.0  # rad/s of the first joint
+BRAKES = load_description("kr150_r3100").max_acceleration[0]
+REACTION_S = 0.01
+STATES_S = 0.008
+T = np.linspace(0.0, 5.0, 501)
+RATE = SPEED * np.clip(np.minimum(T, 5.0 - T) / 0.5, 0.0, 1.0)
+WAY = np.concatenate([[0.0], np.cumsum(0.5 * (RATE[1:] + RATE[:-1]) * np.diff(T))])
+Q, QD = np.tile(HOME, (len(T), 1)), np.zeros((len(T), 6))
+Q[:, 0], QD[:, 0] = HOME[0] - 2.0 + WAY, RATE
+
+
+class Driven:
+    """The session of a robot that drives, 2 s on its way, on a simulated controller."""
+
+    def __init__(self, velocities: bool, lag_s: float, told: bool) -> None:
+        self.robot, self.velocities = Robot(), velocities
+        robot = self.robot
+        robot.at = Q[0]
+        robot.rest()
+        self.begin_s = robot.now
+        robot.session.trajectory(TrajectoryCommand(NAMES, Q, T, QD), robot.now)
+        robot.session.output.path.begin(robot.now)
+        options = ControllerOptions(velocity_states=velocities)
+        self.motion = JointMotion(Q[0], names=NAMES, options=options, lag_s=lag_s)
+        self.motion.take(REACTION_S, Trajectory.of(NAMES, T[1:], Q[1:], QD[1:]))
+        self.stated = StatedController()
+        self.track = RobotTrack(NOMINAL, np.full(6, 3.5e-4), 0.2)
+        for at_s in np.arange(1.8, 2.0, STATES_S):
+            self.pass_to(float(at_s), told)
+        robot.now = self.begin_s + 2.0
+
+    def pass_to(self, at_s: float, told: bool) -> None:
+        """Until then; the controller tells its state, and the joints theirs."""
+        self.motion.pass_to(at_s)
+        q, qd, _, _, desired, rate, _ = self.motion.last()[1]
+        now_s, state = self.begin_s + at_s, np.floor(at_s / CYCLE_S + 1e-9) * CYCLE_S
+        speeds = qd if self.velocities else np.full(6, np.nan)
+        self.track.read(JointCommand(NAMES, q, speeds), now_s)
+        if told:
+            stamp = SimpleNamespace(sec=int(state), nanosec=round(state % 1 * 1e9))
+            self.stated.take(
+                SimpleNamespace(
+                    header=SimpleNamespace(stamp=stamp),
+                    joint_names=list(NAMES),
+                    feedback=SimpleNamespace(velocities=qd if self.velocities else []),
+                    reference=SimpleNamespace(positions=desired, velocities=rate),
+                ),
+                1.0,
+                now_s,
+            )
+        else:
+            self.stated.hear(speeds, 6, now_s)
+
+    def obeys(self, message: Any, late_s: float) -> np.ndarray:
+        """Take a stop so late; the speed of the command in each cycle, from just before."""
+        stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        points = message.points
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points]
+        speeds = [p.velocities for p in points] if points[0].velocities else None
+        places = [p.positions for p in points]
+        given = Trajectory.of(message.joint_names, times, places, speeds, start_s=stamp_s or None)
+        self.motion.take(2.0 + late_s, given)
+        self.motion.pass_to(3.5)
+        rows = self.motion._rows[: self.motion._count - self.motion._begin]
+        return np.diff(rows[round(1.9 / CYCLE_S) :, 2, 0]) / CYCLE_S
+
+
+def by_its_path(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
+    """For a trajectory without points, a lease, a deactivation."""
+    session, now_s = driven.robot.session, driven.robot.now
+    path = session.output.path
+    planned = session.stop(now_s, AHEAD_S)
+    plan = on_its_path(path, planned, now_s)
+    message = driven.stated.stop_message(
+        plan, planned.names, now_s, 1.0, at_s=AHEAD_S, first_s=FIRST_S
+    )
+    return driven.obeys(message, late_s), bool(message.header.stamp.sec)
+
+
+def by_readings(driven: Driven, late_s: float) -> tuple[np.ndarray, bool]:
+    """Of a robot that is elsewhere than its path, or drives on."""
+    now_s, plans = driven.robot.now, []
+    reference = lambda now: driven.stated.reference(NAMES, now, 1.0)  # noqa: E731
+    acceleration = load_description("kr150_r3100").max_acceleration
+    stopping = RobotStop(NOMINAL, acceleration, driven.track, plans.append, reference=reference)
+    assert stopping.begin("a test", now_s)
+    message = driven.stated.stop_message(plans[0], NAMES, now_s, 1.0, first_s=FIRST_S)
+    return driven.obeys(message, late_s), bool(message.header.stamp.sec)
+
+
+STOPS = [by_its_path, by_readings]
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("velocities", [True, False])
+@pytest.mark.parametrize("lag_s", [0.0, LAG_S])
+def test_a_stop_on_a_controller_that_tells_its_reference_never_steps(stop, velocities, lag_s):
+    """Finding: the command went back at 2.5 and 3.4 rad/s for a cycle, and stood for one."""
+    for late_s in (0.008, 0.02, 0.05) if stop is by_its_path else (0.008,):
+        speed, stamped = stop(Driven(velocities, lag_s, told=True), late_s)
+        assert stamped
+        assert np.min(speed) > -1e-3
+        assert np.max(speed) < SPEED + 1e-3
+        # The robot brakes as it may. From readings it begins to 10 ms after they came, and what is
+        # taken up to a cycle later has a second cycle's braking to do in the first one.
+        cycles = 1.05 if stop is by_its_path else 2.0
+        assert np.max(np.abs(np.diff(speed))) < cycles * BRAKES * CYCLE_S
+        assert speed[-1] == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("velocities", [True, False])
+def test_without_its_reference_a_stop_steps_by_no_more_than_the_drives_lag(stop, velocities):
+    """Any trajectory that is not stamped begins where the drives are: that is the controller's."""
+    speed, stamped = stop(Driven(velocities, 0.0, told=False), 0.008)
+    assert not stamped
+    assert np.min(speed) > -1e-3
+    # A cubic makes up for a cycle. The first line, `FIRST_S` long, has the mean speed of its way,
+    # less where it is a cycle late, the next one that of 10 ms further on.
+    even = 3.0 * BRAKES * CYCLE_S
+    if not velocities:
+        even = 0.5 * BRAKES * (FIRST_S + 0.01) + SPEED * CYCLE_S / FIRST_S
+    assert np.max(np.abs(np.diff(speed))) < even
+    speed, _ = stop(Driven(velocities, LAG_S, told=False), 0.008)
+    back = SPEED * LAG_S / CYCLE_S  # in one cycle
+    even += 6.0 * SPEED * LAG_S / FIRST_S**2 * CYCLE_S  # a cubic that makes up for the lag
+    assert np.min(speed) > SPEED - back - even
+    assert np.max(np.abs(np.diff(speed))) < back + even
+    assert np.max(np.abs(np.diff(speed))) > 0.9 * back  # no sender can help it
