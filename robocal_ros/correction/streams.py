@@ -1,8 +1,10 @@
 """A stream of joint targets: as new as its newest message, within the speeds, ended in order."""
 
+from bisect import bisect_right
 from collections import deque
 from dataclasses import replace
 from enum import Enum
+from itertools import accumulate
 
 import numpy as np
 
@@ -28,11 +30,16 @@ from robocal_ros.correction.stepping import ADDS, TOO_FAST
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands
 RESUME_S = 1.0  # after a longer silence a stream is over
-INTERVALS = 15  # whose median is the period
+# The period is that of the last intervals between messages. Those that follow one within a share of
+# it came in a burst with it; so many may be stalls, which are no period, however long they are.
+INTERVALS, BURST, STALLS = 16, 0.125, 2
 # How fast what was held up is caught up with: at so much more than the stream's own speed, but at
 # no less than this share of the joints' speeds, which counts where the stream stands.
 CATCH_UP, LEAST = 1.05, 0.1
+RATE_S = 1e-3  # so far ahead on a path it is looked at how fast its offset changes
 SPEED_S = 0.2  # in which the stream's own speed is looked at
+# The same of what goes out, for how it is slowed down; at least so many periods, and outputs.
+SENT_S, SENT_PERIODS, SENT = 0.1, 8.0, 4
 END_S = 0.5  # a joint without limits slows down so long from its full speed
 SPARE = 1.0  # rad/s (prismatic: m/s): so much faster than its stream a joint without a limit may be
 LATE = 0.8  # of `CATCH_UP_S`: one that lags more catches up at the joints' speeds
@@ -71,18 +78,19 @@ class TargetStream:
         self.phase, self.lag_s = Phase.IDLE, 0.0
         self._why: RefusedError | None = None
         self._active = np.zeros(arm.n)  # 1 where a joint is commanded
-        self._goal, self._last = np.full((2, arm.n), np.nan)  # of the newest messages
-        self._interval_s = 0.0
-        self._came_s = -np.inf
+        self._goal = np.full(arm.n, np.nan)  # of the newest message
+        self._came_s = self._beat_s = -np.inf  # it, and the first of its burst
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self.period_s = np.nan
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
         self._held_up = False  # and lags since
         self._credit_s = 0.0  # time that one that is held up has not used
-        self._way: deque[tuple[float, Array]] = deque()  # targets of the last `SPEED_S`
+        # targets of the last `SPEED_S`, and what went out lately, but for the last
+        self._way: deque[tuple[float, Array]] = deque()
+        self._sent: deque[tuple[float, Array]] = deque()
         self._step_s = 0.0  # time that the last output used
-        self._before, self._spare = np.full((2, arm.n), np.nan)  # what was put out before it
+        self._before = np.full(arm.n, np.nan)  # what was put out before it
         # of the slow-down: from where, how fast, how long, and how much of that has gone out
         self._end_out, self._end_speed = np.empty(0), np.empty(0)
         self._lasts_s, self._slowed_s = 0.0, 0.0
@@ -94,6 +102,26 @@ class TargetStream:
         if self.phase is Phase.ENDING:
             return True
         return self.phase is Phase.RUNNING and now_s - self._came_s <= self._gap_s()
+
+    def _note_interval(self, now_s: float) -> None:
+        """The period: half of the time is in intervals that are so long or longer.
+
+        So it is the time from burst to burst, messages that are lost do not make it longer, and of
+        a stream that slows down a few long intervals count at once.
+        """
+        interval, intervals = now_s - self._beat_s, self._intervals
+        if interval <= 0.0 or interval < BURST * self.period_s:
+            return
+        self._beat_s = now_s
+        intervals.append(interval)
+        lengths = sorted(intervals)
+        pause = max(self._config.stream_gap_s, 2.0 * lengths[len(lengths) // 2])
+        while lengths[-1] > pause:
+            lengths.pop()
+        usual = max(len(lengths) - STALLS, 1)
+        lengths[usual:] = [lengths[usual - 1]] * (len(lengths) - usual)
+        sums = list(accumulate(lengths))
+        self.period_s = lengths[bisect_right(sums, 0.5 * sums[-1])]
 
     def _gap_s(self) -> float:
         """A longer silence is a pause."""
@@ -130,22 +158,20 @@ class TargetStream:
             raise RefusedError(self._why.reason, f"the stream is ended for: {self._why.detail}")
         if self._output.mismatch:
             raise RefusedError(Reason.START_MISMATCH, self._output.mismatch)
-        interval = now_s - self._came_s
-        if self.phase is Phase.RUNNING and interval > self._gap_s():
-            self._look_after_pause(q, interval, now_s)
+        pause = now_s - self._came_s
+        if self.phase is Phase.RUNNING and pause > self._gap_s():
+            self._look_after_pause(q, pause, now_s)
         if self.phase is Phase.IDLE:
             self._active[:] = 0.0
             self._intervals.clear()
             self._way.clear()
-            self.period_s, interval = np.nan, 0.0
-        if interval > 0.0:
-            self._intervals.append(interval)
-            self.period_s = sorted(self._intervals)[len(self._intervals) // 2]
+            self._sent.clear()
+            self.period_s, self._beat_s = np.nan, now_s
+        self._note_interval(now_s)
         if index is not self._index or self.phase is Phase.IDLE:
             self._choose(index, q, now_s)
-        self._last[:], self._interval_s = self._goal, interval
-        self._goal[:] = q
-        self._note_way(q, now_s)
+        self._goal = q
+        self._note(self._way, q, now_s, SPEED_S)
         self._velocity[:] = 0.0
         if command.velocity is not None:
             self._velocity[index] = command.velocity
@@ -172,24 +198,27 @@ class TargetStream:
         self._state.require_fresh(np.flatnonzero(chosen), now_s)
         output, near = self._output, self._config.start_near(self._arm)[chosen]
         place, _ = output.place(np.flatnonzero(chosen), output.out[chosen], now_s)
-        speed = np.zeros(self._arm.n)
-        if self._interval_s > 0.0:
-            speed = np.abs(self._goal - self._last) / self._interval_s
-        spare = np.maximum(self._pace() - speed, 0.0)[chosen] * CATCH_UP_S
+        spare = np.maximum(self._pace() - self._own_speed(), 0.0)[chosen] * CATCH_UP_S
         ahead, moved = np.abs(q - output.taught)[chosen], np.abs(place - output.out[chosen])
         known = np.isfinite(ahead).all() and np.isfinite(moved).all()
         if not known or pause_s > RESUME_S or np.any(ahead > spare + near) or np.any(moved > near):
             self.phase = Phase.IDLE
 
     def _begin(self, new: Index, q: Array, now_s: float) -> None:
-        """Joints begin where the controller is."""
-        output = self._output
+        """Joints begin where the controller is; the offset of a path that is left goes on."""
+        output, limiter = self._output, self._output.limiter
         begins = self._desired.begins(q)
         output.take_up(now_s)
-        offset = output.begin_at(new, q, begins, now_s)
-        output.limiter.begin(new, offset, begins[0, new])
+        offset, rate = output.begin_at(new, q, begins, now_s), np.zeros(len(new))
+        if output.path is not None:
+            driven = np.isin(new, output.path.index)
+            change = output.path.offset(now_s + RATE_S)[0] - limiter.state[OFFSET]
+            rate[driven] = change[new[driven]] / RATE_S
+        limiter.begin(new, offset, begins[0, new])
+        limiter.state[OFFSET_RATE, new] = rate
         output.taught[new], output.out[new] = q[new], q[new] + offset
-        self._before[new] = output.out[new]
+        for _, out in self._sent:
+            out[new] = output.out[new]
         if self.phase is Phase.IDLE:
             output.out_s = now_s
 
@@ -203,7 +232,10 @@ class TargetStream:
         output = self._output
         self.come_to_rest(now_s)
         elapsed, longest = max(now_s - output.out_s, 0.0), self._usable_s(now_s)
-        self._spare[:] = output.out
+        before, window = output.out.copy(), max(SENT_S, SENT_PERIODS * self._step_period_s())
+        if longest < elapsed:  # the time in which the robot stood is no part of its motion
+            self._sent.clear()
+        self._note(self._sent, before, now_s - longest, window)
         self._held_up = longest < elapsed or (self._held_up and self.lag_s > 0.0)
         self._speeds[0] = self._fastest
         if self._held_up:
@@ -223,27 +255,47 @@ class TargetStream:
             q = np.where(self._active > 0.0, output.taught, self._goal) + fraction * way
         else:
             output.limiter.state[OFFSET_RATE] = 0.0
-        self._before, self._spare = self._spare, self._before
-        self._step_s, output.out_s = longest, now_s
+        self._before, self._step_s, output.out_s = before, longest, now_s
         output.stage = self._desired.stage if self._desired.made else None
         self.lag_s = 0.0
         if fraction < 1.0:
             self.lag_s = self._ahead_s()
 
-    def _note_way(self, q: Array, now_s: float) -> None:
-        """Keep a target; of several in a burst the last one, at the time of the first."""
-        way = self._way
+    def _note(
+        self, way: deque[tuple[float, Array]], q: Array, now_s: float, window_s: float
+    ) -> None:
+        """Keep places (n,); of several in a burst the last one, at the time of the first."""
         if way and now_s - way[-1][0] < 0.5 * self._step_period_s():
             way[-1] = way[-1][0], q
         else:
             way.append((now_s, q))
-        while len(way) > 2 and way[1][0] <= now_s - SPEED_S:
+        while len(way) > 2 and way[1][0] <= now_s - window_s:
             way.popleft()
 
     def _own_speed(self) -> Array:
-        """How fast its targets moved lately (n,)."""
-        (begin_s, begin), (end_s, end) = self._way[0], self._way[-1]
+        """How fast its targets moved lately (n,), but for the last, which may begin a burst."""
+        way = self._way
+        (begin_s, begin), (end_s, end) = way[0], way[-2 if len(way) > 2 else -1]
         return np.abs(end - begin) / (end_s - begin_s) if end_s > begin_s else 0.0 * end
+
+    def _sent_speed(self) -> Array:
+        """How fast the joints are sent now (k,), but none the other way than lately.
+
+        By a parabola through what went out: a stream may be slowing down, and the times of its
+        messages are uneven.
+        """
+        output, index = self._output, self._index
+        self._note(self._sent, output.out.copy(), output.out_s, np.inf)
+        t = np.array([t for t, _ in self._sent])
+        way = np.array([out[index] for _, out in self._sent]) - output.out[index]
+        lasts = t[-1] - t[0]
+        if lasts <= 0.0:
+            return np.zeros(len(index))
+        mean = -way[0] / lasts
+        if len(t) < SENT:
+            return np.asarray(mean)
+        speed, pace = np.polyfit((t - t[-1]) / lasts, way, 2)[1] / lasts, self._pace()[index]
+        return np.where(speed * mean > 0.0, np.clip(speed, -pace, pace), 0.0)
 
     def _pace(self) -> Array:
         """The joints' speeds (n,); of those without a limit what is taken for one."""
@@ -318,7 +370,7 @@ class TargetStream:
     # ---- without a message ----------------------------------------------------------------------
 
     def end(self, why: RefusedError, now_s: float) -> None:
-        """End it: the robot is slowed down from where and as fast as it was sent last.
+        """End it: the robot is slowed down from where and as fast as it was sent lately.
 
         After a silence the controller has held the last target since: the robot stands, and
         nothing more goes out, which would set it in motion again.
@@ -327,15 +379,14 @@ class TargetStream:
             return
         output, index, self._why = self._output, self._index, why
         speed = np.zeros(len(index))
-        if self._step_s > 0.0 and not self._holds(now_s - output.out_s):
-            # a message that came early is no faster motion
-            speed = (output.out - self._before)[index] / max(self._step_s, self._step_period_s())
+        if self._sent and not self._holds(now_s - output.out_s):
+            speed = self._sent_speed()
         slowdown = self._slowdown
         if self._unlimited.any():
             slowdown = np.where(np.isfinite(slowdown), slowdown, self._pace() / END_S)
         lasts = np.max(np.abs(speed) / slowdown[index], initial=0.0)
         self.lag_s = 0.0
-        if not 0.0 < lasts < np.inf:
+        if not self._step_period_s() < lasts < np.inf:  # what takes one step is none
             self.phase = Phase.IDLE
             return
         self.phase, self._lasts_s, self._slowed_s = Phase.ENDING, float(lasts), 0.0
@@ -352,7 +403,7 @@ class TargetStream:
             return None
         if self.phase is Phase.RUNNING and self.lag_s > 0.0 and self.is_due(now_s, 1.5):
             command = replace(self._command, position=self._goal[self._index], velocity=None)
-            self._note_way(self._goal.copy(), now_s)
+            self._note(self._way, self._goal, now_s, SPEED_S)
             try:
                 self._advance(now_s)
                 return self._message(command)

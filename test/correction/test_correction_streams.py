@@ -4,10 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from correction_robot import DT, HOME, NAMES, REST, ROUNDING, Robot, drifted, offer, refused
+from correction_robot import (
+    DT,
+    HOME,
+    LARGEST_A,
+    NAMES,
+    REST,
+    REST_A,
+    ROUNDING,
+    Robot,
+    bent_tool,
+    drifted,
+    offer,
+    refused,
+    swing,
+)
 
 from robocal_ros.correction.bounds import Policy, ShiftBounds
 from robocal_ros.correction.inputs import JointCommand
+from robocal_ros.correction.output import spline
 from robocal_ros.correction.refusals import Reason
 
 SECOND = 1_000_000_000
@@ -135,3 +150,55 @@ def test_the_velocities_that_go_out_are_the_derivative_of_the_positions(at: str)
     slack = 1e-6
     assert np.abs(made - own).max() > 20.0 * slack
     assert np.allclose(made, numeric, rtol=0.0, atol=slack), np.abs(made - numeric).max()
+
+
+# ---- what takes a path's place -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scaling", [1.0, 0.5])
+@pytest.mark.parametrize("after_s", [0.3, 0.4, 0.5])
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_stream_in_the_place_of_a_path_lets_its_offset_go_on(
+    moves: bool, after_s: float, scaling: float
+) -> None:
+    """Its rate changes no faster than the limiter allows, from what it was on the path."""
+    robot = Robot()
+    session = robot.session
+    session.offer_tool(bent_tool(4e-3, 1.5))
+    robot.rest()
+    session.enable(True)
+    taught = swing(duration=4.0)
+    if not moves:
+        taught = replace(taught, position=0.0 * taught.position + HOME, acceleration=None)
+        taught = replace(taught, velocity=0.0 * taught.position)
+    session.trajectory(taught, robot.now)
+    path, begin_s = session.output.path, robot.now
+    assert path is not None
+
+    def goal(t_s: float) -> np.ndarray:
+        k = int(np.searchsorted(taught.time_from_start_s, t_s, side="right")) - 1
+        ends = slice(k, k + 2)
+        rates, bends = taught.velocity[ends], taught.acceleration
+        bends = None if bends is None else bends[ends]
+        return spline(taught.time_from_start_s, taught.position[ends], rates, bends, k, t_s)[0]
+
+    while robot.now < begin_s + after_s:
+        robot.now += DT
+        robot.at = path.place(robot.now)
+        session.controller(NAMES, robot.at, scaling, robot.now)
+        robot.read(robot.at)
+    at_s = path.time(robot.now)
+    offset = robot.at - goal(at_s)
+    rate, most = scaling * path.offset(robot.now)[1], LARGEST_A if moves else REST_A
+    assert np.abs(rate).max() > most * DT  # to begin at rest would be a jump of it
+    q = goal(at_s)
+    robot.now += 1e-9
+    robot.read(robot.at)
+    robot.stream(q, dt=0.0)
+    assert np.allclose(robot.at - q, offset, rtol=0.0, atol=1e-6)
+    for k in range(1, 30):
+        q, before, offset = goal(at_s + k * scaling * DT), rate, robot.at - q
+        rate = (robot.stream(q) - q - offset) / DT
+        # how fast the path's own changed is known from the next millisecond of it
+        slack = most * 1e-3 if k == 1 else 0.0
+        assert np.all(np.abs(rate - before) <= most * DT + slack + ROUNDING / DT)
