@@ -90,8 +90,7 @@ class TcfMotion:
         )
         self._lease = LeaseHolder(node, arm.name, serial)
         self._others = CommandPath(node, self._motion.topic.topic_name, self._motion.action, CELL)
-        stale_s = settings["gap_stale_s"]
-        self._gap = Gap(stale_s) if stale_s > 0.0 else None
+        self._gap = Gap(stale_s) if (stale_s := settings["gap_stale_s"]) > 0.0 else None
         if self._gap is not None:
             is_bool = settings["gap_bool"]
             self._sources = GapSources(node, is_bool, self._take_gap)
