@@ -113,13 +113,9 @@ class EndpointNode(LifecycleNode):
                 return
             try:
                 callback(message)
-            except RobocalError as error:
-                count.invalid += 1
-                if self._log_limit.allows(topic, str(error), time.monotonic()):
-                    self.get_logger().warning(f"{topic}: {error}")
             except Exception as error:
                 count.invalid += 1
-                self._log_defect(topic, error)
+                self._log(topic, error)
 
         def lose(event: Any) -> None:
             count.lost += event.total_count_change
@@ -222,7 +218,7 @@ class EndpointNode(LifecycleNode):
             try:
                 callback()
             except Exception as error:
-                self._log_defect("timer", error)
+                self._log("timer", error)
 
         clock = Clock(clock_type=ClockType.STEADY_TIME) if steady else None
         timer = self.create_timer(period_s, tick, clock=clock)
@@ -235,9 +231,15 @@ class EndpointNode(LifecycleNode):
         while self._release:
             self._release.pop()()
 
-    def _log_defect(self, where: str, error: Exception) -> None:
-        words = "".join(traceback.format_exception(error))
-        if self._log_limit.allows(where, words, time.monotonic()):
+    def _log(self, where: str, error: Exception) -> None:
+        """Why something was refused, or a defect; not all of a flood."""
+        refused = isinstance(error, RobocalError)
+        words = str(error) if refused else "".join(traceback.format_exception(error))
+        if not self._log_limit.allows(where, words, time.monotonic()):
+            return
+        if refused:
+            self.get_logger().warning(f"{where}: {words}")
+        else:
             self.get_logger().error(f"{where}: a defect of this software, please report:\n{words}")
 
     def _require_active(self, name: str) -> None:

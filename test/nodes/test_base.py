@@ -24,7 +24,6 @@ from robocal_ros.nodes.endpoints import LOG_EVERY_S, LogLimit
 from robocal_ros.nodes.parameters import Setting
 from robocal_ros.sessions.ignored import MOST_REASONS
 
-
 BUG = 5e5  # of this number the callback has a defect
 
 
