@@ -81,7 +81,7 @@ class TargetStream:
         self._goal = np.full(arm.n, np.nan)  # of the newest message
         self._came_s = self._beat_s = -np.inf  # it, and the first of its burst
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
-        self.period_s = np.nan
+        self.period_s, self._as_usual = np.nan, 0  # and so many intervals since it was found
         self._command: JointCommand | None = None
         self._index = np.zeros(0, dtype=np.int64)
         self._held_up = False  # and lags since
@@ -114,6 +114,10 @@ class TargetStream:
             return
         self._beat_s = now_s
         intervals.append(interval)
+        self._as_usual += 1
+        if self._as_usual < INTERVALS // 2 and abs(interval - self.period_s) < 0.2 * self.period_s:
+            return
+        self._as_usual = 0
         lengths = sorted(intervals)
         pause = max(self._config.stream_gap_s, 2.0 * lengths[len(lengths) // 2])
         while lengths[-1] > pause:
