@@ -85,7 +85,8 @@ class RobotWatch:
         self._plan: JointPlan | None = None
         self._cell: MotionCell | None = None
         self._at_s = self._driven_s = 0.0  # the plan's clock at a time
-        self._reached_s = self._looked_s = 0.0  # how far the robot has come, seen when
+        # how far the robot has come, seen when, by which reading's stamp
+        self._reached_s = self._looked_s = self._looked_at_s = 0.0
         self._moved_to_s = self._moved_s = 0.0  # the plan's clock when it last came further
         self._ended_s = np.inf  # since when the plan is over, with the robot at its end
         self._over = False
@@ -134,6 +135,7 @@ class RobotWatch:
         self._plan, self._cell, self._away = plan, cell, None
         self._driven_s = self._reached_s = self._moved_s = self._moved_to_s = 0.0
         self._at_s = self._looked_s = now_s
+        self._looked_at_s = self._readings[-1][0] if self._readings else np.inf
         self._ended_s, self._over = np.inf, False
 
     def sent(self, now_s: float) -> None:
@@ -239,9 +241,11 @@ class RobotWatch:
             return 0.0, 0.0
         if self._away is not None:
             return self._away
-        q, heard_s = self._readings[-1][1], self._heard_s
+        (at_s, q), heard_s = self._readings[-1], self._heard_s
         first_s = max(self._reached_s - JITTER_S, 0.0)
-        last_s = self._reached_s + max(heard_s - self._looked_s, 0.0) + UNSAID_S
+        # readings that waited come at once: the time between them is that of their stamps
+        since_s = max(heard_s - self._looked_s, at_s - self._looked_at_s, 0.0)
+        last_s = self._reached_s + since_s + UNSAID_S
         last_s = min(last_s, self.driven_s(heard_s) + UNSAID_S * self.scaling_known(heard_s))
         last_s = max(min(last_s, plan.duration_s), first_s)
         times = np.linspace(first_s, last_s, int(np.ceil((last_s - first_s) / APART_S)) + 1)
@@ -262,6 +266,7 @@ class RobotWatch:
             if self._reached_s > self._moved_to_s + JITTER_S:
                 self._moved_to_s, self._moved_s = self._reached_s, self.driven_s(heard_s)
         self._looked_s, self._away = max(heard_s, self._looked_s), found
+        self._looked_at_s = at_s
         return found
 
     def keeps(self, tip_m: float, joint_rad: float) -> bool:

@@ -113,6 +113,26 @@ def test_a_stop_of_a_motion_that_began_late_hurries_no_joint(
     assert -lag_s - 0.01 < ahead_s < 0.8 * LEAD_S
 
 
+@pytest.mark.parametrize("stall_s", [0.05, 0.2, 0.4])
+def test_readings_that_waited_for_a_busy_node_are_no_robot_beside_its_path(stall_s: float) -> None:
+    """They come at once; the first is looked at, and then the last: the robot went on meanwhile."""
+    cell = MotionCell(
+        ARM, ToolBody(np.eye(4), 0.1, 0.008, 0.05), np.eye(4), DRIVING.housing, LIMITS
+    )
+    plan = joint_way(cell, HOME, HOME + np.array([1.0, -0.3, 0.2, 0.5, -0.4, 0.1]))
+    stalls_s = 0.5 * plan.duration_s
+    watch = RobotWatch(ARM, DRIVING)
+    watch.reading(-0.008, HOME, -0.008)
+    watch.follow(plan, cell, 0.0)
+    for at_s in np.arange(0.0, plan.duration_s, 0.008):
+        heard_s = at_s
+        if stalls_s <= at_s < stalls_s + stall_s:
+            heard_s = stalls_s + stall_s + 1e-4 * (at_s - stalls_s)
+        watch.reading(at_s, plan.at(at_s)[0], heard_s)
+        waited = stalls_s + 0.008 < at_s < stalls_s + stall_s - 0.008
+        assert waited or watch.keeps(*watch.away()), at_s
+
+
 def test_a_scaling_that_is_not_told_again_is_as_planned():
     """Finding: one that had died at 0 was believed for ever."""
     watch = seen(*steady(0.008, 0.0 * FASTEST))
