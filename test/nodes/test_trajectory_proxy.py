@@ -258,6 +258,15 @@ def test_a_goal_without_points_is_rejected_and_disturbs_nothing(cell: Any) -> No
     sent.ends(GoalStatus.STATUS_SUCCEEDED)
 
 
+def slows_down(points: Any) -> bool:
+    """Lines, for a robot whose states have no velocities, each slower than the one before."""
+    times = np.array([p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points])
+    q = np.array([p.positions for p in points])
+    speed = np.abs(np.diff(q, axis=0)).max(axis=1) / np.diff(times)
+    slower = len(speed) > 1 and np.all(np.diff(speed) < 0.0)
+    return bool(slower) and not any(p.velocities for p in points)
+
+
 def test_a_lease_stops_a_goal_by_a_goal_that_slows_down(cell: Any) -> None:
     cell.begin()
     sent = cell.send(HOME, MOVED, lasts_s=8.0).moves()
@@ -268,7 +277,7 @@ def test_a_lease_stops_a_goal_by_a_goal_that_slows_down(cell: Any) -> None:
     assert "leased" in result.error_string
     stop = cell.robot.goals[-1].trajectory.points
     assert stop[0].time_from_start.nanosec > 0.08e9
-    assert list(stop[-1].velocities) == [0.0] * 6
+    assert slows_down(stop)
     cell.graph.spin_until(lambda: cell.robot.path is None, "the robot stands")
     place = cell.robot.q.copy()
     assert "leased" in cell.send(HOME, HOME).ends(GoalStatus.STATUS_ABORTED).error_string
@@ -309,7 +318,7 @@ def test_deactivation_stops_and_rejects(cell: Any) -> None:
     assert "deactivated" in result.error_string
     cell.graph.spin_until(lambda: cell.robot.path is None, "the robot stands", 2.0)
     stop = cell.robot.goals[-1].trajectory.points  # a stop, no bare cancel
-    assert list(stop[-1].velocities) == [0.0] * 6
+    assert slows_down(stop)
     assert list(stop[-1].positions) != MOVED.tolist()
     for _ in range(2):  # inactive, then unconfigured
         rejected = cell.send(HOME, MOVED)
@@ -428,7 +437,7 @@ def test_a_controller_that_only_drops_out_of_discovery_is_stopped(graph: Any, de
     assert "vanished" in sent.ends(GoalStatus.STATUS_ABORTED, 5.0).error_string
     assert path.live(time.monotonic())  # it is not known to stand
     graph.spin_until(lambda: len(robot.goals) > 1 and robot.cancels, "stop and cancel")
-    assert len(robot.goals[1].trajectory.points) == 1
+    assert slows_down(robot.goals[1].trajectory.points)
     if deaf:
         fault = "the robot still moves, stop it by hand"
         graph.spin_until(lambda: fault in node._stopping.fault, fault, 10.0)
