@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from rclpy.action import ActionClient, ActionServer
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -219,6 +220,10 @@ class Graph:
             self.executor.remove_node(node)
             node.close()
         self.executor.shutdown()
+        for waitable in list(self.probe.waitables):
+            # what the traceback of a failed test keeps would command the next one's robot
+            if isinstance(waitable, (ActionClient, ActionServer)):
+                waitable.destroy()
         self.probe.destroy_node()
         self.context.try_shutdown()
 
