@@ -177,6 +177,7 @@ class LiveCell:
         """Whether the robot rests for so long from now."""
         self.joints.clear()
         self.graph.spin_for(seconds)
+        self.graph.spin_until(lambda: len(self.joints) > 5, "readings")
         return bool(np.max(np.ptp([m.position for m in self.joints], axis=0)) < 1e-9)
 
     def capture_reference(self) -> None:
