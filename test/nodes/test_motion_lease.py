@@ -97,6 +97,7 @@ def error(said: list[DiagnosticArray], node: str, words: str) -> bool:
     )
 
 
+@pytest.mark.cell
 @pytest.mark.parametrize("driver", ["tcf_node", "maintenance_node"])
 def test_who_else_commands_the_robot_stops_what_moves_it_and_lets_nothing_begin(
     graph: Any, tmp_path: Path, driver: str
