@@ -355,6 +355,7 @@ def test_a_trajectory_without_points_becomes_a_stop(line: Moving, lost: int) -> 
     assert all(len(message.points) for message in line.paths)
 
 
+@pytest.mark.cell
 @pytest.mark.parametrize("how", ["streams", "drives"])
 def test_a_deactivation_brings_the_robot_to_rest(graph: Any, how: str) -> None:
     """Of a process: it does nothing else meanwhile."""

@@ -29,8 +29,7 @@ def test_a_gap_that_closes_stops_the_tool_node_at_once(graph: Any, tmp_path: Pat
     graph.spin_for(0.5)
     cell.is_open = False
     graph.spin_until(lambda: len(cell.sent) >= 3, "the stop", within_s=1.0)
-    graph.spin_for(0.5)
-    assert cell.stands(1.0)
+    graph.spin_until(lambda: cell.stands(1.0), "it stands", within_s=4.0)
     for stop in cell.sent[2:]:  # one whose effect is seen late is sent again, from where it is
         assert not any(stop.points[-1].velocities)
         assert np.max(np.abs(np.array(stop.points[-1].positions) - cell.q)) < 0.005
@@ -127,8 +126,7 @@ def test_the_tool_node_stops_without_this_node_whatever_the_plc_says(
         graph.spin_for(0.3)
         cell.is_open = False
     graph.spin_until(lambda: len(cell.sent) >= 3, "the stop", within_s=1.5)
-    graph.spin_for(0.5)
-    assert cell.stands(1.0)
+    graph.spin_until(lambda: cell.stands(1.0), "it stands", within_s=4.0)
     cell.start_maintenance()
     assert cell.statuses[-1].state == MaintenanceStatus.FAULT
     assert "see where the robot is" in cell.statuses[-1].fault
