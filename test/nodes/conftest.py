@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
 from robocal_ros.nodes import qos
@@ -211,6 +212,24 @@ class Graph:
             f"{subscribers} subscribers of {topic}",
         )
         return publisher
+
+    def drive(
+        self, topic: str, message: JointTrajectory, moves: Callable[[], object], subscribers: int
+    ) -> None:
+        """Command a robot as a person does: again, until it moves.
+
+        A controller reads the topic as best effort, and may yet be to find a new publisher that
+        has found it.
+        """
+        drive = self.publisher(JointTrajectory, topic, subscribers=subscribers)
+        for _ in range(3):
+            drive.publish(message)
+            until_s = time.monotonic() + 1.0
+            while not moves() and time.monotonic() < until_s:
+                self.spin_for(0.02)
+            if moves():
+                break
+        self.probe.destroy_publisher(drive)  # nobody else commands while the cell does
 
     def close(self) -> None:
         """End everything."""

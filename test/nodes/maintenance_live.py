@@ -23,6 +23,7 @@ from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import Housing, ToolBody
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import REST_RAD
 from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.motion.travel import joint_way
 from robocal_ros.nodes import qos
@@ -197,10 +198,18 @@ class LiveCell:
         limits = MotionLimits(tcp_speed_m_s=1.0)
         cell = MotionCell(self.arm, body, np.eye(4), housing, limits)
         plan: JointPlan = joint_way(cell, start, end)
-        drive = self.graph.publisher(JointTrajectory, ROBOT, subscribers=2)  # the robot, and `sent`
-        drive.publish(trajectory_message(plan, self.arm.joint_names))
-        self.graph.spin_for(plan.duration_s)
-        self.graph.probe.destroy_publisher(drive)  # nobody else commands while the cell measures
+        stood = self.q
+
+        def near(q: np.ndarray, atol: float) -> bool:
+            return np.allclose(self.q, q, rtol=0.0, atol=atol)
+
+        self.graph.drive(
+            ROBOT,
+            trajectory_message(plan, self.arm.joint_names),
+            lambda: near(end, REST_RAD) or not near(stood, 10.0 * REST_RAD),
+            subscribers=2,  # the robot, and `sent`
+        )
+        self.graph.spin_until(lambda: near(end, REST_RAD), "its end", plan.duration_s + 5.0)
 
     # ---- calls ----------------------------------------------------------------------------------
 

@@ -96,13 +96,20 @@ class Cell:
         """A person drives the robot to where it stood at first."""
         back = JointTrajectoryPoint(positions=self.joints[0].position, time_from_start=BACK)
         back.velocities = back.accelerations = [0.0] * len(back.positions)
-        drive = self.graph.publisher(JointTrajectory, "/tcf_node/joint_trajectory", subscribers=2)
-        drive.publish(JointTrajectory(joint_names=self.joints[0].name, points=[back]))
-        self.graph.spin_until(
-            lambda: np.allclose(self.joints[-1].position, back.positions, rtol=0.0, atol=1e-6),
-            "the robot is back",
+        message = JointTrajectory(joint_names=self.joints[0].name, points=[back])
+
+        def near(atol: float) -> bool:
+            at = self.joints[-1].position
+            return np.allclose(at, back.positions, rtol=0.0, atol=atol)
+
+        stood = self.joints[-1].position
+        self.graph.drive(
+            "/tcf_node/joint_trajectory",
+            message,
+            lambda: near(1e-6) or not np.allclose(self.joints[-1].position, stood, atol=1e-3),
+            subscribers=2,  # the robot, and `sent`
         )
-        self.graph.probe.destroy_publisher(drive)  # nobody else commands while the node does
+        self.graph.spin_until(lambda: near(1e-6), "the robot is back")
         self.graph.spin_for(0.5)
 
 
