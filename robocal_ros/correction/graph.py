@@ -1,15 +1,10 @@
 """Who else commands the robot, or publishes its joints: by who serves and publishes on the graph.
 
-Names of nodes only make the words readable. Facts used, of rmw_fastrtps and Fast DDS:
-
-- The first 12 bytes of an endpoint's gid are its participant's prefix, one per ROS context: what a
-  process publishes and serves shares them (a process of two contexts has two).
-- A client of an action is a publisher of the DDS topic ``rq/<action>/_action/send_goalRequest``.
-- A publisher numbers its messages: those of one publisher increase.
+A publisher numbers its messages, those of one publisher increase (rmw_fastrtps); what else is used
+of the graph stands in `motion.graph`.
 """
 
 import math
-import uuid
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -19,18 +14,16 @@ from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Empty
 
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.wire import joint_names
+from robocal_ros.motion.graph import KILLED, clients, own_endpoint, publishers, strangers
 
 LEASE_S = 1.0  # a lease that was not renewed for so long is lost: its holder died, or hangs
 STOOD_S = 1.0  # a lost one is over when the robot has stood for so long
-PREFIX = 12  # bytes of a gid
 MOST_TAKEN = 100  # joint states of a look
 STEPS_BACK = 2  # of message numbers within `MEMORY_S`: one comes of a driver that was restarted
 MEMORY_S = 5.0
-UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
 
 
 class GraphViolation(NamedTuple):
@@ -38,41 +31,6 @@ class GraphViolation(NamedTuple):
 
     reason: Reason
     detail: str
-
-
-class Endpoint(NamedTuple):
-    """Who publishes something: DDS participant, and fully qualified name of the node."""
-
-    participant: bytes
-    name: str
-
-    def may_be_node_of(self, other: "Endpoint") -> bool:
-        """Whether it is of the same node, as far as the nodes' names are discovered."""
-        return self.participant == other.participant and (
-            self.name == other.name or any(one.name.endswith(UNKNOWN) for one in (self, other))
-        )
-
-
-def publishers(node: Node, topic: str, *, dds: bool = False) -> list[Endpoint]:
-    """Who publishes a resolved ROS topic, or the DDS topic of that name."""
-    found = node.get_publishers_info_by_topic(topic, no_mangle=dds)
-    return [
-        Endpoint(
-            bytes(info.endpoint_gid)[:PREFIX], f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-        )
-        for info in found
-    ]
-
-
-def own_participant(node: Node) -> bytes:
-    """The participant of ``node``: of a topic that nobody else can know."""
-    topic = f"{node.get_fully_qualified_name()}/identity_{uuid.uuid4().hex}"
-    publisher = node.create_publisher(Empty, topic, 1)
-    try:
-        (own,) = publishers(node, topic)  # an own endpoint is known at once
-    finally:
-        node.destroy_publisher(publisher)
-    return own.participant
 
 
 @dataclass
@@ -238,13 +196,8 @@ class GraphWatch:
     ) -> None:
         self._node, self._sources, self.leases = node, sources, leases
         self._lease_topic = lease_topic
-        self._asked = [
-            (topic, "publishes", own, topic, False) for topic, own in commands.items()
-        ] + [
-            (name, "is a client of", own, f"rq{name}/_action/send_goalRequest", True)
-            for name, own in actions.items()
-        ]
-        self._own = Endpoint(own_participant(node), node.get_fully_qualified_name())
+        self._commands, self._actions = dict(commands), dict(actions)
+        self._own = own_endpoint(node)
         self.commanders = ""  # who else commands the robot, or publishes its joints
         self.lease = ""  # who holds one
         self.lost = ""  # whose was not renewed while the robot may still move by it
@@ -254,12 +207,15 @@ class GraphWatch:
 
         ``stood_s``: how long the robot has stood, as far as that is known.
         """
-        leasing = publishers(self._node, self._lease_topic)
+        node, own, found = self._node, self._own, []
+        leasing = publishers(node, self._lease_topic)
         cell = [one for one in leasing if one.name not in self.leases.others]
-        found = []
-        for subject, does, own, topic, dds in self._asked:
-            who = publishers(self._node, topic, dds=dds)
-            found += [f"{name} {does} {subject}" for name in self._strangers(who, own, cell)]
+        for topic, count in self._commands.items():
+            others = strangers(publishers(node, topic), own, count, cell)
+            found += [f"{who} publishes {topic}" for who in others]
+        for action, count in self._actions.items():
+            others = strangers(clients(node, action), own, count, cell)
+            found += [f"{who} is a client of {action}" for who in others]
         joints = self._sources.look(now_s)
         self.commanders = "; ".join([*found, *filter(None, [joints])])
         self.leases.look(now_s, stood_s)
@@ -267,33 +223,13 @@ class GraphWatch:
         if self.commanders:
             return GraphViolation(
                 Reason.OTHER_COMMANDER,
-                f"{self.commanders}. End it; one that was killed counts until DDS gives it up, "
-                "after up to 20 s",
+                f"{self.commanders}. End it; {KILLED}",
             )
         return GraphViolation(Reason.LEASED, self.lease) if self.lease else None
-
-    def _strangers(self, who: list[Endpoint], own: int, cell: list[Endpoint]) -> list[str]:
-        """Names of who neither is this node nor moves the robot for the cell."""
-        ours = [one for one in who if one == self._own]
-        rest = [
-            one
-            for one in who
-            if one != self._own and not any(one.may_be_node_of(holder) for holder in cell)
-        ]
-        names = [_name(one, self._own.name) for one in rest]
-        if len(ours) > own:
-            names.append(f"a second {self._own.name} in this process")
-        return sorted(names)
 
     def close(self) -> None:
         """Release what was opened."""
         self._sources.close()
-
-
-def _name(one: Endpoint, own: str) -> str:
-    if one.name.endswith(UNKNOWN):
-        return "a node that is not discovered yet"
-    return f"a second {own}" if one.name == own else one.name
 
 
 class CommandSources:

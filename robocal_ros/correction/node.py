@@ -46,8 +46,8 @@ from robocal_ros.correction.settings import (
 )
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
-from robocal_ros.motion.messages import REACTION_S, StatedController
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.messages import StatedController
+from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.speed_scaling import SpeedScaling
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode

@@ -22,8 +22,8 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.motion.messages import REACTION_S, StatedController
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.messages import StatedController
+from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.motion.speed_scaling import SpeedScaling
@@ -194,6 +194,7 @@ class MotionDriver:
         self._scaling.controller(getattr(message, "speed_scaling_factor", np.nan), now_s)
         self._controller.take(message, self._scaling.at(now_s), now_s)
         if robot is not None:
+            robot.held_s = self._controller.held_s
             self._tell_scaling(robot, now_s)
         reference = message.reference
         if len(reference.positions) != count or len(reference.velocities) != count:

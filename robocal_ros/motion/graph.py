@@ -1,26 +1,88 @@
 """Who else commands the robot: by who publishes and serves on the graph, never by name.
 
-The first 12 bytes of an endpoint's gid are its participant's, one for each process (of one ROS
-context): what a process publishes shares them. The client of an action is a publisher of the DDS
-topic ``rq/<action>/_action/send_goalRequest``.
+Names of nodes only make the words readable. Facts used, of rmw_fastrtps and Fast DDS:
+
+- The first 12 bytes of an endpoint's gid are its participant's prefix, one per ROS context: what a
+  process publishes and serves shares them (a process of two contexts has two).
+- A client of an action is a publisher of the DDS topic ``rq/<action>/_action/send_goalRequest``.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import uuid
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 from rclpy.node import Node
+from std_msgs.msg import Empty
 
 PREFIX = 12  # bytes of a gid
 UNKNOWN = "_NODE_NAME_UNKNOWN_"  # of a node that is not yet, or no longer, discovered
+KILLED = "one that was killed counts until DDS gives it up, after up to 20 s"
 
 
-def publishers(node: Node, topic: str, *, dds: bool = False) -> dict[bytes, str]:
-    """Endpoints that publish a resolved topic: gid, and the node's name for people."""
-    found: Any = node.get_publishers_info_by_topic(topic, no_mangle=dds)
-    return {
-        bytes(info.endpoint_gid): f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+class Endpoint(NamedTuple):
+    """Who publishes something: DDS participant, and fully qualified name of the node."""
+
+    participant: bytes
+    name: str
+
+    def may_be_node_of(self, other: "Endpoint") -> bool:
+        """Whether it is of the same node, as far as the nodes' names are discovered.
+
+        Another node of the same process is not: programs are composed of many.
+        """
+        return self.participant == other.participant and (
+            self.name == other.name or any(one.name.endswith(UNKNOWN) for one in (self, other))
+        )
+
+
+def publishers(node: Node, topic: str) -> list[Endpoint]:
+    """Who publishes a resolved ROS topic."""
+    return _endpoints(node.get_publishers_info_by_topic(topic))
+
+
+def clients(node: Node, action: str) -> list[Endpoint]:
+    """Who sends goals to an action of that resolved name."""
+    topic = f"rq{action}/_action/send_goalRequest"
+    return _endpoints(node.get_publishers_info_by_topic(topic, no_mangle=True))
+
+
+def _endpoints(found: Iterable[Any]) -> list[Endpoint]:
+    return [
+        Endpoint(
+            bytes(info.endpoint_gid)[:PREFIX], f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+        )
         for info in found
-    }
+    ]
+
+
+def own_endpoint(node: Node) -> Endpoint:
+    """What endpoints of ``node`` look like: those of a topic that nobody else can know."""
+    topic = f"{node.get_fully_qualified_name()}/identity_{uuid.uuid4().hex}"
+    publisher = node.create_publisher(Empty, topic, 1)
+    try:
+        (own,) = publishers(node, topic)  # an own endpoint is known at once
+    finally:
+        node.destroy_publisher(publisher)
+    return own
+
+
+def strangers(
+    who: Iterable[Endpoint], own: Endpoint, count: int, cell: Sequence[Endpoint]
+) -> list[str]:
+    """Names of who neither is this node, with ``count`` endpoints, nor one of the cell's."""
+    who = list(who)
+    rest = [
+        one for one in who if one != own and not any(one.may_be_node_of(holder) for holder in cell)
+    ]
+    names = [
+        "a node that is not discovered yet" if one.name.endswith(UNKNOWN)
+        else f"a second {own.name}" if one.name == own.name
+        else one.name
+        for one in rest
+    ]  # fmt: skip
+    if who.count(own) > count:
+        names.append(f"a second {own.name} in this process")
+    return sorted(names)
 
 
 class CommandPath:
@@ -40,63 +102,34 @@ class CommandPath:
     def __init__(
         self, node: Node, topic: str, action: str, cell: Sequence[str], mine: str = ""
     ) -> None:
-        self._node, self._mine = node, mine
+        self._node, self._mine, self._action = node, mine, action
         # A controller takes trajectories on the topic beside its action too.
-        topics = {topic, *([f"{action.rpartition('/')[0]}/joint_trajectory"] if action else [])}
-        self._paths = [(each, "publishes", each, False) for each in sorted(topics)]
-        if action:
-            dds = f"rq{action}/_action/send_goalRequest"
-            self._paths.append((action, "is a client of", dds, True))
+        beside = [f"{action.rpartition('/')[0]}/joint_trajectory"] if action else []
+        self._topics = sorted({topic, *beside})
         self._cell = [node.resolve_topic_name(each) for each in cell]
+        self._own = own_endpoint(node)
         self.violation = ""
 
     def look(self) -> str:
         """Look now, before anything begins to move and twice a second; the violation."""
-        found = []
-        same = publishers(self._node, self._mine) if self._mine else {}
+        node, found = self._node, []
+        same = publishers(node, self._mine) if self._mine else []
         if len(same) > 1:
-            who = ", ".join(f"{name} [{gid.hex()[:24]}]" for gid, name in sorted(same.items()))
+            who = ", ".join(sorted(f"{one.name} [{one.participant.hex()}]" for one in same))
             found.append(
                 f"{self._mine} has {len(same)} publishers ({who}): one node of this kind for each "
                 "robot; end the others"
             )
-        cell = {
-            (gid[:PREFIX], who)
-            for each in self._cell
-            for gid, who in publishers(self._node, each).items()
-        }
-        for name, does, topic, dds in self._paths:
-            found += [f"{who} {does} {name}" for who in self._strangers(topic, dds, cell)]
+        cell = [one for each in self._cell for one in publishers(node, each)]
+        for topic in self._topics:
+            others = strangers(publishers(node, topic), self._own, 1, cell)
+            found += [f"{who} publishes {topic}" for who in others]
+        if self._action:
+            others = strangers(clients(node, self._action), self._own, 1, cell)
+            found += [f"{who} is a client of {self._action}" for who in others]
         self.violation = "; ".join(found)
         if found:
             self.violation += (
-                ": nobody else may command the robot while the cell moves it; one that was killed "
-                "counts until DDS gives it up, after up to 20 s"
+                f": nobody else may command the robot while the cell moves it; {KILLED}"
             )
         return self.violation
-
-    def _strangers(self, topic: str, dds: bool, cell: set[tuple[bytes, str]]) -> list[str]:
-        """Names of who neither is this node nor one of the cell's."""
-        found = publishers(self._node, topic, dds=dds)
-        rest = [who for gid, who in found.items() if not _is_of((gid[:PREFIX], who), cell)]
-        own = self._node.get_fully_qualified_name()
-        if own in rest:
-            rest.remove(own)
-        return sorted(
-            "a node that is not discovered yet" if who.endswith(UNKNOWN)
-            else f"a second {own}" if who == own
-            else who
-            for who in rest
-        )  # fmt: skip
-
-
-def _is_of(one: tuple[bytes, str], nodes: set[tuple[bytes, str]]) -> bool:
-    """Whether it is one of these nodes, as far as their names are discovered.
-
-    Another node of the same process is not: programs are composed of many.
-    """
-    return any(
-        one[0] == participant
-        and (one[1] == name or any(each.endswith(UNKNOWN) for each in (one[1], name)))
-        for participant, name in nodes
-    )

@@ -18,12 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core.samples import stamp_ns
-from robocal_ros.motion.plan import LEAD_S, JointPlan
+from robocal_ros.motion.plan import LEAD_S, REACTION_S, JointPlan
 from robocal_ros.nodes.conversions import NS
 
 Array = NDArray[np.float64]
 
-REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
 LINES_S = 0.01  # between points for a controller that has no velocities
 STATED_S = 0.05  # a controller's state that is older, or so far off in its stamp, is not gone by
 SPOKEN_S = 1.0  # a controller whose state is newer tells whether there are velocities

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+REACTION_S = 0.01  # from a message to what the controller makes of it (8 to 10 ms measured)
 LEAD_S = 0.05
 """First point of what is sent, ahead of its arrival.
 

@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 VELOCITY_S = 0.03  # span of the readings that give a velocity
 LEAST, OLDEST_S = 5, 0.2  # of them, if not too old: one wild reading is outvoted
 REST_RAD = 1e-4  # a robot that rests moves less
-AT_REST = 5e-3  # rad/s (m/s); slower references move nothing
 BACK_S = 1.0  # stamps that go back by more began anew
 FARTHEST = 1e9  # rad or m; of what is beyond no speed is finite
 AS_NEAR = 0.01  # of the allowed deviation: what no reading tells apart
@@ -68,7 +67,8 @@ class RobotWatch:
     ----------
     silence : how long no new reading came.
     scaling : how fast the controller's clock runs, 1 as planned; 1 where nobody tells it lately.
-    held_s : when one that pauses was last seen to give up a motion: its reference came to rest.
+    held_s : when a controller that pauses was last seen to give up a motion, as
+        `StatedController` has it.
     """
 
     def __init__(self, arm: SerialArm, driving: DrivingConfig) -> None:
@@ -77,7 +77,6 @@ class RobotWatch:
         self.silence = Silence()
         self.scaling, self.held_s = 1.0, -np.inf
         self._scaled_s = -np.inf  # when that was told
-        self._paused_speed = 0.0  # of the reference, in a pause
         self._heard_s = 0.0
         self._readings: deque[tuple[float, Array]] = deque(maxlen=512)
         self._reference: tuple[Array, Array] | None = None
@@ -118,10 +117,6 @@ class RobotWatch:
         if not (np.all(np.isfinite(q)) and np.all(np.isfinite(qd))):
             return
         self._reference, self._reference_s = (q, qd), now_s
-        before, speed = self._paused_speed, float(np.max(np.abs(qd)))
-        self._paused_speed = speed if self.scaling == 0.0 else 0.0
-        if self.scaling == 0.0 and speed < AT_REST <= before:
-            self.held_s = now_s
         if self._plan is None or np.max(np.abs(qd)) < 1e-2:
             return
         here_s = self.driven_s(now_s)

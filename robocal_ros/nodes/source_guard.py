@@ -3,7 +3,7 @@
 from rclpy.node import Node
 
 from robocal_ros.core.samples import UNCORRECTED
-from robocal_ros.motion.graph import PREFIX, UNKNOWN, publishers
+from robocal_ros.motion.graph import UNKNOWN, publishers
 from robocal_ros.sessions.observations import JOINTS
 
 _STATUS = "robocal_msgs/msg/CorrectionStatus"  # who publishes it is a correction node
@@ -38,20 +38,16 @@ class SourceGuard:
 
     def look(self) -> None:
         """Look again; before its publishers are discovered the topic's name is a hint."""
-        found = self._publishers(self._topic)
-        if self._hinted and (not found or any(name.endswith(UNKNOWN) for _, name in found)):
+        found = set(publishers(self._node, self._topic))
+        if self._hinted and (not found or any(one.name.endswith(UNKNOWN) for one in found)):
             return
         correcting = {
             who
             for topic, kinds in self._node.get_topic_names_and_types()
             if _STATUS in kinds
-            for who in self._publishers(topic)
+            for who in publishers(self._node, topic)
         }
-        culprits = sorted({name for _, name in found & correcting})
+        culprits = sorted({one.name for one in found & correcting})
         self.fault = (
             f"{self._topic} is published by {', '.join(culprits)}: {self._why}" if culprits else ""
         )
-
-    def _publishers(self, topic: str) -> set[tuple[bytes, str]]:
-        """DDS participant and node of each publisher."""
-        return {(gid[:PREFIX], name) for gid, name in publishers(self._node, topic).items()}

@@ -5,12 +5,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from correction_robot import HOME, NAMES, NOMINAL, Robot
 
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.housing import Housing
+from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.messages import StatedController
+from robocal_ros.motion.robot_watch import RobotWatch
+from robocal_ros.motion.stopping import stop
+from robocal_ros.motion.watched_stop import STANDS_S, WatchedStop
 from robocal_ros.sim.joint_motion import CYCLE_S, LAG_S, JointMotion
 from robocal_ros.sim.trajectory import Trajectory
 from robocal_ros.sim.trajectory_goal import ControllerOptions
@@ -145,3 +152,26 @@ def test_without_its_reference_a_stop_steps_by_no_more_than_the_drives_lag(stop,
     assert np.min(speed) > SPEED - back - even
     assert np.max(np.abs(np.diff(speed))) < back + even
     assert np.max(np.abs(np.diff(speed))) > 0.9 * back  # no sender can help it
+
+
+def test_a_stop_that_a_pausing_controller_is_seen_to_take_is_over():
+    """Of own motions: the watch takes the controller's word for it."""
+    robot = RobotWatch(NOMINAL, DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05))
+    stopping, controller = WatchedStop(NOMINAL, MotionLimits()), StatedController()
+    state = SimpleNamespace(joint_names=NAMES, header=SimpleNamespace(stamp=Time()))
+    state.feedback = SimpleNamespace(velocities=np.zeros(6))
+    for number in range(200):
+        now_s = number * CYCLE_S
+        robot.scaled(float(number == 0), now_s)
+        robot.reading(now_s, HOME, now_s)
+        robot.silence.look(now_s)
+        qd = 0.3 * np.eye(6)[0] * (number < 100)  # unscaled
+        robot.controller(HOME, qd, now_s)
+        state.reference = SimpleNamespace(positions=HOME, velocities=qd)
+        controller.take(state, robot.scaling, now_s)
+        robot.held_s = controller.held_s
+        if number == 60:
+            stopping.begin(stop(NOMINAL, MotionLimits(), HOME, np.zeros(6)), now_s)
+        stopping.look(robot, now_s)
+        if not 100 <= number <= 100 + np.ceil(STANDS_S / CYCLE_S):
+            assert stopping.under_way is (60 <= number < 100)

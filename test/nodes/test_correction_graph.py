@@ -16,8 +16,9 @@ from robocal_msgs.msg import MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.correction.graph import GraphWatch, JointSources, Leases, own_participant
+from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
 from robocal_ros.correction.refusals import Reason
+from robocal_ros.motion.graph import own_endpoint
 from robocal_ros.nodes import qos
 
 PATH = "/arm_controller/joint_trajectory"
@@ -85,8 +86,10 @@ def watched(graph: Any) -> Iterator[Watched]:
 
 def test_endpoints_of_a_process_share_a_participant(watched: Watched) -> None:
     same = Node("another", context=watched.own.context)
-    assert own_participant(watched.own) == own_participant(same)
-    assert own_participant(watched.process("another").node) != own_participant(same)
+    assert own_endpoint(watched.own).participant == own_endpoint(same).participant
+    assert (
+        own_endpoint(watched.process("another").node).participant != own_endpoint(same).participant
+    )
     same.destroy_node()
 
 

@@ -14,8 +14,7 @@ from robocal_ros.correction.robot_stop import (
     RobotStop,
     RobotTrack,
 )
-from robocal_ros.motion.messages import REACTION_S
-from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
 from robocal_ros.storage.robots import load_description
 

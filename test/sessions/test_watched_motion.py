@@ -186,22 +186,6 @@ def test_a_stop_that_is_lost_in_a_pause_does_not_let_the_motion_go_on(lost):
     assert abs(q - paused)[0] <= (speed[0] * longest_s if lost == 1000 else 0.0)
 
 
-def test_a_stop_that_a_pausing_controller_is_seen_to_take_is_over():
-    robot = RobotWatch(ARM, DrivingConfig(HOUSING, 0.1, 0.008, 0.05))
-    stopping = WatchedStop(ARM, MotionLimits())
-    for number in range(200):
-        now_s = number * PERIOD_S
-        robot.scaled(float(number == 0), now_s)
-        robot.reading(now_s, HOME, now_s)
-        robot.silence.look(now_s)
-        robot.controller(HOME, 0.3 * np.eye(6)[0] * (number < 100), now_s)  # unscaled velocities
-        if number == 60:
-            stopping.begin(stop(ARM, MotionLimits(), HOME, np.zeros(6)), now_s)
-        stopping.look(robot, now_s)
-        if not 100 <= number <= 100 + np.ceil(STANDS_S / PERIOD_S):
-            assert stopping.under_way is (60 <= number < 100)
-
-
 # ---- stops --------------------------------------------------------------------------------------
 
 
