@@ -318,7 +318,7 @@ def test_a_history_that_cannot_be_read_leaves_nobody_waiting(plc, graph):
 def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
     client = ActionClient(graph.probe, RunMaintenance, f"{NODE}/run_maintenance")
     graph.spin_until(client.server_is_ready, "the action")
-    client.send_goal_async(RunMaintenance.Goal(cycle_id="a", gap_s=30.0))
+    sent = client.send_goal_async(RunMaintenance.Goal(cycle_id="a", gap_s=30.0))
     session, calls = plc.node._session, plc.node._calls
 
     def ended() -> bool:
@@ -331,6 +331,10 @@ def test_a_cancel_that_comes_late_leaves_the_next_cycle_alone(plc, graph):
     assert calls._cancel(goal) is CancelResponse.REJECT
     graph.spin_until(lambda: session.running is None, "b has ended")
     assert session.result("b").code is Code.ACCEPT
+    graph.spin_until(sent.done, "a was taken")
+    told = sent.result().get_result_async()
+    graph.spin_until(told.done, "a's caller is told")
+    assert told.result().result.status == session.result("a").code
 
 
 def test_a_node_that_is_deactivated_says_so(plc, graph):
