@@ -8,6 +8,7 @@ from typing import Any
 from session_events import EventLog
 
 from robocal_ros import __version__
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
@@ -15,7 +16,6 @@ from robocal_ros.sessions.hand_eye_config import HandEyeConfig
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_recorded import configuration
 from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.storage.bags import BagMessage, BagReader, BagWriter
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot

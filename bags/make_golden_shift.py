@@ -35,8 +35,10 @@ from bench.closed_loop.judging import Figures  # noqa: E402
 from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
 from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
 from robocal_ros.core.samples import (  # noqa: E402
+    JOINTS,
     REFERENCE_SPHERE,
     SPHERE_CLOUD,
+    TEMPERATURES,
     JointSample,
     PointSample,
     TemperatureSample,
@@ -45,8 +47,6 @@ from robocal_ros.core.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noq
 from robocal_ros.sessions import records, tool_recorded  # noqa: E402
 from robocal_ros.sessions.edge_log import EDGES  # noqa: E402
 from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
-from robocal_ros.sessions.observations import JOINTS  # noqa: E402
-from robocal_ros.sessions.temperatures import TEMPERATURES  # noqa: E402
 from robocal_ros.sim.cell_outputs import Happened  # noqa: E402
 from robocal_ros.sim.cell_samples import Sample  # noqa: E402
 from robocal_ros.storage.bag_writer import BagWriter, ros_time  # noqa: E402

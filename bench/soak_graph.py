@@ -19,7 +19,7 @@ from std_srvs.srv import SetBool
 from bench.processes import ENDS_WITH_PARENT, resident_mb
 from bench.startup import EXECUTABLES
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.conversions import time_message

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import arm_of
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import arm_of
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.sessions.found_cycles import automatic_commands
 from robocal_ros.sessions.inputs import take_message

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import arm_of
 from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
+from robocal_ros.core.kinematics.documents import arm_of
 from robocal_ros.core.point_clouds import cloud_points
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.sessions import events

@@ -13,7 +13,7 @@ from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
 from robocal_ros import __version__
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import MEASURED_POINT, SPHERE_CLOUD, JointSample, PointSample
+from robocal_ros.core.samples import JOINTS, MEASURED_POINT, SPHERE_CLOUD, JointSample, PointSample
 from robocal_ros.core.thermal.process_documents import process_document
 from robocal_ros.core.thermal.process_learning import LearnedProcess
 from robocal_ros.core.tool.edge_samples import EdgeSample
@@ -29,7 +29,6 @@ from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession
 from robocal_ros.sessions.maintenance.accuracy import Accuracy
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_driving import ToolDriver

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     import numpy as np
 
-    from robocal_ros.core.documents import transform_document
+    from robocal_ros.core.frame_texts import transform_document
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -154,7 +154,8 @@ def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[
 def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
     from math import degrees
 
-    from robocal_ros.core.documents import transform_document, verdict_document
+    from robocal_ros.core.assessment import verdict_document
+    from robocal_ros.core.frame_texts import transform_document
 
     sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
     return {

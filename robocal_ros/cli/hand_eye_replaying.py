@@ -8,7 +8,7 @@ import numpy as np
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
-from robocal_ros.core.documents import transform_document
+from robocal_ros.core.frame_texts import transform_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message

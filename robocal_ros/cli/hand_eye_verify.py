@@ -45,12 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.assessment import summarise
-    from robocal_ros.core.documents import (
-        errors_document,
-        transform_document,
-        verdict_document,
-    )
+    from robocal_ros.core.assessment import errors_document, summarise, verdict_document
+    from robocal_ros.core.frame_texts import transform_document
     from robocal_ros.core.hand_eye.result import by_shot
     from robocal_ros.core.hand_eye.verification import verify
     from robocal_ros.storage.hand_eye_files import read_flange_mount

@@ -8,7 +8,6 @@ import numpy as np
 
 from robocal_ros.core.assessment import hold_out, pose_groups
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import identification_document
 from robocal_ros.core.errors import InputError, TooFewSamplesError
 from robocal_ros.core.identification import (
     JudgedIdentification,
@@ -16,6 +15,7 @@ from robocal_ros.core.identification import (
     Part,
     identify_and_judge,
 )
+from robocal_ros.core.identification.documents import identification_document
 from robocal_ros.core.identification.mismatch import explain_mismatch, require_match
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements

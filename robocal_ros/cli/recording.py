@@ -6,11 +6,10 @@ from itertools import chain, pairwise
 from typing import Any
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import stamp_ns
+from robocal_ros.core.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_shots import SHOTS
-from robocal_ros.sessions.observations import JOINTS, MEASURING
 from robocal_ros.sessions.replay import (
     EVENTS,
     first_configuration,
@@ -19,7 +18,6 @@ from robocal_ros.sessions.replay import (
     read_events,
     topic_kind,
 )
-from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.storage.bags import BagMessage, BagReader
 
 MEASURED = (*MEASURING, EDGES, *SHOTS)

@@ -13,23 +13,22 @@ from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recording import UNASKED, Recording, open_recording
 from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
 from robocal_ros.cli.tool_replaying import replay_tool
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.found_cycles import accepting, automatic_commands, window_commands
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
 from robocal_ros.sessions.inputs import take_message
 from robocal_ros.sessions.maintenance.session import RUN as MAINTAIN
-from robocal_ros.sessions.records import is_thermal_session
 from robocal_ros.sessions.replay import (
     ReplayReport,
     feed,
     one_by_one,
     replay,
 )
-from robocal_ros.sessions.seeding import session_as_recorded
+from robocal_ros.sessions.seeding import is_thermal_session, session_as_recorded
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.tool_recorded import is_tool_session

@@ -21,7 +21,8 @@ from robocal_ros.core.thermal.spots import ColdSpots
 from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits, require_cold_counterparts
 from robocal_ros.storage.prior_files import read_prior
 from robocal_ros.storage.sensor_files import PlacedSensor, read_sensor
-from robocal_ros.storage.tables import read_measurements, read_visits
+from robocal_ros.storage.tables import read_measurements
+from robocal_ros.storage.visit_tables import read_visits
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.documents import transform_document
+    from robocal_ros.core.frame_texts import transform_document
     from robocal_ros.core.tool.exports import exported
 
     T_flange_tool = given_frame(args)

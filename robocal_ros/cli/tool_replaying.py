@@ -6,7 +6,7 @@ from typing import Any
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
-from robocal_ros.core.documents import transform_document
+from robocal_ros.core.frame_texts import transform_document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.events import Outcome
 from robocal_ros.sessions.replay import ReplayReport

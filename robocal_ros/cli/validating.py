@@ -31,8 +31,8 @@ from robocal_ros.report.validation_figures import Drawn, cell_drawn, thermal_fig
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
-from robocal_ros.sessions.records import is_thermal_session
 from robocal_ros.sessions.replay import EVENTS, first_configuration, read_events, topic_kind
+from robocal_ros.sessions.seeding import is_thermal_session
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.tool_recorded import is_tool_session
 from robocal_ros.storage.bags import BagMessage, BagReader

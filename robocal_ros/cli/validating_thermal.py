@@ -11,15 +11,14 @@ from numpy.typing import NDArray
 from robocal_ros.cli.bag_truth import CheckPoints
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.core.documents import arm_of, holds_drift, reference_of
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import arm_of
 from robocal_ros.core.proposals import THERMAL, Action, Entry
-from robocal_ros.core.samples import Measurements, stamp_ns
+from robocal_ros.core.samples import MEASURING, Measurements, stamp_ns
 from robocal_ros.core.thermal.achieved import measured_errors, true_errors
-from robocal_ros.core.thermal.reference import ColdReference
+from robocal_ros.core.thermal.reference import ColdReference, holds_drift, reference_of
 from robocal_ros.report.drift import figures_of
 from robocal_ros.sessions.in_force import REFERENCE
-from robocal_ros.sessions.observations import MEASURING
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.bags import BagMessage
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.core.frame_texts import Document
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -199,3 +200,35 @@ def _one_sided_p(gain: Array) -> float:
         return 0.0 if gain.mean() > 0.0 else 1.0
     t = float(gain.mean()) / (spread / np.sqrt(len(gain)))
     return float(1.0 - stdtr(len(gain) - 1, t))
+
+
+def errors_document(errors: ErrorSummary) -> Document:
+    """Held-out errors in mm."""
+    return {
+        "mean_mm": errors.mean_m * 1e3,
+        "rms_mm": errors.rms_m * 1e3,
+        "p95_mm": errors.p95_m * 1e3,
+        "max_mm": errors.max_m * 1e3,
+        "n": errors.n,
+    }
+
+
+def judged_errors_document(judged: Judgement) -> Document:
+    """Held-out errors before and after, and those that the candidate's covariance predicts."""
+    return {
+        "nominal": {"held_out": errors_document(judged.nominal)},
+        "in_force": {"held_out": errors_document(judged.current)},
+        "calibrated": {
+            "held_out": errors_document(judged.candidate),
+            "predicted": {
+                "model_rms_mm": judged.predicted_rms_m * 1e3,
+                "total_rms_mm": judged.predicted_total_rms_m * 1e3,
+                "workspace_rms_mm": judged.workspace_rms_m * 1e3,
+            },
+        },
+    }
+
+
+def verdict_document(verdict: Verdict) -> Document:
+    """Decision, its code's name and its reason."""
+    return {"accept": verdict.accept, "code": verdict.code.name, "reason": verdict.reason}

@@ -1,4 +1,6 @@
-"""Frames as text: fixed decimals, URDF."""
+"""Frames as text: documents (JSON), fixed decimals, URDF."""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,3 +31,11 @@ def urdf_joint(parent: str, child: str, xyz: str, rpy: str) -> str:
         f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n'
         "</joint>"
     )
+
+
+Document = dict[str, Any]
+
+
+def transform_document(T: Array) -> Document:
+    """A pose (4, 4) as ``xyz_mm`` and ``quat_xyzw``."""
+    return {"xyz_mm": (T[:3, 3] * 1e3).tolist(), "quat_xyzw": frames.quat_xyzw(T).tolist()}

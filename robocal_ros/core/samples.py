@@ -12,18 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.point_clouds import cloud_points
 
 Array = NDArray[np.float64]
 
 DEFAULT_TARGET = "tool"
 CORRECTED = "robocal_corrected"  # frame_id of commands that carry a joint correction
+JOINTS = "joint_states"
+SPHERE_CENTER = "sphere_center"
 SPHERE_CLOUD = "sphere_cloud"
-REFERENCE_SPHERE = "reference_sphere_center"
+MEASURED_POSE = "measured_pose"
+REFERENCE_SPHERE = "reference_sphere_center"  # a sphere fixed in the cell
 MEASURED_POINT = "measured_point"  # the input that a point comes from where nothing else is said
+MEASURING = (MEASURED_POINT, SPHERE_CENTER, SPHERE_CLOUD, MEASURED_POSE, REFERENCE_SPHERE)
+JUMPS = "clock_jumps"  # beside topics in marks
 UNCORRECTED = "joint_correction"  # in the name of a correction node, and so of its topics
 TAUGHT = "robocal_taught"  # frame_id of joint states from which the correction was removed
+TEMPERATURES = "motor_temperatures"
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +223,8 @@ def joint_sample(message: Any) -> JointSample:
     return JointSample(stamp_ns(message.header.stamp), names, position)
 
 
-def _frame_and_target(frame_id: str, default_target: str) -> tuple[str, str]:
+def frame_and_target(frame_id: str, default_target: str) -> tuple[str, str]:
+    """Measuring frame and target of a ``frame[/target]``."""
     frame, _, target = frame_id.partition("/")
     return frame, target or default_target
 
@@ -234,26 +239,10 @@ def point_sample(
     message: Any, default_target: str = DEFAULT_TARGET, topic: str = MEASURED_POINT
 ) -> PointSample:
     """Build a sample from a ``geometry_msgs/PointStamped`` (frame_id ``frame[/target]``)."""
-    frame, target = _frame_and_target(message.header.frame_id, default_target)
+    frame, target = frame_and_target(message.header.frame_id, default_target)
     p = message.point
     position = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured point")
     return PointSample(stamp_ns(message.header.stamp), frame, target, position, topic)
-
-
-def cloud_sample(
-    message: Any, rule: SphereRule, default_target: str = DEFAULT_TARGET, topic: str = SPHERE_CLOUD
-) -> PointSample:
-    """Build a sample of a sphere's centre from a ``sensor_msgs/PointCloud2`` of its cap.
-
-    Raises
-    ------
-    InputError, TooFewSamplesError, ResidualError
-        When the message is no cloud, or holds no sphere as the rule wants it.
-    """
-    frame, target = _frame_and_target(message.header.frame_id, default_target)
-    fit = fit_sphere(cloud_points(message), rule)
-    sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
-    return PointSample(stamp_ns(message.header.stamp), frame, target, fit.centre, topic, sigma_m)
 
 
 def temperature_sample(message: Any) -> TemperatureSample:
@@ -281,7 +270,7 @@ def pose_sample(message: Any, default_target: str = DEFAULT_TARGET) -> PoseSampl
     """
     from robocal_ros.core.frames import transform_from_quat
 
-    frame, target = _frame_and_target(message.header.frame_id, default_target)
+    frame, target = frame_and_target(message.header.frame_id, default_target)
     p, o = message.pose.position, message.pose.orientation
     xyz = _finite(np.array([p.x, p.y, p.z], dtype=np.float64), "measured position")
     quat = _finite(np.array([o.x, o.y, o.z, o.w], dtype=np.float64), "measured orientation")

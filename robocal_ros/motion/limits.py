@@ -9,6 +9,9 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 
 Array = NDArray[np.float64]
+# How far from where a step begins each joint may stand.
+START_NEAR_RAD = float(np.radians(0.02))
+START_NEAR_M = 5e-5  # prismatic
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,3 +57,8 @@ class MotionLimits:
                 )
             found.append(np.broadcast_to(values, (arm.n,)))
         return found[0], found[1], found[2]
+
+
+def start_near(arm: SerialArm) -> Array:
+    """How far (n,) from where a motion begins each joint may stand, rad (m)."""
+    return np.where(arm.prismatic, START_NEAR_M, START_NEAR_RAD)

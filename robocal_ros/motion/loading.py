@@ -8,7 +8,6 @@ import numpy as np
 from robocal_ros.core.errors import LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.kinematics.inverse import inverse
-from robocal_ros.core.tool.flange_path import FEWEST_READINGS, JointPath
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.stopping import stop
 
@@ -21,12 +20,3 @@ def load_motion(arm: SerialArm) -> None:
     stop(arm, MotionLimits(), q, np.full(arm.n, 0.01)).at(0.0)
     with suppress(LimitError):  # a posture that some arm does not have
         inverse(arm, arm.fk(q)[None], q)
-
-
-def load_measuring(arm: SerialArm) -> None:
-    """The same of measuring a tool in motion: a third of a second."""
-    import scipy.special  # noqa: F401
-
-    load_motion(arm)
-    time = np.linspace(0.0, 0.1, FEWEST_READINGS)
-    JointPath(arm, time, np.full((len(time), arm.n), 0.3)).at(np.array([0.05]))

@@ -8,24 +8,17 @@ from numpy.typing import ArrayLike, NDArray
 from robocal_ros.core import frames
 from robocal_ros.core.errors import LimitError
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.tool.flange_path import FEWEST_READINGS, JointPath
 from robocal_ros.core.tool.measuring_plan import PlannedStep
 from robocal_ros.motion import tip_path
 from robocal_ros.motion.cell import ROUNDING, MotionCell
-from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.plan import JointPlan, joined
+from robocal_ros.motion.limits import MotionLimits, start_near
+from robocal_ros.motion.loading import load_motion
+from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.timing import Ride, ramp_of
+from robocal_ros.motion.travel import along, corner_ride, raised_way
 
 Array = NDArray[np.float64]
-
-# How far from where a step begins each joint may stand.
-START_NEAR_RAD = float(np.radians(0.02))
-START_NEAR_M = 5e-5  # prismatic
-SHORTEST_WAY_M = 1e-6  # a shorter part of an approach is left out
-
-
-def start_near(arm: SerialArm) -> Array:
-    """How far (n,) from where a motion begins each joint may stand, rad (m)."""
-    return np.where(arm.prismatic, START_NEAR_M, START_NEAR_RAD)
 
 
 def start_pose(step: PlannedStep, limits: MotionLimits) -> Array:
@@ -56,29 +49,9 @@ def approach(
     return along(cell, q, corners, f"way to step {step.name}")
 
 
-def along(cell: MotionCell, q: Array, corners: list[Array], name: str) -> JointPlan:
-    """Straight from pose to pose of the tip (4, 4), from joints (n,), at rest at each.
-
-    Raises
-    ------
-    LimitError
-        Where the way passes a joint limit, the reach, a singularity, or the housing.
-    """
-    plans: list[JointPlan] = []
-    here = cell.T_base_tip(q)
-    for number, there in enumerate(corners, start=1):
-        plan = cell.joints(tip_path.line(here, there, _ride(cell, here, there)), q)
-        share, _ = cell.demand(plan, cell.limits.tcp_speed_m_s)
-        plan = plan.slower(max(share, 1.0))
-        cell.require_clear(plan, f"{name}, part {number}")
-        plans.append(plan)
-        q, here = plan.q[-1], there
-    return joined(plans)
-
-
 def least_s(cell: MotionCell, corners: list[Array]) -> float:
     """How long `along` takes at the least from pose to pose (4, 4): joints may need longer."""
-    return sum(_ride(cell, here, there).duration_s for here, there in pairwise(corners))
+    return sum(corner_ride(cell, here, there).duration_s for here, there in pairwise(corners))
 
 
 def measuring(cell: MotionCell, step: PlannedStep, q_now: ArrayLike) -> JointPlan:
@@ -130,38 +103,6 @@ def _corners(cell: MotionCell, here: Array, step: PlannedStep, after_circle: boo
     if inside and after_circle and step.kind == "circle":  # both begin in one quadrant
         return [there]
     return raised_way(cell, here, there, -np.inf if inside else cell.housing.retract_m)
-
-
-def raised_way(cell: MotionCell, here: Array, there: Array, above_m: float) -> list[Array]:
-    """Poses of the tip (4, 4): up along the laser's z to ``above_m`` or the higher end, over, down.
-
-    Parts that are no way are left out; the last pose is ``there``.
-    """
-    first, last = cell.in_laser(here[:3, 3]), cell.in_laser(there[:3, 3])
-    height = max(first[2], last[2], above_m)
-    way = [_raised(cell, here, height - first[2]), _raised(cell, there, height - last[2])]
-    moves = [
-        a for a, b in zip(way, [here, *way], strict=False) if _way(cell, a, b) > SHORTEST_WAY_M
-    ]
-    return [*moves, there]
-
-
-def _raised(cell: MotionCell, T: Array, by_m: float) -> Array:
-    """A pose moved along the laser's z."""
-    return np.asarray(frames.transform(np.eye(3), by_m * cell.T_base_laser[:3, 2]) @ T)
-
-
-def _way(cell: MotionCell, here: Array, there: Array) -> float:
-    """No point between tip and flange moves further, m."""
-    turn = np.linalg.norm(frames.log_rotation(there[:3, :3] @ here[:3, :3].T))
-    reach = np.max(np.linalg.norm(cell.tool.corners - cell.tool.p_tip, axis=1))
-    return float(np.linalg.norm(there[:3, 3] - here[:3, 3]) + turn * reach)
-
-
-def _ride(cell: MotionCell, here: Array, there: Array) -> Ride:
-    """The fastest within the tip's limits."""
-    limits = cell.limits
-    return Ride.within(_way(cell, here, there), limits.tcp_speed_m_s, limits.tcp_acceleration_m_s2)
 
 
 def _turn(step: PlannedStep, limits: MotionLimits) -> Ride:
@@ -222,3 +163,12 @@ def _require_start(cell: MotionCell, step: PlannedStep, q: Array) -> None:
             f"off by {scale * abs(shift[joint]):.3f} {unit}, allowed are "
             f"{scale * near[joint]:.3f} {unit}. Approach the start again"
         )
+
+
+def load_measuring(arm: SerialArm) -> None:
+    """The same of measuring a tool in motion: a third of a second."""
+    import scipy.special  # noqa: F401
+
+    load_motion(arm)
+    time = np.linspace(0.0, 0.1, FEWEST_READINGS)
+    JointPath(arm, time, np.full((len(time), arm.n), 0.3)).at(np.array([0.05]))

@@ -12,7 +12,7 @@ from robocal_ros.core.errors import LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
-from robocal_ros.motion.measuring import start_near
+from robocal_ros.motion.limits import start_near
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.silence import Silence
 from robocal_ros.motion.speed_scaling import TOLD_S

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Transform
+from geometry_msgs.msg import Pose, Transform
 from robocal_msgs.msg import (
-    AccuracyState,
     CalibrationQuality,
     CalibrationSummary,
     KinematicModel,
@@ -21,7 +20,6 @@ from robocal_ros.core.kinematics.parameters import COLUMNS
 from robocal_ros.core.proposals import Entry
 
 if TYPE_CHECKING:  # most nodes have no thermal session
-    from robocal_ros.sessions.accuracy import Accuracy
     from robocal_ros.sessions.events import Outcome
 
 NS = 1_000_000_000
@@ -59,7 +57,7 @@ def kinematic_model(
     state: int,
     stamp: Header,
 ) -> KinematicModel:
-    """A model document (``core.documents.model_document``) as a message.
+    """A model document (``model_document``) as a message.
 
     Raises
     ------
@@ -136,14 +134,6 @@ def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Heade
     return message
 
 
-def accuracy_message(
-    found: "Accuracy", tolerance_m: float, *, robot: str, serial: str, stamp: Header
-) -> AccuracyState:
-    """How accurate the robot is believed to be, see `Accuracy.document`."""
-    told = found.document(tolerance_m)
-    return AccuracyState(header=stamp, robot=robot, serial=serial, **told)
-
-
 def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
     """Tell errors, mm, by the names ``mean_mm``, ``rms_mm``, ``p95_mm`` and ``max_mm``.
 
@@ -177,3 +167,11 @@ def summary_message(entry: Entry) -> CalibrationSummary:
 def _require_finite(what: str, values: Sequence[float]) -> None:
     if not all(math.isfinite(value) for value in values):
         raise InputError(f"the {what} holds a number that is not finite: it is not sent")
+
+
+def pose_message(T: Any) -> Pose:
+    """A pose (4, 4), m."""
+    moved = transform_message(T)
+    message = Pose(orientation=moved.rotation)
+    message.position.x, message.position.y, message.position.z = T[:3, 3].tolist()
+    return message

@@ -18,7 +18,8 @@ from robocal_ros.sessions.events import LOAD, Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_data import MOST_POINTS, DataSet, data_set_begun
 from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_paths import made_folder_beside, unused
+from robocal_ros.storage.files import made_folder_beside
+from robocal_ros.storage.history_paths import unused
 
 Ask = Callable[[Command], Awaitable[Outcome]]
 

@@ -16,6 +16,7 @@ from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
 from robocal_ros.core.proposals import Head, hand_eye_kind
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.motion.silence import Silence
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.base import POLL_S, HouseNode
@@ -38,7 +39,6 @@ from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_recorded import configuration
 from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 

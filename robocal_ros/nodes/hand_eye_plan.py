@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from robocal_msgs.srv import CheckHandEyePlan
 
 from robocal_ros.core.samples import joint_sample
+from robocal_ros.nodes.conversions import pose_message
 from robocal_ros.nodes.endpoints import EndpointNode
 from robocal_ros.nodes.pose_settings import given_pose
-from robocal_ros.nodes.tool_messages import pose_message
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_planning import (
     judged_plan,

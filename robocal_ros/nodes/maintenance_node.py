@@ -10,7 +10,15 @@ from robocal_msgs.msg import AccuracyState, CorrectionStatus
 from sensor_msgs.msg import JointState, PointCloud2
 
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.samples import joint_sample, stamp_ns
+from robocal_ros.core.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
+    joint_sample,
+    stamp_ns,
+)
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.motion.driver import LeaseHolder, MotionDriver
 from robocal_ros.motion.gap_sources import GapSources
@@ -35,7 +43,6 @@ from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance import MaintenanceSession, State
 from robocal_ros.sessions.maintenance.requests import Answer, Move, Request
-from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT, POSE
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
 from robocal_ros.storage.state_files import StateFile
@@ -48,10 +55,10 @@ NS = 1_000_000_000
 ENDS = "the node was deactivated"
 ACCURACY, CORRECTION = "thermal_node/accuracy", "joint_correction_node/status"
 MEASUREMENTS = {
-    POINT: PointStamped,
-    CENTRE: PointStamped,
-    CLOUD: PointCloud2,
-    POSE: PoseStamped,
+    MEASURED_POINT: PointStamped,
+    SPHERE_CENTER: PointStamped,
+    SPHERE_CLOUD: PointCloud2,
+    MEASURED_POSE: PoseStamped,
 }
 
 

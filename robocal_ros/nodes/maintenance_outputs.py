@@ -9,6 +9,7 @@ from robocal_msgs.msg import AccuracyState, MaintenanceResult, MaintenanceStatus
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.nodes.session_events import SessionEvents
 from robocal_ros.nodes.tcf_services import ANSWERS
+from robocal_ros.nodes.thermal_outputs import accuracy_message
 from robocal_ros.sessions.accuracy import Accuracy
 from robocal_ros.sessions.maintenance import CycleResult, Status
 
@@ -74,7 +75,7 @@ class MaintenanceOutputs:
     def accuracy(self, found: Accuracy, tolerance_m: float, now_ns: int) -> None:
         """Tell the line how accurate the cell is believed to be."""
         self._accuracy.publish(
-            conversions.accuracy_message(
+            accuracy_message(
                 found,
                 tolerance_m,
                 robot=self._robot,

@@ -2,9 +2,8 @@
 
 from rclpy.node import Node
 
-from robocal_ros.core.samples import UNCORRECTED
+from robocal_ros.core.samples import JOINTS, UNCORRECTED
 from robocal_ros.motion.graph import UNKNOWN, publishers
-from robocal_ros.sessions.observations import JOINTS
 
 _STATUS = "robocal_msgs/msg/CorrectionStatus"  # who publishes it is a correction node
 

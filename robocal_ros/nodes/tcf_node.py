@@ -11,8 +11,9 @@ from sensor_msgs.msg import JointState
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.motion.loading import load_measuring
+from robocal_ros.motion.measuring import load_measuring
 from robocal_ros.motion.silence import Silence
 from robocal_ros.nodes import qos, tcf_motion
 from robocal_ros.nodes.base import POLL_S, HouseNode
@@ -29,7 +30,6 @@ from robocal_ros.nodes.tcf_services import Runner, TcfServices
 from robocal_ros.nodes.tcf_settings import SETTINGS, TRAJECTORY, session_config, taught_tool
 from robocal_ros.sessions.edge_log import EDGES
 from robocal_ros.sessions.events import BREAK_OFF, MEASURE_TOOL, TOOL_STEP, Command, Outcome
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_inputs import take_tool_message

@@ -8,7 +8,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import CalibrationQuality, ToolFrame, ToolStep
 
-from robocal_ros.core.documents import Document
+from robocal_ros.core.frame_texts import Document
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import PlannedStep

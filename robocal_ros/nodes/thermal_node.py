@@ -9,8 +9,17 @@ from sensor_msgs.msg import JointState, PointCloud2, Temperature
 
 from robocal_ros import __version__
 from robocal_ros.core import frames
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.kinematics.documents import model_document
+from robocal_ros.core.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    REFERENCE_SPHERE,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
+    TEMPERATURES,
+)
 from robocal_ros.core.thermal.documents import placed_of
 from robocal_ros.core.thermal.identification import require_parameters
 from robocal_ros.nodes import qos
@@ -29,10 +38,8 @@ from robocal_ros.nodes.thermal_services import ThermalServices
 from robocal_ros.nodes.thermal_settings import SETTINGS, session_config
 from robocal_ros.sessions.events import CYCLE, Outcome
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
-from robocal_ros.sessions.records import configuration
+from robocal_ros.sessions.seeding import configuration
 from robocal_ros.sessions.setting_up import SENSOR
-from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot, robot_file_hash
@@ -42,11 +49,11 @@ Array = NDArray[np.float64]
 ACCURACY_S = 1.0
 INPUTS = {
     JOINTS: JointState,
-    POINT: PointStamped,
-    CENTRE: PointStamped,
-    CLOUD: PointCloud2,
-    FIXED: PointStamped,
-    POSE: PoseStamped,
+    MEASURED_POINT: PointStamped,
+    SPHERE_CENTER: PointStamped,
+    SPHERE_CLOUD: PointCloud2,
+    REFERENCE_SPHERE: PointStamped,
+    MEASURED_POSE: PoseStamped,
     TEMPERATURES: Temperature,
 }
 

@@ -8,6 +8,7 @@ from geometry_msgs.msg import TransformStamped
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile
 from robocal_msgs.msg import AccuracyState, CalibrationQuality, KinematicModel
+from std_msgs.msg import Header
 
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.nodes import conversions, qos
@@ -65,7 +66,7 @@ class ThermalOutputs:
     def accuracy(self, found: Accuracy, tolerance_m: float, stamp_ns: int) -> None:
         """Tell the line how accurate the robot is believed to be."""
         self._accuracy.publish(
-            conversions.accuracy_message(
+            accuracy_message(
                 found,
                 tolerance_m,
                 robot=self._nominal.name,
@@ -96,3 +97,11 @@ class ThermalOutputs:
             state=state,
             stamp=conversions.header(stamp_ns, self._base_frame),
         )
+
+
+def accuracy_message(
+    found: "Accuracy", tolerance_m: float, *, robot: str, serial: str, stamp: Header
+) -> AccuracyState:
+    """How accurate the robot is believed to be, see `Accuracy.document`."""
+    told = found.document(tolerance_m)
+    return AccuracyState(header=stamp, robot=robot, serial=serial, **told)

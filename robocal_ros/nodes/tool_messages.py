@@ -1,7 +1,7 @@
 """Steps and tools as messages: pure mapping."""
 
 import numpy as np
-from geometry_msgs.msg import Pose, Quaternion, TransformStamped
+from geometry_msgs.msg import Quaternion, TransformStamped
 from numpy.typing import NDArray
 from robocal_msgs.msg import ToolFrame, ToolStep
 
@@ -9,19 +9,11 @@ from robocal_ros.core import frames
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.nodes.conversions import header, transform_message
+from robocal_ros.nodes.conversions import header, pose_message, transform_message
 
 Array = NDArray[np.float64]
 
 KINDS = {"circle": ToolStep.CIRCLE, "plunge": ToolStep.PLUNGE}
-
-
-def pose_message(T: Array) -> Pose:
-    """A pose (4, 4), m."""
-    moved = transform_message(T)
-    message = Pose(orientation=moved.rotation)
-    message.position.x, message.position.y, message.position.z = T[:3, 3].tolist()
-    return message
 
 
 def step_message(step: PlannedStep, run: int, stamp_ns: int, frame: str) -> ToolStep:

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from robocal_ros.core.samples import JOINTS, JUMPS
 from robocal_ros.sessions import events
 from robocal_ros.sessions.cycles import CycleBook
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.observations import JOINTS, JUMPS, ObservationDesk
+from robocal_ros.sessions.events import Command, joints_awaited_ns, reached
+from robocal_ros.sessions.observations import ObservationDesk
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.windows import Windows
 
@@ -63,17 +64,3 @@ class Bounds:
         if command.name in events.MEASURED:
             marks[JOINTS] = (command.stamp_ns or 0) + int(self._config.lateness_s * 1e9)
         return marks
-
-
-def reached(marks: Mapping[str, int], newest_ns: Mapping[str, int], jumps: int) -> bool:
-    """Whether samples have come as far as the marks of a recorded command."""
-    wanted = marks.get(JUMPS, 0)
-    topics = (topic for topic in marks if topic != JUMPS)
-    near = all(newest_ns.get(topic, -1) >= marks[topic] for topic in topics)
-    return jumps > wanted or (jumps == wanted and near)
-
-
-def joints_awaited_ns(marks: Mapping[str, int], newest_ns: Mapping[str, int]) -> int | None:
-    """Stamp of the joint reading with which the marks may be reached; None: not by one."""
-    wanted = marks.get(JOINTS, -1)
-    return wanted if newest_ns.get(JOINTS, -1) < wanted else None

@@ -8,18 +8,14 @@ from robocal_ros import __version__
 from robocal_ros.core.codes import Code
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Head
-from robocal_ros.core.samples import JointBlock, JointSample
+from robocal_ros.core.samples import JOINTS, JUMPS, JointBlock, JointSample
 from robocal_ros.core.streams import JointStream
 from robocal_ros.sessions import events
-from robocal_ros.sessions.bounds import joints_awaited_ns, reached
-from robocal_ros.sessions.decisions import decide
-from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.sessions.decisions import decide, outside_decision
+from robocal_ros.sessions.events import Command, Outcome, joints_awaited_ns, reached
 from robocal_ros.sessions.followed import Followed
-from robocal_ros.sessions.history import History
+from robocal_ros.sessions.history import BY, History, bring_into_force
 from robocal_ros.sessions.ignored import Ignored
-from robocal_ros.sessions.in_force import outside_decision
-from robocal_ros.sessions.observations import JOINTS, JUMPS
-from robocal_ros.sessions.seeding import BY, bring_into_force
 
 WHILE = "in force while this was recorded"
 GAP_NS = 250_000_000

@@ -1,10 +1,12 @@
 """Decisions about calibrations: a command to the history."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
-from robocal_ros.core.proposals import BEFORE_ANY, THERMAL, TOOL, Entry
+from robocal_ros.core.proposals import BEFORE_ANY, THERMAL, TOOL, Decision, Entry
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
@@ -93,3 +95,12 @@ def named(history: History, command: Command, kind: str) -> Command:
     else:
         arguments["id"] = pending[0]
     return replace(command, arguments=arguments)
+
+
+def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:
+    """Put another process's decision as a command that was carried out, for the record."""
+    chosen = decision.calibration_id or 0
+    arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
+    command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
+    message = f"revision {decision.head_after}: decided outside this node"
+    return Outcome(command, Code.ACCEPT, message, None, chosen, decision.head_after, outside=True)

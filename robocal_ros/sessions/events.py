@@ -6,6 +6,7 @@ from typing import Any
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.core.samples import JOINTS, JUMPS
 
 CONFIGURE = "configure"
 CALIBRATE_SENSOR = "calibrate_sensor"
@@ -98,3 +99,17 @@ def carried_out(
         return handlers[command.name](command, wall_ns)
     except RobocalError as error:
         return Outcome(command, error.code, str(error))
+
+
+def reached(marks: Mapping[str, int], newest_ns: Mapping[str, int], jumps: int) -> bool:
+    """Whether samples have come as far as the marks of a recorded command."""
+    wanted = marks.get(JUMPS, 0)
+    topics = (topic for topic in marks if topic != JUMPS)
+    near = all(newest_ns.get(topic, -1) >= marks[topic] for topic in topics)
+    return jumps > wanted or (jumps == wanted and near)
+
+
+def joints_awaited_ns(marks: Mapping[str, int], newest_ns: Mapping[str, int]) -> int | None:
+    """Stamp of the joint reading with which the marks may be reached; None: not by one."""
+    wanted = marks.get(JOINTS, -1)
+    return wanted if newest_ns.get(JOINTS, -1) < wanted else None

@@ -6,7 +6,6 @@ from contextlib import suppress
 import numpy as np
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import reference_of
 from robocal_ros.core.errors import RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import THERMAL, Entry, State
@@ -17,6 +16,7 @@ from robocal_ros.core.thermal.process_learning import (
     learn_gains,
     learn_process,
 )
+from robocal_ros.core.thermal.reference import reference_of
 from robocal_ros.sessions.history import History
 from robocal_ros.sessions.in_force import REFERENCE
 

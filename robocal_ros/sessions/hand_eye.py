@@ -8,7 +8,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, LimitError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import hand_eye_kind
-from robocal_ros.core.samples import JointSample
+from robocal_ros.core.samples import JOINTS, JointSample
 from robocal_ros.core.streams import CLOCK_JUMP_NS, NotStillError
 from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import Commanded, Handler
@@ -30,7 +30,6 @@ from robocal_ros.sessions.hand_eye_shots import IMAGE, Shot, ShotLog
 from robocal_ros.sessions.hand_eye_solving import require_known
 from robocal_ros.sessions.hand_eye_thermal import PoseModels
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.observations import JOINTS
 
 _NO_SET = "no data set is open: call start, or load one"
 

@@ -1,7 +1,7 @@
 """Where a sensor sits according to the history, and the arm that its flange poses come from."""
 
-from robocal_ros.core.documents import arm_of
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import arm_of
 from robocal_ros.core.proposals import THERMAL, Head, hand_eye_kind
 from robocal_ros.sessions.followed import Followed
 from robocal_ros.sessions.history import History

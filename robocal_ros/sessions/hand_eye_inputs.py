@@ -3,10 +3,9 @@
 from typing import Any
 
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.samples import joint_sample
+from robocal_ros.core.samples import JOINTS, joint_sample
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_shots import SHOTS, shot_of
-from robocal_ros.sessions.observations import JOINTS
 
 
 def take_hand_eye_message(session: HandEyeSession, kind: str, message: Any) -> None:

@@ -7,9 +7,8 @@ from robocal_ros.core.proposals import THERMAL, hand_eye_kind
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.history import History
+from robocal_ros.sessions.history import History, seeded
 from robocal_ros.sessions.recorded import configured_with, recorded_arguments
-from robocal_ros.sessions.seeding import seeded
 
 OWN = "sensor"  # only a hand-eye session's configuration has it
 

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.samples import joint_sample
+from robocal_ros.core.samples import JOINTS, joint_sample
 from robocal_ros.core.streams import JointStream, NotStillError, StandstillRule
 from robocal_ros.sessions import events
 from robocal_ros.sessions.commanded import GAP_NS
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_shots import PROFILE, Shot, shot_of
 from robocal_ros.sessions.ignored import Ignored
-from robocal_ros.sessions.observations import JOINTS
 
 Array = NDArray[np.float64]
 

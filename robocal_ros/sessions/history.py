@@ -5,7 +5,11 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from robocal_ros.core.codes import Code
+from robocal_ros.core.errors import WrongRobotError
+from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Decision, Entry, Head, Proposal
+from robocal_ros.sessions.events import Command
 
 
 class History(Protocol):
@@ -69,3 +73,73 @@ class History(Protocol):
 
     def data_version(self) -> Any:
         """A value that changes when the history does."""
+
+
+BY = "replay"
+
+
+WHY = "in force when the recording began"
+
+
+def require_robot(nominal: SerialArm, configured: Command) -> None:
+    """Refuse a robot that the recording was not made with.
+
+    Raises
+    ------
+    WrongRobotError
+        Always then; the message names both models.
+    """
+    recorded = str(configured.arguments.get("model_hash", ""))
+    if recorded != nominal.model_hash:
+        raise WrongRobotError(
+            f"this was recorded with robot '{configured.arguments.get('robot', '')}' of nominal "
+            f"model {recorded}; '{nominal.name}' is {nominal.model_hash}"
+        )
+
+
+def seeded(
+    history: History,
+    nominal: SerialArm,
+    in_force: Mapping[str, Mapping[str, Any] | None],
+    software: str,
+) -> bool:
+    """Bring what was in force, by its kind, into an empty history; whether it was empty.
+
+    Called once all else of the recording was read: what is left in a history after a failure would
+    be taken for the user's own at the next try.
+    """
+    if history.list(1):
+        return False
+    for kind, model in in_force.items():
+        bring_into_force(history, kind, nominal, model, software)
+    return True
+
+
+def bring_into_force(
+    history: History,
+    kind: str,
+    nominal: SerialArm,
+    model: Mapping[str, Any] | None,
+    software: str,
+    why: str = WHY,
+) -> None:
+    """Accept what was in force when, or while, a recording was made; None: nothing was."""
+    if model is None:
+        return
+    calibration_id = history.propose(
+        Proposal(
+            kind=kind,
+            model_hash=nominal.model_hash,
+            based_on=history.head(kind).revision,
+            cycle_id="",
+            stamp_ns=0,
+            created_ns=0,
+            software=software,
+            method="",
+            code=Code.ACCEPT,
+            reason=why,
+            document={},
+            model=model,
+        )
+    )
+    history.accept(calibration_id, by=BY, reason=why, expected_head=None, wall_ns=0)

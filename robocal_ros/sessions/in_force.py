@@ -1,17 +1,17 @@
 """What the history has in force, followed while other processes decide in it too."""
 
-from collections.abc import Mapping
-
-from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import arm_of, commissioned_of, holds_drift, reference_of
 from robocal_ros.core.errors import ConflictError
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, Decision
-from robocal_ros.core.thermal.reference import ColdReference
-from robocal_ros.sessions.events import Command, Outcome
+from robocal_ros.core.kinematics.documents import arm_of
+from robocal_ros.core.proposals import THERMAL
+from robocal_ros.core.thermal.reference import (
+    ColdReference,
+    commissioned_of,
+    holds_drift,
+    reference_of,
+)
 from robocal_ros.sessions.followed import Followed
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.observations import JOINTS
 
 REFERENCE = "reference"
 
@@ -70,12 +70,3 @@ class InForce(Followed):
     def nominal(self) -> SerialArm:
         """The arm without any calibration."""
         return self._nominal
-
-
-def outside_decision(decision: Decision, marks: Mapping[str, int]) -> Outcome:
-    """Put another process's decision as a command that was carried out, for the record."""
-    chosen = decision.calibration_id or 0
-    arguments = {"id": chosen, "by": decision.by, "reason": decision.reason}
-    command = Command(decision.action.value, arguments, marks.get(JOINTS, 0), marks)
-    message = f"revision {decision.head_after}: decided outside this node"
-    return Outcome(command, Code.ACCEPT, message, None, chosen, decision.head_after, outside=True)

@@ -3,15 +3,20 @@
 from typing import Any
 
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.fitting.sphere import cloud_sample
 from robocal_ros.core.samples import (
-    cloud_sample,
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    REFERENCE_SPHERE,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
+    TEMPERATURES,
     joint_sample,
     point_sample,
     pose_sample,
     temperature_sample,
 )
-from robocal_ros.sessions.observations import CENTRE, CLOUD, FIXED, JOINTS, POINT, POSE
-from robocal_ros.sessions.temperatures import TEMPERATURES
 from robocal_ros.sessions.thermal import ThermalSession
 
 
@@ -23,13 +28,13 @@ def take_message(session: ThermalSession, kind: str, message: Any) -> None:
     try:
         if kind == JOINTS:
             session.add(joint_sample(message))
-        elif kind in (POINT, CENTRE, FIXED):
+        elif kind in (MEASURED_POINT, SPHERE_CENTER, REFERENCE_SPHERE):
             session.add(point_sample(message, session.config.target, kind))
-        elif kind == CLOUD:
+        elif kind == SPHERE_CLOUD:
             session.add(cloud_sample(message, session.config.sphere, session.config.target))
         elif kind == TEMPERATURES:
             session.add(temperature_sample(message))
-        elif kind == POSE:
+        elif kind == MEASURED_POSE:
             session.add(pose_sample(message, session.config.target))
     except RobocalError as error:
         session.desk.ignored.add(kind, str(error))

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.samples import (
-    MEASURED_POINT,
+    JOINTS,
+    JUMPS,
+    MEASURED_POSE,
+    MEASURING,
     REFERENCE_SPHERE,
-    SPHERE_CLOUD,
     JointBlock,
     JointSample,
     PointSample,
@@ -24,14 +26,6 @@ from robocal_ros.sessions.observation import Observation
 
 Array = NDArray[np.float64]
 
-JOINTS = "joint_states"
-POINT = MEASURED_POINT
-CENTRE = "sphere_center"
-CLOUD = SPHERE_CLOUD
-POSE = "measured_pose"
-FIXED = REFERENCE_SPHERE  # a sphere fixed in the cell
-MEASURING = (POINT, CENTRE, CLOUD, POSE, FIXED)
-JUMPS = "clock_jumps"
 
 MOST_WAITING = 5000  # measurements that wait for joints: more means that no joints come
 MOST_KEPT = 20000  # observations that no command has used
@@ -40,7 +34,7 @@ FAR_AHEAD_NS = 60_000_000_000  # a measurement stamped so much after the joints 
 
 
 def _topic(sample: PointSample | PoseSample) -> str:
-    return sample.topic if isinstance(sample, PointSample) else POSE
+    return sample.topic if isinstance(sample, PointSample) else MEASURED_POSE
 
 
 @dataclass
@@ -265,7 +259,7 @@ class ObservationDesk:
             and o.ready_ns <= joints
             and o.stamp_ns <= marks.get(o.topic, -1)
         ]
-        found.sort(key=lambda o: (o.stamp_ns, o.target, o.topic != POSE))
+        found.sort(key=lambda o: (o.stamp_ns, o.target, o.topic != MEASURED_POSE))
         if found and self.frame is None:
             self.frame = found[0].frame
             for other in [o for o in self._observed if o.frame != self.frame]:
@@ -284,7 +278,7 @@ class ObservationDesk:
 
     def unused(self, from_ns: int) -> list[Observation]:
         """Observations of targets on the flange, from a stamp on, that no command has used."""
-        return [o for o in self._observed if o.stamp_ns >= from_ns and o.topic != FIXED]
+        return [o for o in self._observed if o.stamp_ns >= from_ns and o.topic != REFERENCE_SPHERE]
 
     def last_run_ns(self, pause_ns: int) -> int:
         """Stamp from which the unused observations follow each other without so long a pause."""

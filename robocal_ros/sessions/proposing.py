@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import Verdict
-from robocal_ros.core.documents import (
-    identification_document,
-    identified_model_document,
-    model_document,
-)
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.identification import Method, identify_and_hold_out
+from robocal_ros.core.identification.documents import (
+    identification_document,
+    identified_model_document,
+)
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.cycle_verdict import judge_cycle

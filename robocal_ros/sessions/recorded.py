@@ -7,7 +7,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.sessions.commanded import Commanded
 from robocal_ros.sessions.events import CONFIGURE, Command
-from robocal_ros.sessions.seeding import require_robot
+from robocal_ros.sessions.history import require_robot
 
 Document = Mapping[str, Any]
 

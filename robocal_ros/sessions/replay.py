@@ -6,12 +6,18 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, TypeVar
 
 from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import UNCORRECTED, JointBlock, stamp_ns
+from robocal_ros.core.samples import (
+    JOINTS,
+    JUMPS,
+    MEASURING,
+    TEMPERATURES,
+    UNCORRECTED,
+    JointBlock,
+    stamp_ns,
+)
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.observations import JOINTS, JUMPS, MEASURING
 from robocal_ros.sessions.records import digest, read_command
-from robocal_ros.sessions.temperatures import TEMPERATURES
 
 EVENTS = "session_events"
 NOT_BITS = "not to the last bit"

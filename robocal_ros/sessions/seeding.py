@@ -1,37 +1,21 @@
 """A session that starts where a recorded one started."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, WrongRobotError
+from robocal_ros.core.errors import InputError
+from robocal_ros.core.fitting.sphere import SphereRule
 from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import THERMAL, Proposal
-from robocal_ros.sessions.events import Command
+from robocal_ros.core.proposals import THERMAL
+from robocal_ros.core.samples import JOINTS
+from robocal_ros.core.streams import StandstillRule
+from robocal_ros.sessions.events import CONFIGURE, Command
 from robocal_ros.sessions.follower_state import FollowerState
-from robocal_ros.sessions.history import History
+from robocal_ros.sessions.history import History, require_robot, seeded
 from robocal_ros.sessions.in_force import REFERENCE
-from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.thermal import ThermalSession
-
-BY = "replay"
-WHY = "in force when the recording began"
-
-
-def require_robot(nominal: SerialArm, configured: Command) -> None:
-    """Refuse a robot that the recording was not made with.
-
-    Raises
-    ------
-    WrongRobotError
-        Always then; the message names both models.
-    """
-    recorded = str(configured.arguments.get("model_hash", ""))
-    if recorded != nominal.model_hash:
-        raise WrongRobotError(
-            f"this was recorded with robot '{configured.arguments.get('robot', '')}' of nominal "
-            f"model {recorded}; '{nominal.name}' is {nominal.model_hash}"
-        )
+from robocal_ros.sessions.thermal_config import ThermalConfig
 
 
 def session_as_recorded(
@@ -63,49 +47,51 @@ def session_as_recorded(
     return session
 
 
-def seeded(
-    history: History,
-    nominal: SerialArm,
-    in_force: Mapping[str, Mapping[str, Any] | None],
-    software: str,
-) -> bool:
-    """Bring what was in force, by its kind, into an empty history; whether it was empty.
+OWN = "tracker"  # only a thermal session's configuration has it
 
-    Called once all else of the recording was read: what is left in a history after a failure would
-    be taken for the user's own at the next try.
+
+def configuration(session: ThermalSession, topics: Mapping[str, str] | None = None) -> Command:
+    """The session's settings and what is in force, so that replay can start from the same.
+
+    Recorded at the start and after each change of what is in force: a recording that begins
+    later has it too. ``topics``: name of each input's topic.
     """
-    if history.list(1):
-        return False
-    for kind, model in in_force.items():
-        bring_into_force(history, kind, nominal, model, software)
-    return True
-
-
-def bring_into_force(
-    history: History,
-    kind: str,
-    nominal: SerialArm,
-    model: Mapping[str, Any] | None,
-    software: str,
-    why: str = WHY,
-) -> None:
-    """Accept what was in force when, or while, a recording was made; None: nothing was."""
-    if model is None:
-        return
-    calibration_id = history.propose(
-        Proposal(
-            kind=kind,
-            model_hash=nominal.model_hash,
-            based_on=history.head(kind).revision,
-            cycle_id="",
-            stamp_ns=0,
-            created_ns=0,
-            software=software,
-            method="",
-            code=Code.ACCEPT,
-            reason=why,
-            document={},
-            model=model,
-        )
+    return Command(
+        CONFIGURE,
+        {
+            "robot": session.nominal.name,
+            "model_hash": session.nominal.model_hash,
+            "topics": dict(topics or {}),
+            "config": asdict(session.config),
+            "model": session.in_force.model,
+            "reference": session.reference_model,
+            OWN: None if session.follower is None else session.follower.state.document(),
+        },
+        session.desk.newest_ns.get(JOINTS, 0),
+        session.desk.marks,
     )
-    history.accept(calibration_id, by=BY, reason=why, expected_head=None, wall_ns=0)
+
+
+def is_thermal_session(configured: Command | None) -> bool:
+    """Whether a configuration was recorded by a thermal session."""
+    return configured is not None and OWN in configured.arguments
+
+
+def config_of(arguments: Mapping[str, Any]) -> ThermalConfig:
+    """Read the settings back from a configuration record.
+
+    Raises
+    ------
+    InputError
+        When the record has other settings than this version knows.
+    """
+    try:
+        values = dict(arguments["config"])
+        rule = StandstillRule(**values.pop("standstill"))
+        sphere = SphereRule(**values.pop("sphere"))
+        for name in ("drift_parameters", "tip_m"):
+            values[name] = tuple(values.get(name, ()))
+        values["work_poses"] = tuple(tuple(q) for q in values.get("work_poses", ()))
+        return ThermalConfig(standstill=rule, sphere=sphere, **values)
+    except (KeyError, TypeError) as error:
+        raise InputError(f"the recorded configuration cannot be read: {error}") from error

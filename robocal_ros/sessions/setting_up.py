@@ -7,13 +7,17 @@ import numpy as np
 
 from robocal_ros.core.assessment import Verdict, summarise
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import COMMISSIONED, reference_document
 from robocal_ros.core.errors import ConflictError, InputError, TooFewSamplesError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import Measurements
 from robocal_ros.core.thermal.documents import sensor_document
 from robocal_ros.core.thermal.process_documents import process_document
-from robocal_ros.core.thermal.reference import ColdReference, capture_reference
+from robocal_ros.core.thermal.reference import (
+    COMMISSIONED,
+    ColdReference,
+    capture_reference,
+    reference_document,
+)
 from robocal_ros.core.thermal.sensor_calibration import (
     SensorMethod,
     calibrate_sensor,

@@ -8,7 +8,6 @@ from robocal_ros.core.samples import TemperatureSample
 
 Array = NDArray[np.float64]
 
-TEMPERATURES = "motor_temperatures"
 EVERY_NS = 10_000_000_000  # of a joint's samples within ten seconds the first one counts
 SILENT_NS = 900_000_000_000  # a temperature says nothing any more after a quarter of an hour
 MOST_KEPT = 20_000  # of those ten seconds: more than two days

@@ -13,6 +13,8 @@ from robocal_ros.core.errors import ConflictError, RobocalError, StorageError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import Head
 from robocal_ros.core.samples import (
+    JOINTS,
+    TEMPERATURES,
     JointBlock,
     JointSample,
     Measurements,
@@ -25,16 +27,16 @@ from robocal_ros.sessions import events
 from robocal_ros.sessions.accuracy import Accuracy, accuracy_of
 from robocal_ros.sessions.bounds import Bounds
 from robocal_ros.sessions.cycles import TIME_OUT, CycleBook, ended
-from robocal_ros.sessions.decisions import decide
+from robocal_ros.sessions.decisions import decide, outside_decision
 from robocal_ros.sessions.drift_following import DriftFollower, Following
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.in_force import InForce, outside_decision
+from robocal_ros.sessions.in_force import InForce
 from robocal_ros.sessions.keeping import Keeper
-from robocal_ros.sessions.observations import JOINTS, ObservationDesk
+from robocal_ros.sessions.observations import ObservationDesk
 from robocal_ros.sessions.proposing import Proposer
 from robocal_ros.sessions.setting_up import SetUp
-from robocal_ros.sessions.temperatures import TEMPERATURES, MotorTemperatures
+from robocal_ros.sessions.temperatures import MotorTemperatures
 from robocal_ros.sessions.thermal_config import ThermalConfig
 from robocal_ros.sessions.windows import Beside, Windows
 

@@ -9,7 +9,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.samples import JointSample
+from robocal_ros.core.samples import JOINTS, JointSample
 from robocal_ros.core.tool.beam_edges import BeamError
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.measuring_plan import MeasuringPlan, Mode, PlannedStep
@@ -18,7 +18,6 @@ from robocal_ros.sessions.commanded import Commanded, Handler
 from robocal_ros.sessions.edge_log import AHEAD_NS, EDGES, MOST_EDGES, EdgeLog
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.history import History
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool_config import ToolConfig
 from robocal_ros.sessions.tool_in_force import ToolInForce
 from robocal_ros.sessions.tool_results import FULL, MODES, QUICK, ToolResults

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.documents import arm_of
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import arm_of
 from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, Head
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.core.tool.run_traits import RunTraits

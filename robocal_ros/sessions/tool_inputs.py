@@ -3,10 +3,9 @@
 from typing import Any
 
 from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.samples import joint_sample
+from robocal_ros.core.samples import JOINTS, joint_sample
 from robocal_ros.core.tool.edge_samples import edge_sample
 from robocal_ros.sessions.edge_log import EDGES
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool import ToolSession
 
 

@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL
 from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.history import History
+from robocal_ros.sessions.history import History, seeded
 from robocal_ros.sessions.recorded import configured_with, recorded_arguments
-from robocal_ros.sessions.seeding import seeded
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig
 

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.samples import Measurements
+from robocal_ros.core.samples import JOINTS, REFERENCE_SPHERE, Measurements
 from robocal_ros.sessions import events
 from robocal_ros.sessions.cycles import TIME_OUT, CycleBook
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.in_force import InForce
 from robocal_ros.sessions.observation import Observation, as_measurements, one_per_visit
-from robocal_ros.sessions.observations import FIXED, JOINTS, ObservationDesk
+from robocal_ros.sessions.observations import ObservationDesk
 from robocal_ros.sessions.thermal_config import ThermalConfig
 
 Array = NDArray[np.float64]
@@ -65,8 +65,8 @@ class Windows:
         desk.drop_far_ahead()
         after = int(command.arguments.get("from_ns", desk.from_ns)) - 1
         observed = desk.window(after, command.stamp_ns or 0, command.marks or {})
-        fixed = [o.position for o in observed if o.topic == FIXED]
-        found = [o for o in observed if o.topic != FIXED]
+        fixed = [o.position for o in observed if o.topic == REFERENCE_SPHERE]
+        found = [o for o in observed if o.topic != REFERENCE_SPHERE]
         if not found:
             raise TooFewSamplesError(desk.why_nothing())
         drift = self._current.reference is not None and not sets_up

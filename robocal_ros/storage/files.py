@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterable
 from pathlib import Path
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.core.errors import InputError, StorageError
 
 MOST_QUOTED = 60
 
@@ -115,3 +115,19 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def made_folder_beside(history: Path, name: str) -> Path:
+    """Folder of further files of a history's robot, ``<serial>/<name>`` beside it; made if need be.
+
+    Raises
+    ------
+    StorageError
+        When it cannot be made.
+    """
+    folder = history.with_suffix("") / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"the folder {folder} cannot be made: {error.strerror}") from error
+    return folder

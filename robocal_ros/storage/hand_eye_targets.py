@@ -12,7 +12,7 @@ import yaml
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.documents import transform_document
+from robocal_ros.core.frame_texts import transform_document
 from robocal_ros.core.hand_eye.board import FEWEST_CORNERS
 from robocal_ros.core.hand_eye.targets import (
     MACHINING_M,

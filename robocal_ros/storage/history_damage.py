@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros.core.errors import InputError, StorageError
-from robocal_ros.storage.files import write_text
-from robocal_ros.storage.history_paths import made_folder_beside
+from robocal_ros.storage.files import made_folder_beside, write_text
 
 COMPANIONS = ("", "-wal", "-shm")
 _FILE = "acknowledged.json"

@@ -46,22 +46,6 @@ def history_path(serial: str, folder: Path) -> Path:
     return folder / (name + _SUFFIX)
 
 
-def made_folder_beside(history: Path, name: str) -> Path:
-    """Folder of further files of a history's robot, ``<serial>/<name>`` beside it; made if need be.
-
-    Raises
-    ------
-    StorageError
-        When it cannot be made.
-    """
-    folder = history.with_suffix("") / name
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StorageError(f"the folder {folder} cannot be made: {error.strerror}") from error
-    return folder
-
-
 def unused(folder: Path, stem: str, suffix: str) -> Path:
     """A file that is not there yet: named by its stem, else with a number behind it."""
     names = itertools.chain([stem], (f"{stem}_{number}" for number in itertools.count(2)))

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from robocal_ros.core.errors import ConflictError, StorageError
-from robocal_ros.storage.history_paths import made_folder_beside
+from robocal_ros.storage.files import made_folder_beside
 
 _POLL_S = 0.01
 

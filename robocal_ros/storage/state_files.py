@@ -6,8 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros.core.errors import InputError, StateLostError, StorageError
-from robocal_ros.storage.files import draft_beside, read_text, sync_folder, write_text
-from robocal_ros.storage.history_paths import made_folder_beside
+from robocal_ros.storage.files import (
+    draft_beside,
+    made_folder_beside,
+    read_text,
+    sync_folder,
+    write_text,
+)
 
 STATE = "state.json"
 

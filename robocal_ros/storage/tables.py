@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import DEFAULT_TARGET, Measurements
-from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits
 from robocal_ros.storage.cells import Cells, read_cells, texts, write_cells
 from robocal_ros.storage.files import quoted
 from robocal_ros.storage.table_columns import (
@@ -45,30 +43,11 @@ def read_measurements(path: str | Path, arm: SerialArm) -> Measurements:
     InputError
         With file, row and column, when anything in the file is not as docs/csv.md says.
     """
-    return _measurements(*_read(Path(path), arm), arm)
+    return measurements_of(*read_table(Path(path), arm), arm)
 
 
-def read_visits(path: str | Path, arm: SerialArm) -> Visits:
-    """Read a table of visits of named poses: as ``read_measurements``, with a column ``pose``.
-
-    Raises
-    ------
-    InputError
-        As ``read_measurements``, and when the column ``pose`` is missing.
-    """
-    table, layout = _read(Path(path), arm)
-    if "pose" not in layout.place:
-        raise InputError(
-            "column pose is missing: it names each measuring pose, the same name cold and warm",
-            file=table.file,
-            row=1,
-        )
-    data = _measurements(table, layout, arm)
-    cycle = table.words("cycle") or (ONLY_CYCLE,) * len(data)
-    return Visits(data, table.words("pose"), cycle)
-
-
-def _measurements(table: Cells, layout: Layout, arm: SerialArm) -> Measurements:
+def measurements_of(table: Cells, layout: Layout, arm: SerialArm) -> Measurements:
+    """Measurements in a table that was read."""
     numbers = np.column_stack([table.numbers(name) for name in layout.numeric])
     n = arm.n
     rest = numbers[:, n + 3 :]
@@ -135,7 +114,8 @@ def joint_texts(q: Array, arm: SerialArm) -> dict[str, list[str]]:
     return columns
 
 
-def _read(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
+def read_table(path: Path, arm: SerialArm) -> tuple[Cells, Layout]:
+    """Cells of a table of measurements, and where its columns are."""
     found: list[Layout] = []
     table = read_cells(path, lambda header, file: found.append(read_layout(header, arm, file)))
     return table, found[0]

@@ -12,7 +12,8 @@ from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.core.samples import JointSample, PointSample
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.records import arguments_text, configuration, outcome_text
+from robocal_ros.sessions.records import arguments_text, outcome_text
+from robocal_ros.sessions.seeding import configuration
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.storage.bag_writer import ros_time
 from robocal_ros.storage.bags import BagWriter

@@ -16,7 +16,7 @@ from tool_tables import tool_tables
 from tracker_files import SCAN, tracker_files
 
 from robocal_ros.cli.main import COMMANDS
-from robocal_ros.core.documents import transform_document
+from robocal_ros.core.frame_texts import transform_document
 from robocal_ros.sim.tracker_cells import prp_cell
 from robocal_ros.storage.robots import load_description
 

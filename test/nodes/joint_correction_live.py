@@ -14,8 +14,8 @@ from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.nodes import conversions, qos

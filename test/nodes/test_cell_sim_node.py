@@ -17,8 +17,7 @@ from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from robocal_ros.core import frames
-from robocal_ros.core.fitting.sphere import SphereRule
-from robocal_ros.core.samples import cloud_sample
+from robocal_ros.core.fitting.sphere import SphereRule, cloud_sample
 from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
 from robocal_ros.core.tool.measuring_plan import MeasuringMotion, MeasuringPlan
 from robocal_ros.nodes import qos

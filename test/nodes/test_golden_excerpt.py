@@ -23,12 +23,12 @@ from tool_cell_live import STREAM
 
 from robocal_ros import __version__
 from robocal_ros.cli.recording import Recording, open_recording
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.tcf_node import TcfNode
 from robocal_ros.sessions import events, replay
 from robocal_ros.sessions.decisions import ONLY
 from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.tool_inputs import take_tool_message
 from robocal_ros.sessions.tool_recorded import tool_session_as_recorded
 from robocal_ros.storage.bags import BagReader

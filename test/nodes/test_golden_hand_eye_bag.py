@@ -11,6 +11,7 @@ from hand_eye_live import STREAM, TYPES
 from rclpy.serialization import deserialize_message
 from robocal_msgs.msg import SessionEvent
 
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.sessions.events import (
@@ -24,7 +25,6 @@ from robocal_ros.sessions.events import (
     Command,
 )
 from robocal_ros.sessions.hand_eye_shots import PROFILE
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.storage.bags import BagReader, BagWriter
 
 BAGS = Path(__file__).parents[2] / "bags"

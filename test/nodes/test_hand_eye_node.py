@@ -28,11 +28,11 @@ from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.targets import LineTarget
 from robocal_ros.nodes import qos
+from robocal_ros.nodes.conversions import pose_message
 from robocal_ros.nodes.diagnostics import ERROR
 from robocal_ros.nodes.hand_eye_node import HandEyeNode
 from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
 from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.nodes.tool_messages import pose_message
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye_data import Capture
 from robocal_ros.storage.bags import BagWriter, read_bag

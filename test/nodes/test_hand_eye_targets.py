@@ -20,7 +20,7 @@ from robocal_ros.core.codes import Code
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
 from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
 from robocal_ros.nodes import qos
-from robocal_ros.nodes.tool_messages import pose_message
+from robocal_ros.nodes.conversions import pose_message
 from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, step_shots
 from robocal_ros.sim.profile_sensor import ProfileSensor
 from robocal_ros.storage.hand_eye_bags import write_data_set

@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool
 from trajectory_controllers import ARM, CONTROLLERS, HOME, NODE, Controlled, trajectory
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.samples import CORRECTED
 from robocal_ros.nodes import conversions, qos
 from robocal_ros.storage.robots import robot_file_hash

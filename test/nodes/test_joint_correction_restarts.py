@@ -19,15 +19,15 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from tool_driver import noisy_cell
 
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL, TOOL
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.clamping import correction_between
 from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.nodes import qos
-from robocal_ros.sessions.seeding import bring_into_force
+from robocal_ros.sessions.history import bring_into_force
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.laser_files import LaserFile, write_laser
 

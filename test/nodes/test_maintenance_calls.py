@@ -21,7 +21,7 @@ from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import Proposal
 from robocal_ros.nodes import qos
 from robocal_ros.nodes.maintenance_node import ACCURACY, MaintenanceNode

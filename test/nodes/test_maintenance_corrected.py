@@ -9,7 +9,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from test_maintenance_calls import HOME_DEG, proposed
 
-from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.nodes import conversions, qos

@@ -25,7 +25,7 @@ from shift import Shift, built, postures, warmed
 
 from robocal_ros import __version__
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import Head, Proposal, State
 from robocal_ros.core.samples import JointSample
 from robocal_ros.nodes import qos
@@ -37,8 +37,8 @@ from robocal_ros.nodes.maintenance_node import MaintenanceNode
 from robocal_ros.nodes.session_events import EVENTS
 from robocal_ros.nodes.thermal_node import ThermalNode
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.records import config_of
 from robocal_ros.sessions.replay import input_topics, read_events, replay
+from robocal_ros.sessions.seeding import config_of
 from robocal_ros.sessions.thermal import ThermalSession
 from robocal_ros.storage.bags import BagReader, BagWriter
 from robocal_ros.storage.calibrations import CalibrationHistory

@@ -12,12 +12,12 @@ import numpy as np
 from robocal_ros.core import frames
 from robocal_ros.core.hand_eye.target_documents import target_document
 from robocal_ros.core.hand_eye.targets import SphereTarget
+from robocal_ros.core.samples import JOINTS
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
 from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sim.cell_plan import rigid_robot
 from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
 from robocal_ros.sim.hand_eye_sets import sphere_shots

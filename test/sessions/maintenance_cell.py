@@ -13,8 +13,8 @@ from tool_driver import TAUGHT, noisy_cell
 from tool_driver import config_of as tool_config
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import RobocalError
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
 from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
 from robocal_ros.core.tool.judging import KnownTool

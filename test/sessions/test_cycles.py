@@ -10,12 +10,11 @@ from shift import Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointSample, PointSample
+from robocal_ros.core.samples import JOINTS, JointSample, PointSample
 from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions import events
 from robocal_ros.sessions.drift_following import CHECKPOINT_EVERY
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.observations import JOINTS
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot

@@ -20,13 +20,13 @@ from hand_eye_laser import SHOTS, TARGETS, WARM, driver_of, off_m
 
 from robocal_ros.core import frames
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.hand_eye.quality import HandEyeSettings
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL, hand_eye_kind
 from robocal_ros.sessions import events
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
+from robocal_ros.sessions.history import bring_into_force
 from robocal_ros.sessions.records import digest
-from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.sim.profile_sensor import ProfileSensor
 
 KIND = hand_eye_kind(FRAME)

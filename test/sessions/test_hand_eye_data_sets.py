@@ -14,15 +14,15 @@ from hand_eye_driver import (
 from hand_eye_laser import SHOTS, WARM, begun, driver_of
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye_data import data_set_of
 from robocal_ros.sessions.hand_eye_recorded import configuration, hand_eye_session_as_recorded
+from robocal_ros.sessions.history import bring_into_force
 from robocal_ros.sessions.records import digest
-from robocal_ros.sessions.seeding import bring_into_force
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.hand_eye_bags import read_data_set, write_data_set
 

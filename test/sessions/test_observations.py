@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core.samples import JointSample, PointSample, PoseSample
+from robocal_ros.core.samples import JOINTS, JUMPS, JointSample, PointSample, PoseSample
 from robocal_ros.core.streams import JointStream, Reading, StandstillRule
 from robocal_ros.sessions.ignored import MOST_REASONS
 from robocal_ros.sessions.observation import as_measurements
-from robocal_ros.sessions.observations import (
-    JOINTS,
-    JUMPS,
-    MOST_WAITING,
-    POINT,
-    POSE,
-    ObservationDesk,
-)
+from robocal_ros.sessions.observations import MOST_WAITING, POINT, POSE, ObservationDesk
 
 MS = 1_000_000
 NAMES = ("a", "b")

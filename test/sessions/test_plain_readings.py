@@ -10,12 +10,18 @@ from joint_blocks import in_blocks
 from tool_driver import config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointBlock, JointSample, PointSample
+from robocal_ros.core.samples import (
+    JOINTS,
+    JUMPS,
+    MEASURED_POINT,
+    JointBlock,
+    JointSample,
+    PointSample,
+)
 from robocal_ros.core.streams import JointStream, StandstillRule
 from robocal_ros.sessions import events
-from robocal_ros.sessions.bounds import joints_awaited_ns, reached
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.observations import JOINTS, JUMPS, POINT, ObservationDesk
+from robocal_ros.sessions.events import Command, Outcome, joints_awaited_ns, reached
+from robocal_ros.sessions.observations import ObservationDesk
 from robocal_ros.sessions.replay import replay
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_inputs import take_tool_message
@@ -97,7 +103,7 @@ class Desk:
         if not force and not reached(marks, desk.newest_ns, desk.jumps):
             return []
         command = self.queue.pop(0)
-        found = desk.window(-1, command.stamp_ns or 0, marks | {POINT: 2**62})
+        found = desk.window(-1, command.stamp_ns or 0, marks | {MEASURED_POINT: 2**62})
         self.told.append((wall_ns, [o.stamp_ns for o in found], desk.marks, state_of(desk)))
         desk.use(command.stamp_ns or 0)
         return [Outcome(command, Code.ACCEPT, "")]

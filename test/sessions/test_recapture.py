@@ -12,8 +12,7 @@ from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command, Outcome
 from robocal_ros.sessions.maintenance.deciding import Decider
-from robocal_ros.sessions.records import configuration
-from robocal_ros.sessions.seeding import session_as_recorded
+from robocal_ros.sessions.seeding import configuration, session_as_recorded
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot

@@ -8,14 +8,14 @@ import pytest
 from hand_eye_driver import ARM
 from tool_driver import config_of, noisy_cell
 
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL
+from robocal_ros.core.samples import JOINTS, JUMPS
 from robocal_ros.sessions import hand_eye_recorded, records, tool_recorded
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.observations import JOINTS, JUMPS
 from robocal_ros.sessions.replay import read_events
 from robocal_ros.sessions.seeding import session_as_recorded
 from robocal_ros.sessions.thermal import ThermalSession

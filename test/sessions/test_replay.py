@@ -14,20 +14,12 @@ from shift import Shift, built, postures, warmed
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import InputError
 from robocal_ros.core.proposals import Proposal
-from robocal_ros.core.samples import JointBlock, JointSample
+from robocal_ros.core.samples import JOINTS, MEASURED_POINT, MEASURED_POSE, JointBlock, JointSample
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import CONFIGURE, Command
 from robocal_ros.sessions.found_cycles import automatic_commands, window_commands
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import JOINTS, POINT, POSE
-from robocal_ros.sessions.records import (
-    arguments_text,
-    config_of,
-    configuration,
-    digest,
-    outcome_text,
-    read_command,
-)
+from robocal_ros.sessions.records import arguments_text, digest, outcome_text, read_command
 from robocal_ros.sessions.replay import (
     NOT_BITS,
     feed,
@@ -35,6 +27,7 @@ from robocal_ros.sessions.replay import (
     read_events,
     replay,
 )
+from robocal_ros.sessions.seeding import config_of, configuration
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
 from robocal_ros.storage.robots import load_robot
@@ -272,7 +265,7 @@ def test_a_record_of_another_version_is_refused():
 
 def test_topics_by_their_names():
     topics = ["/r/joint_states", "/joint_correction_node/joint_states", "/s/measured_pose", "/x"]
-    assert input_topics(topics) == {"/r/joint_states": JOINTS, "/s/measured_pose": POSE}
+    assert input_topics(topics) == {"/r/joint_states": JOINTS, "/s/measured_pose": MEASURED_POSE}
     with pytest.raises(InputError, match=r"both /a/joint_states and /b/joint_states"):
         input_topics(["/a/joint_states", "/b/joint_states"])
 
@@ -292,11 +285,11 @@ def test_samples_that_cannot_be_used_are_counted(nominal, tmp_path):
     short = joint_message(JointSample(5 * NS, ("a1", "a2"), np.zeros(1)))
     feed(session, Recorded("/cell/joint_states", short), None, take_message)
     assert {topic: sum(c.values()) for topic, c in session.desk.ignored.items()} == {
-        POINT: 1,
-        POSE: 1,
+        MEASURED_POINT: 1,
+        MEASURED_POSE: 1,
         JOINTS: 1,
     }
-    assert "not finite" in next(iter(session.desk.ignored[POINT]))
+    assert "not finite" in next(iter(session.desk.ignored[MEASURED_POINT]))
 
 
 def test_the_configured_target_names_measurements_that_name_none(nominal, visits, tmp_path):
@@ -306,8 +299,8 @@ def test_the_configured_target_names_measurements_that_name_none(nominal, visits
         if isinstance(sample, JointSample):
             session.add(sample)
     middle = visits[0][75].stamp_ns  # at rest
-    take_message(session, POINT, point_message(middle, "sensor", 1.0, 2.0, 3.0))
-    (found,) = session.desk.window(-1, 2**62, {JOINTS: 2**62, POINT: 2**62})
+    take_message(session, MEASURED_POINT, point_message(middle, "sensor", 1.0, 2.0, 3.0))
+    (found,) = session.desk.window(-1, 2**62, {JOINTS: 2**62, MEASURED_POINT: 2**62})
     assert found.target == "cube"
 
 
@@ -316,7 +309,7 @@ def test_cycles_are_found_where_no_command_was_recorded(nominal, visits, tmp_pat
     samples = [recorded(s) for part in visits[:3] for s in part]
     for sample in samples:
         feed(scout, sample, None, take_message)
-    found = scout.desk.window(-1, 2**62, {JOINTS: 2**62, POINT: 2**62})
+    found = scout.desk.window(-1, 2**62, {JOINTS: 2**62, MEASURED_POINT: 2**62})
     assert len(found) == 3 * POSES
     commands = automatic_commands(found)
     assert [c.name for c, _ in commands] == ["capture_reference", "identify", "identify"]
@@ -329,7 +322,7 @@ def test_poses_that_never_recur_are_one_calibration(nominal, visits, tmp_path):
     scout = session_in(tmp_path, nominal)
     for sample in visits[0]:
         scout.add(sample)
-    found = scout.desk.window(-1, 2**62, {JOINTS: 2**62, POINT: 2**62})
+    found = scout.desk.window(-1, 2**62, {JOINTS: 2**62, MEASURED_POINT: 2**62})
     ((command, outcome),) = automatic_commands(found)
     assert command.name == events.IDENTIFY
     assert command.arguments["from_ns"] == found[0].stamp_ns

@@ -8,11 +8,16 @@ import pytest
 from shift import Shift, built, postures, warmed
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointSample
+from robocal_ros.core.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
+    JointSample,
+)
 from robocal_ros.sessions import events
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.observations import CENTRE, CLOUD, JOINTS, POINT
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.sim.sphere_cloud import CloudScene, sphere_cloud
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -62,8 +67,8 @@ def messages(samples: list[Any], kind: str, scene: CloudScene | None = None) -> 
                 JOINTS,
                 Message(header=header(ns, ""), name=sample.names, position=sample.position),
             )
-        elif kind == CLOUD:
-            yield CLOUD, cloud(ns, sphere_cloud(sample.position_m, 1000, rng, scene))
+        elif kind == SPHERE_CLOUD:
+            yield SPHERE_CLOUD, cloud(ns, sphere_cloud(sample.position_m, 1000, rng, scene))
         else:
             p = Message(**dict(zip("xyz", sample.position_m.tolist(), strict=True)))
             yield kind, Message(header=header(ns), point=p)
@@ -86,7 +91,8 @@ def drift(nominal: Any, visits: list[list[Any]], kind: str, folder: Any) -> Any:
 def test_cloud_and_centre_give_the_same_drift(nominal, visits, tmp_path):
     """The centre of a thousand points is known to 2 µm: far below the 20 µm of a visit."""
     by_point, by_centre, by_cloud = (
-        drift(nominal, visits, kind, tmp_path / kind) for kind in (POINT, CENTRE, CLOUD)
+        drift(nominal, visits, kind, tmp_path / kind)
+        for kind in (MEASURED_POINT, SPHERE_CENTER, SPHERE_CLOUD)
     )
     assert by_point.document["parameters"] == by_centre.document["parameters"]
     assert by_cloud.status is by_point.status is Code.ACCEPT
@@ -99,9 +105,9 @@ def test_a_cloud_without_a_sphere_is_counted_with_its_figure(nominal, visits, tm
     history = CalibrationHistory.open("s1", model_hash=nominal.model_hash, state_dir=tmp_path)
     session = ThermalSession(nominal, history, ThermalConfig(), "test")
     small = CloudScene(half_angle_rad=np.radians(12.0), stem=0.0, background=0.0)
-    for topic, message in messages(visits[0], CLOUD, small):
+    for topic, message in messages(visits[0], SPHERE_CLOUD, small):
         take_message(session, topic, message)
-    assert sum(session.desk.ignored[CLOUD].values()) == POSES
+    assert sum(session.desk.ignored[SPHERE_CLOUD].values()) == POSES
     session.submit(Command(events.CAPTURE_REFERENCE, {}))
     (outcome,) = session.advance(wall_ns=7, force=True)
     assert outcome.status is Code.TOO_FEW_SAMPLES

@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from shift import Shift, built, of_kind, postures, warmed
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointSample, PointSample
+from robocal_ros.core.samples import JOINTS, MEASURED_POINT, JointSample, PointSample
 from robocal_ros.core.streams import StandstillRule
 from robocal_ros.sessions import events
 from robocal_ros.sessions.decisions import NEWEST, ONLY
 from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.observations import JOINTS, POINT
 from robocal_ros.sessions.records import digest
 from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
 from robocal_ros.storage.calibrations import CalibrationHistory
@@ -128,7 +127,7 @@ def marked(visits):
     for command in commands(first, second):
         ready = next(j.stamp_ns for j in joints if j.stamp_ns >= command.stamp_ns + 200_000_000)
         seen = max(p.stamp_ns for p in points if p.stamp_ns <= ready)
-        yield command, {JOINTS: ready, POINT: seen}, previous
+        yield command, {JOINTS: ready, MEASURED_POINT: seen}, previous
         previous = command.stamp_ns
 
 
@@ -279,7 +278,7 @@ def test_one_stamp_from_the_future_changes_no_bit_of_a_cycle(
         outcomes += session.advance(wall_ns=7)
     assert [o.status for o in outcomes] == [Code.ACCEPT, Code.ACCEPT]
     assert [digest(o.document) for o in outcomes] == expected[0]
-    kind = JOINTS if wrong is JointSample else POINT
+    kind = JOINTS if wrong is JointSample else MEASURED_POINT
     assert session.desk.ignored[kind].total() == 2
 
 

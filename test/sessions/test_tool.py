@@ -8,15 +8,15 @@ import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import model_document
 from robocal_ros.core.errors import InputError
+from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.samples import JointSample
 from robocal_ros.core.tool.beam_edges import BeamEdge
 from robocal_ros.core.tool.edge_samples import EdgeSample
 from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.sessions.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
-from robocal_ros.sessions.seeding import bring_into_force
+from robocal_ros.sessions.history import bring_into_force
 from robocal_ros.sessions.tool import ToolSession
 from robocal_ros.sessions.tool_config import ToolConfig, rows_of
 from robocal_ros.sim.beams import RoundTool, bent

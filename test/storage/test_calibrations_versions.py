@@ -13,12 +13,8 @@ from robocal_ros.core.errors import (
     StorageError,
 )
 from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_paths import (
-    history_path,
-    known_serials,
-    made_folder_beside,
-    unused,
-)
+from robocal_ros.storage.files import made_folder_beside
+from robocal_ros.storage.history_paths import history_path, known_serials, unused
 from robocal_ros.storage.history_schema import MIGRATIONS, SCHEMA_VERSION
 
 

@@ -6,12 +6,21 @@ and Zisserman 2000); Gauss-Newton over the points near it is the answer.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core.errors import ResidualError, TooFewSamplesError
 from robocal_ros.core.fitting.profile_noise import MAD
+from robocal_ros.core.point_clouds import cloud_points
+from robocal_ros.core.samples import (
+    DEFAULT_TARGET,
+    SPHERE_CLOUD,
+    PointSample,
+    frame_and_target,
+    stamp_ns,
+)
 
 Array = NDArray[np.float64]
 
@@ -233,3 +242,19 @@ def _require(fit: SphereFit, rule: SphereRule) -> None:
             f"{sigma * 1e3:.3f} mm (allowed {rule.centre_sigma_m * 1e3:.3f} mm): show the sensor "
             "more of the sphere"
         )
+
+
+def cloud_sample(
+    message: Any, rule: SphereRule, default_target: str = DEFAULT_TARGET, topic: str = SPHERE_CLOUD
+) -> PointSample:
+    """Build a sample of a sphere's centre from a ``sensor_msgs/PointCloud2`` of its cap.
+
+    Raises
+    ------
+    InputError, TooFewSamplesError, ResidualError
+        When the message is no cloud, or holds no sphere as the rule wants it.
+    """
+    frame, target = frame_and_target(message.header.frame_id, default_target)
+    fit = fit_sphere(cloud_points(message), rule)
+    sigma_m = float(np.sqrt(np.trace(fit.covariance) / 3.0))
+    return PointSample(stamp_ns(message.header.stamp), frame, target, fit.centre, topic, sigma_m)

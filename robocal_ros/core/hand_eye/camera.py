@@ -7,9 +7,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import summarise
-from robocal_ros.core.documents import errors_document, transform_document
+from robocal_ros.core.assessment import errors_document, summarise
 from robocal_ros.core.errors import InputError, ResidualError
+from robocal_ros.core.frame_texts import transform_document
 from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS, closed_form, closed_forms
 from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
 from robocal_ros.core.hand_eye.camera_mistakes import mistake, require_pairs, swapped, wrong_scale

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.assessment import Verdict, summarise
-from robocal_ros.core.documents import transform_document, verdict_document
+from robocal_ros.core.assessment import Verdict, summarise, verdict_document
+from robocal_ros.core.frame_texts import transform_document
 
 Array = NDArray[np.float64]
 Document = dict[str, Any]

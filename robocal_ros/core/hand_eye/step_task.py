@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.documents import transform_document
 from robocal_ros.core.errors import InputError, ResidualError, RobocalError
 from robocal_ros.core.fitting.polyline import CornerFit, CornerRule, fit_corners
+from robocal_ros.core.frame_texts import transform_document
 from robocal_ros.core.hand_eye.corner_matching import Match, along, nearest
 from robocal_ros.core.hand_eye.edge_start import closed_corners, robust_corners
 from robocal_ros.core.hand_eye.mount_fit import MountFit, first_look, misfit

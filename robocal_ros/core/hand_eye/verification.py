@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict, summarise
+from robocal_ros.core.assessment import Verdict, errors_document, summarise
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import errors_document
 from robocal_ros.core.estimation import solve
 from robocal_ros.core.hand_eye.mount_fit import distances, without
 from robocal_ros.core.hand_eye.mount_problem import (

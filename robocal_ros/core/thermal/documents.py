@@ -7,16 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.assessment import Judgement, summarise
-from robocal_ros.core.documents import (
-    cell_document,
+from robocal_ros.core.assessment import (
+    Judgement,
     errors_document,
     judged_errors_document,
-    parameters_document,
-    transform_document,
+    summarise,
     verdict_document,
 )
+from robocal_ros.core.frame_texts import transform_document
+from robocal_ros.core.identification.documents import cell_document
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import parameters_document
 from robocal_ros.core.thermal.flange_identification import JudgedFlangeSensor
 from robocal_ros.core.thermal.identification import CycleDrift
 from robocal_ros.core.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.assessment import LARGEST_RMS_M, summarise
 from robocal_ros.core.errors import ResidualError
+from robocal_ros.core.frame_texts import Document
 from robocal_ros.core.identification.cell import CellModel
 from robocal_ros.core.identification.mismatch import require_match
 from robocal_ros.core.identification.solve import identify
@@ -72,3 +73,59 @@ def capture_reference(arm: SerialArm, data: Measurements) -> ColdReference:
             "and target names"
         )
     return reference
+
+
+COMMISSIONED = "commissioned_mdh"  # of a reference's model: the arm without any drift
+
+
+def holds_drift(model: Document | None) -> bool:
+    """Whether a model document holds a drift since a cold reference; None: the nominal model."""
+    return "reference_mdh" in (model or {})
+
+
+def commissioned_of(reference: Document, nominal: SerialArm) -> SerialArm:
+    """The arm without any drift, also where the reference was captured with the robot warm."""
+    return nominal.with_mdh(np.array(reference.get(COMMISSIONED, reference["mdh"])))
+
+
+def reference_document(reference: ColdReference) -> Document:
+    """A cold reference in full precision, SI; ``reference_of`` reads it back to the last bit."""
+    cell, data = reference.cell, reference.data
+    return {
+        "mdh": cell.arm.mdh.tolist(),
+        "T_frame_base": cell.T_frame_base.tolist(),
+        "targets": list(cell.targets),
+        "T_flange_target": cell.T_flange_target.tolist(),
+        "q": data.q.tolist(),
+        "position": data.position.tolist(),
+        "target": list(data.target),
+        "sample": list(data.sample),
+        "stamp_ns": None if data.stamp_ns is None else data.stamp_ns.tolist(),
+        "fixed": reference.fixed.tolist(),
+        "temperature": None if reference.temperature is None else reference.temperature.tolist(),
+    }
+
+
+def reference_of(document: Document, nominal: SerialArm) -> ColdReference:
+    """Read a cold reference back from its document."""
+    cell = CellModel(
+        nominal.with_mdh(document["mdh"]),
+        np.array(document["T_frame_base"]),
+        tuple(document["targets"]),
+        np.array(document["T_flange_target"]),
+    )
+    stamps = document["stamp_ns"]
+    data = Measurements(
+        q=np.array(document["q"]),
+        position=np.array(document["position"]),
+        target=tuple(document["target"]),
+        sample=tuple(document["sample"]),
+        stamp_ns=None if stamps is None else np.array(stamps, dtype=np.int64),
+    )
+    warmth = document["temperature"]
+    return ColdReference(
+        cell,
+        data,
+        fixed=np.array(document["fixed"]).reshape(-1, 3),
+        temperature=None if warmth is None else np.array(warmth),
+    )

@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.core.assessment import Verdict
-from robocal_ros.core.documents import verdict_document
+from robocal_ros.core.assessment import Verdict, verdict_document
 from robocal_ros.core.tool.judging import ToolChange
 from robocal_ros.core.tool.quick_check import QuickCheck
 

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.core import frames
-from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.assessment import Verdict, verdict_document
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import verdict_document
 from robocal_ros.core.tool.crossed_beams import CircleFit
 from robocal_ros.core.tool.crossed_run import ToolEstimate
 from robocal_ros.core.tool.judging import KnownTool

@@ -12,10 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import Verdict
+from robocal_ros.core.assessment import Verdict, verdict_document
 from robocal_ros.core.codes import Code
 from robocal_ros.core.descent import chi2_quantile
-from robocal_ros.core.documents import verdict_document
 from robocal_ros.core.tool.judging import KnownTool, change_between, difference
 from robocal_ros.core.tool.witness import SMALL_M, Witness
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from robocal_ros.core.codes import Code
-from robocal_ros.core.documents import arm_of, commissioned_of
 from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
 from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.core.kinematics.documents import arm_of
 from robocal_ros.core.proposals import (
     THERMAL,
     TOOL,
@@ -20,6 +20,7 @@ from robocal_ros.core.proposals import (
     State,
     require_measured_with,
 )
+from robocal_ros.core.thermal.reference import commissioned_of
 from robocal_ros.core.tool.judging import KnownTool, change_between
 from robocal_ros.core.tool.laser_frame import LaserFrame
 from robocal_ros.sessions.decisions import decide, measured_with

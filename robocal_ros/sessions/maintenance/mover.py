@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.core.codes import Code
 from robocal_ros.core.errors import LimitError, RobocalError, TooFewSamplesError
-from robocal_ros.motion.measuring import start_near
+from robocal_ros.motion.limits import start_near
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import VELOCITY_S, LeftPlanError, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import stop, stop_time

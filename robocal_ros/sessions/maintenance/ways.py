@@ -15,9 +15,9 @@ from robocal_ros.core.errors import InputError, LimitError
 from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import ToolBody
-from robocal_ros.motion.measuring import along, least_s, raised_way
+from robocal_ros.motion.measuring import least_s
 from robocal_ros.motion.plan import JointPlan, joined
-from robocal_ros.motion.travel import departure, joint_way
+from robocal_ros.motion.travel import along, departure, joint_way, raised_way
 from robocal_ros.sessions.maintenance.config import MaintenanceConfig
 
 Array = NDArray[np.float64]
