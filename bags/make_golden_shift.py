@@ -44,7 +44,7 @@ from robocal_ros.core.samples import (  # noqa: E402
     TemperatureSample,
 )
 from robocal_ros.core.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noqa: E402
-from robocal_ros.sessions import records, tool_recorded  # noqa: E402
+from robocal_ros.sessions import seeding, tool_recorded  # noqa: E402
 from robocal_ros.sessions.edge_log import EDGES  # noqa: E402
 from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
 from robocal_ros.sim.cell_outputs import Happened  # noqa: E402
@@ -134,7 +134,7 @@ class Recorder:
             "tool": (current.head.revision, current.thermal.revision, current.healthy.revision),
         }
         made = {
-            "thermal": lambda: records.configuration(thermal, THERMAL),
+            "thermal": lambda: seeding.configuration(thermal, THERMAL),
             "tool": lambda: tool_recorded.configuration(tool, TOOL),
         }
         for node, state in shown.items():

@@ -3,15 +3,23 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core.samples import JOINTS, JUMPS, JointSample, PointSample, PoseSample
+from robocal_ros.core.samples import (
+    JOINTS,
+    JUMPS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    JointSample,
+    PointSample,
+    PoseSample,
+)
 from robocal_ros.core.streams import JointStream, Reading, StandstillRule
 from robocal_ros.sessions.ignored import MOST_REASONS
 from robocal_ros.sessions.observation import as_measurements
-from robocal_ros.sessions.observations import MOST_WAITING, POINT, POSE, ObservationDesk
+from robocal_ros.sessions.observations import MOST_WAITING, ObservationDesk
 
 MS = 1_000_000
 NAMES = ("a", "b")
-ALL = {JOINTS: 2**62, POINT: 2**62, POSE: 2**62}
+ALL = {JOINTS: 2**62, MEASURED_POINT: 2**62, MEASURED_POSE: 2**62}
 RULE = StandstillRule(before_s=0.3, after_s=0.1, tolerance_rad=1e-3, gap_s=0.25)
 
 
@@ -48,7 +56,7 @@ def test_a_measurement_gets_the_joints_of_its_stamp():
     (found,) = everything(d)
     assert found.q == pytest.approx([0.1 + 1e-7 * 1650, 0.2], abs=1e-12)
     assert found.ready_ns == 1800 * MS  # the reading that ends the standstill window
-    assert (found.topic, found.frame, found.target) == (POINT, "sensor", "ball")
+    assert (found.topic, found.frame, found.target) == (MEASURED_POINT, "sensor", "ball")
 
 
 @pytest.mark.parametrize("first", ["joints", "measurement"])
@@ -79,7 +87,7 @@ def test_a_robot_that_moves_after_the_measurement_spoils_it():
     d.add_joints(joints(1600, 0.15, 0.2))
     d.add_measurement(point(1500))
     assert everything(d) == []
-    assert d.ignored[POINT] == {"a moved by # deg (allowed # deg)": 1}
+    assert d.ignored[MEASURED_POINT] == {"a moved by # deg (allowed # deg)": 1}
 
 
 def test_a_pause_of_the_joints_spoils_a_measurement_and_is_counted():
@@ -90,14 +98,14 @@ def test_a_pause_of_the_joints_spoils_a_measurement_and_is_counted():
     assert everything(d) == []
     assert d.stream.gap_count == 1
     assert d.stream.longest_gap_ns == 400 * MS
-    assert d.ignored[POINT] == {"joint readings pause for # s (allowed # s)": 1}
+    assert d.ignored[MEASURED_POINT] == {"joint readings pause for # s (allowed # s)": 1}
 
 
 def test_a_measurement_before_the_first_joints_is_named():
     d = desk()
     d.add_measurement(point(1100))
     stand(d, 1000, 1500)
-    assert d.ignored[POINT] == {"no joint readings from before the measurement": 1}
+    assert d.ignored[MEASURED_POINT] == {"no joint readings from before the measurement": 1}
     assert d.from_ns == 1300 * MS  # from here on windows are complete
 
 
@@ -130,7 +138,7 @@ def test_a_clock_that_jumps_back_begins_anew():
     d.add_measurement(point(12_000))  # waits for joints that never come
     d.use(10_200 * MS)
     stand(d, 1000, 2000)
-    assert d.ignored[POINT] == {"the clock jumped back": 2}
+    assert d.ignored[MEASURED_POINT] == {"the clock jumped back": 2}
     assert d.newest_ns == {JOINTS: 2000 * MS}
     d.add_measurement(point(1500))
     assert [o.stamp_ns for o in everything(d)] == [1500 * MS]
@@ -142,7 +150,7 @@ def test_another_frame_is_refused_where_the_frame_is_set():
     stand(d, 1000, 2000)
     d.add_measurement(point(1500, frame="camera"))
     assert everything(d) == []
-    assert d.ignored[POINT] == {"frame 'camera' is not the measuring frame 'sensor'": 1}
+    assert d.ignored[MEASURED_POINT] == {"frame 'camera' is not the measuring frame 'sensor'": 1}
 
 
 @pytest.mark.parametrize("order", [(1500, 1600), (1600, 1500)])
@@ -155,7 +163,7 @@ def test_the_earliest_observation_gives_the_frame(order):
         d.add_measurement(point(ms, frame=frames[ms]))
     assert [o.frame for o in everything(d)] == ["sensor"]
     assert d.frame == "sensor"
-    assert sum(d.ignored[POINT].values()) == 1
+    assert sum(d.ignored[MEASURED_POINT].values()) == 1
     d.add_measurement(point(1700, frame="camera"))
     assert len(everything(d)) == 1
 
@@ -170,9 +178,9 @@ def test_a_target_counts_once_at_a_stamp_and_the_pose_before_the_point():
     d.add_measurement(point(1500, 5.0, target="cube"))
     found = everything(d)
     assert [(o.stamp_ns // MS, o.target, o.topic) for o in found] == [
-        (1500, "ball", POINT),
-        (1500, "cube", POINT),
-        (1600, "ball", POSE),
+        (1500, "ball", MEASURED_POINT),
+        (1500, "cube", MEASURED_POINT),
+        (1600, "ball", MEASURED_POSE),
     ]
     assert found[0].position[0] == 1.0
     samples = as_measurements(found).sample
@@ -197,7 +205,7 @@ def test_a_window_holds_what_lies_between_its_bounds_and_before_its_marks():
     assert stamps(1500 * MS, 2500 * MS, ALL) == [2000, 2500]
     assert stamps(-1, 2499 * MS, ALL) == [1500, 2000]
     assert stamps(-1, 2500 * MS, ALL | {JOINTS: 2100 * MS}) == [1500, 2000]
-    assert stamps(-1, 2500 * MS, ALL | {POINT: 1500 * MS}) == [1500]
+    assert stamps(-1, 2500 * MS, ALL | {MEASURED_POINT: 1500 * MS}) == [1500]
     assert stamps(-1, 2500 * MS, {}) == []
 
 
@@ -205,11 +213,11 @@ def test_nothing_grows_without_bound():
     d = desk()
     for ms in range(1000, 1000 + MOST_WAITING + 10):
         d.add_measurement(point(ms))
-    assert d.ignored[POINT] == {"no joint readings came": 10}
+    assert d.ignored[MEASURED_POINT] == {"no joint readings came": 10}
     for number in range(3 * MOST_REASONS):
-        d.ignored.add(POSE, f"frame 'f{number}' is unknown")
-    assert len(d.ignored[POSE]) == MOST_REASONS + 1
-    assert sum(d.ignored[POSE].values()) == 3 * MOST_REASONS
+        d.ignored.add(MEASURED_POSE, f"frame 'f{number}' is unknown")
+    assert len(d.ignored[MEASURED_POSE]) == MOST_REASONS + 1
+    assert sum(d.ignored[MEASURED_POSE].values()) == 3 * MOST_REASONS
 
 
 class CountedStream(JointStream):
@@ -248,7 +256,7 @@ def test_one_wrong_joint_stamp_costs_that_reading_only(off_ms):
     stand(d, 3100, 4000)
     d.add_measurement(point(3500))
     assert [o.stamp_ns // MS for o in everything(d)] == [2500, 3500]
-    assert d.marks == {JOINTS: 4000 * MS, POINT: 3500 * MS, JUMPS: 0}
+    assert d.marks == {JOINTS: 4000 * MS, MEASURED_POINT: 3500 * MS, JUMPS: 0}
     assert d.from_ns == 2300 * MS + 1
     assert d.ignored == {JOINTS: {"a stamp that no reading goes on from, # s off": 1}}
 
@@ -268,11 +276,11 @@ def test_one_measurement_from_the_future_moves_no_mark():
     stand(d, 1000, 2000)
     d.add_measurement(point(1500))
     assert d.clock_ns == 2000 * MS
-    assert d.marks == {JOINTS: 2000 * MS, POINT: 1500 * MS, JUMPS: 0}
+    assert d.marks == {JOINTS: 2000 * MS, MEASURED_POINT: 1500 * MS, JUMPS: 0}
     d.add_measurement(point(2300))  # a little ahead of its joints: it is of now
     assert d.clock_ns == 2300 * MS
     d.drop_far_ahead()
-    assert d.ignored[POINT] == {"stamped # s after the newest joint reading": 1}
+    assert d.ignored[MEASURED_POINT] == {"stamped # s after the newest joint reading": 1}
     stand(d, 2100, 3000)
     assert [o.stamp_ns // MS for o in everything(d)] == [1500, 2300]
 

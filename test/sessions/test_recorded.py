@@ -12,7 +12,7 @@ from robocal_ros.core.errors import InputError
 from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.core.proposals import THERMAL
 from robocal_ros.core.samples import JOINTS, JUMPS
-from robocal_ros.sessions import hand_eye_recorded, records, tool_recorded
+from robocal_ros.sessions import hand_eye_recorded, records, seeding, tool_recorded
 from robocal_ros.sessions.events import Command
 from robocal_ros.sessions.hand_eye import HandEyeSession
 from robocal_ros.sessions.hand_eye_config import HandEyeConfig
@@ -26,7 +26,7 @@ NS = 1_000_000_000
 KINDS = {
     "thermal": (
         lambda history: ThermalSession(ARM, history, ThermalConfig(), "test"),
-        records.configuration,
+        seeding.configuration,
         session_as_recorded,
     ),
     "tool": (
