@@ -100,7 +100,7 @@ $(STAMPS)/editable: $(STAMPS)/wheels $(PYTHON_FILES)
 
 # Compiled kernels are kept beside their source; nodes start 1.5 s sooner with them.
 $(STAMPS)/kernels: $(STAMPS)/editable \
-		$(shell grep -rls --include='*.py' 'robocal_ros.core.compiled import' robocal_ros) tools/warm_kernels.py
+		$(shell grep -rls --include='*.py' 'robocal_ros.ground.compiled import' robocal_ros) tools/warm_kernels.py
 	$(VENV)/bin/python tools/warm_kernels.py
 	touch $@
 

@@ -26,7 +26,7 @@ setup(
     maintainer="robocal_ros maintainers",
     maintainer_email="maintainers@robocal-ros.example",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "sim/*.csv"]},
+    package_data={NAME: ["py.typed", "cell_sim/*.csv"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (str(SHARE), ["package.xml"]),
@@ -39,14 +39,14 @@ setup(
     entry_points={
         "console_scripts": [
             "robocal = robocal_ros.cli.main:main",
-            "tcf_node = robocal_ros.nodes.tcf_node:main",
-            "hand_eye_node = robocal_ros.nodes.hand_eye_node:main",
-            "thermal_node = robocal_ros.nodes.thermal_node:main",
+            "tcf_node = robocal_ros.tool.node:main",
+            "hand_eye_node = robocal_ros.hand_eye.node:main",
+            "thermal_node = robocal_ros.thermal.node:main",
             "joint_correction_node = robocal_ros.correction.node:main",
-            "cell_sim_node = robocal_ros.nodes.cell_sim_node:main",
-            "maintenance_node = robocal_ros.nodes.maintenance_node:main",
-            "replay_node = robocal_ros.nodes.replay_node:main",
-            "recorder_node = robocal_ros.nodes.recorder_node:main",
+            "cell_sim_node = robocal_ros.cell_sim.node:main",
+            "maintenance_node = robocal_ros.maintenance.node:main",
+            "replay_node = robocal_ros.bags.replay_node:main",
+            "recorder_node = robocal_ros.bags.recorder_node:main",
         ]
     },
 )

@@ -24,7 +24,7 @@ from bench.live.graph import CellController, LiveError
 from bench.live.plc import GAP_S, Judge, Plc
 from bench.live.running import live_cell, validate
 from bench.startup import ROOT
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.ground.errors import RobocalError
 
 OUT = ROOT / "out"
 COLLISION_MM = 2.0

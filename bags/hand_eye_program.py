@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.hand_eye.target_documents import KIND_OF, target_document
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sim.motion import Path as JointPath
-from robocal_ros.storage.hand_eye_targets import Target
+from robocal_ros.cell_sim.motion import Path as JointPath
+from robocal_ros.hand_eye.target_documents import KIND_OF, target_document
+from robocal_ros.hand_eye.target_files import Target
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
 
 Array = NDArray[np.float64]
 

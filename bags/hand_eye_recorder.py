@@ -8,17 +8,17 @@ from typing import Any
 from session_events import EventLog
 
 from robocal_ros import __version__
-from robocal_ros.core.samples import JOINTS
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
-from robocal_ros.sessions.hand_eye_recorded import configuration
-from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.storage.bags import BagMessage, BagReader, BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.inputs import take_hand_eye_message
+from robocal_ros.hand_eye.recorded import configuration
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
 
 EVENTS = "/hand_eye_node/session_events"
 SERIAL, BY = "SIM-UR10-1", "cell controller"

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.sim import kr150
-from robocal_ros.sim.motion import readings
-from robocal_ros.sim.poses import read_poses
-from robocal_ros.sim.robot import Effects, TrueRobot
-from robocal_ros.sim.sensor import SphereSensor
-from robocal_ros.sim.shift import Shift, ShiftPlan, simulate
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.motion import readings
+from robocal_ros.cell_sim.poses import read_poses
+from robocal_ros.cell_sim.robot import Effects, TrueRobot
+from robocal_ros.cell_sim.sensor import SphereSensor
+from robocal_ros.cell_sim.shift import Shift, ShiftPlan, simulate
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 

@@ -34,7 +34,10 @@ from bench.closed_loop import setting  # noqa: E402
 from bench.closed_loop.judging import Figures  # noqa: E402
 from bench.closed_loop.plant import PASS_S, WORK, Plant  # noqa: E402
 from bench.closed_loop.shift import GOLDEN, at, run_shift  # noqa: E402
-from robocal_ros.core.samples import (  # noqa: E402
+from robocal_ros.bags.bag_writer import BagWriter, ros_time  # noqa: E402
+from robocal_ros.cell_sim.cell_outputs import Happened  # noqa: E402
+from robocal_ros.cell_sim.cell_samples import Sample  # noqa: E402
+from robocal_ros.ground.samples import (  # noqa: E402
     JOINTS,
     REFERENCE_SPHERE,
     SPHERE_CLOUD,
@@ -43,13 +46,11 @@ from robocal_ros.core.samples import (  # noqa: E402
     PointSample,
     TemperatureSample,
 )
-from robocal_ros.core.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noqa: E402
-from robocal_ros.sessions import seeding, tool_recorded  # noqa: E402
-from robocal_ros.sessions.edge_log import EDGES  # noqa: E402
-from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
-from robocal_ros.sim.cell_outputs import Happened  # noqa: E402
-from robocal_ros.sim.cell_samples import Sample  # noqa: E402
-from robocal_ros.storage.bag_writer import BagWriter, ros_time  # noqa: E402
+from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome  # noqa: E402
+from robocal_ros.thermal import seeding  # noqa: E402
+from robocal_ros.tool import recorded as tool_recorded  # noqa: E402
+from robocal_ros.tool.edge_log import EDGES  # noqa: E402
+from robocal_ros.tool.edge_samples import BREAK, RESTORE, EdgeSample  # noqa: E402
 
 FULL = ROOT / "out" / "golden_shift.mcap"
 EXCERPT = Path(__file__).with_name("golden_excerpt.mcap")

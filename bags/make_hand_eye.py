@@ -41,13 +41,11 @@ from hand_eye_program import (
 from hand_eye_recorder import record_session
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.sessions.events import Outcome
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sim.cell_plan import rigid_robot
-from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
-from robocal_ros.sim.hand_eye_sets import (
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
+from robocal_ros.cell_sim.hand_eye_sets import (
     TrueStairs,
     edge_block,
     edge_shots,
@@ -55,18 +53,20 @@ from robocal_ros.sim.hand_eye_sets import (
     step_shots,
     taught,
 )
-from robocal_ros.sim.motion import Path as JointPath
-from robocal_ros.sim.motion import readings
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.profile_targets import Scene, ball_on_table
-from robocal_ros.sim.robot import TrueRobot
-from robocal_ros.sim.thermal import Warmth
-from robocal_ros.sim.ur10_station import Q_NEAR
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.hand_eye_tables import write_shots
-from robocal_ros.storage.hand_eye_targets import Target, read_target, write_target
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.motion import Path as JointPath
+from robocal_ros.cell_sim.motion import readings
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.profile_targets import Scene, ball_on_table
+from robocal_ros.cell_sim.robot import TrueRobot
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.tables import write_shots
+from robocal_ros.hand_eye.target_files import Target, read_target, write_target
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session.events import Outcome
 
 Array = NDArray[np.float64]
 Record = tuple[float, str, str, dict[str, Any]]

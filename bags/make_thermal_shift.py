@@ -18,13 +18,13 @@ import numpy as np
 from make_demo_shift import DemoCell, Record, header
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import MEASURING, poses
-from robocal_ros.sim.shift import Shift, ShiftPlan, simulate
-from robocal_ros.sim.sphere_cloud import sphere_cloud
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.drift import MEASURING, poses
+from robocal_ros.cell_sim.shift import Shift, ShiftPlan, simulate
+from robocal_ros.cell_sim.sphere_cloud import sphere_cloud
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 

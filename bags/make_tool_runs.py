@@ -20,24 +20,31 @@ import numpy as np
 from session_events import EventLog
 
 from robocal_ros import __version__
-from robocal_ros.core.samples import JointSample
-from robocal_ros.core.tool.beam_edges import BeamEdge, InputRule
-from robocal_ros.core.tool.edge_samples import BREAK, RESTORE
-from robocal_ros.core.tool.laser_frame import LaserFrame
-from robocal_ros.core.tool.measuring_plan import PlannedStep
-from robocal_ros.sessions import events
-from robocal_ros.sessions.edge_log import EDGES
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_config import ToolConfig, rows_of
-from robocal_ros.sessions.tool_recorded import configuration
-from robocal_ros.sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
-from robocal_ros.sim.robot_program import RobotProgram, Sample
-from robocal_ros.sim.tool_cell import ToolCell
-from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT, laser_of
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.cell_sim.beams import BeamStation, RoundTool, TrueInput, TrueNoise, beams_of, bent
+from robocal_ros.cell_sim.robot_program import RobotProgram, Sample
+from robocal_ros.cell_sim.tool_cell import ToolCell
+from robocal_ros.cell_sim.ur10_station import (
+    BETA_RAD,
+    GAP_M,
+    Q_NEAR,
+    T_BASE_LASER,
+    TAUGHT,
+    laser_of,
+)
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.tool.beam_edges import BeamEdge, InputRule
+from robocal_ros.tool.config import ToolConfig, rows_of
+from robocal_ros.tool.edge_log import EDGES
+from robocal_ros.tool.edge_samples import BREAK, RESTORE
+from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.measuring_plan import PlannedStep
+from robocal_ros.tool.recorded import configuration
+from robocal_ros.tool.session import ToolSession
 
 BAG = Path(__file__).with_name("tool_runs.mcap")
 SEED = 11

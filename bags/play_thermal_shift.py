@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for the bench
 
 from bench.live.graph import CellController, LiveError
 from bench.startup import ROOT
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.sim.shift import REFERENCE
-from robocal_ros.storage.bags import BagReader, BagWriter
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.cell_sim.shift import REFERENCE
+from robocal_ros.ground.codes import Code
+from robocal_ros.ros import qos
+from robocal_ros.ros.session_events import EVENTS
 
 SERIAL = "SIM-KR150-2"
 INPUTS = ("joint_states", "sphere_cloud", "reference_sphere_center", "motor_temperatures")

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from typing import Any
 
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.records import arguments_text, outcome_text
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.records import arguments_text, outcome_text
 
 
 class EventLog:

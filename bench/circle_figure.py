@@ -6,11 +6,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
 
-from robocal_ros.core import frames
-from robocal_ros.core.tool.beam_edges import BeamEdge
+from robocal_ros.cell_sim.beam_moves import Circle
+from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.ground import frames
 from robocal_ros.report.figures import AFTER, BEFORE, FAINT, STYLE
-from robocal_ros.sim.beam_moves import Circle
-from robocal_ros.sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.tool.beam_edges import BeamEdge
 
 RADIUS_M, TOOL_M = 0.012, 0.0025
 CENTRE_M = np.array([0.003, -0.004])  # the bent tool's axis at the circle's centre

@@ -14,9 +14,6 @@ from numpy.typing import NDArray
 
 from bench.speed import medians, pinocchio_model
 from bench.tables import Cell, Goal, Table
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.universal_robots import link_transform
 from robocal_ros.correction import solution
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, TrajectoryCommand
@@ -25,7 +22,10 @@ from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimiter
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.staged import StagedCorrection
-from robocal_ros.storage.robots import load_description, load_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_description, load_robot
+from robocal_ros.kinematics.universal_robots import link_transform
 
 Array = NDArray[np.float64]
 

@@ -126,7 +126,7 @@ def measure(seconds: float) -> dict[str, Any]:
 def _subjects(folder: Path) -> "Iterator[tuple[Probe, list[Stream]]]":
     """All processes with their streams, the correction in force and settled."""
     from bench.stream_probe import Probe, Stream, Subject
-    from robocal_ros.storage.robots import load_robot
+    from robocal_ros.kinematics.robots import load_robot
 
     arm = load_robot("kr150_r3100")
     relay = [sys.executable, Path(__file__).with_name("bare_relay.py")]
@@ -219,7 +219,7 @@ def _paths(probe: "Probe", streams: "list[Stream]") -> dict[str, list[float]]:
     from rclpy.serialization import serialize_message
     from trajectory_msgs.msg import JointTrajectory
 
-    from robocal_ros.nodes import qos
+    from robocal_ros.ros import qos
 
     came: list[float] = []
     chosen = [stream for stream in streams if stream.subject.name in (NODE, RELAY)]

@@ -15,12 +15,12 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from bench.tables import Table
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagReader, BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
-from robocal_ros.storage.tables import read_measurements, write_measurements
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.tables import read_measurements, write_measurements
 
 ROUNDS = 5
 ROWS = 12_000

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
+from robocal_ros.ground import frames
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

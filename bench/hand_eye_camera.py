@@ -21,19 +21,19 @@ from bench.hand_eye_sets import (
     turned_tsai,
 )
 from bench.tables import Goal, Table
-from robocal_ros.core.hand_eye.board import boards_of_corners, see_boards
-from robocal_ros.core.hand_eye.camera_closed_forms import (
+from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
+from robocal_ros.hand_eye.board import boards_of_corners, see_boards
+from robocal_ros.hand_eye.camera_closed_forms import (
     CLOSED_FORMS,
     HAND_EYE,
     closed_form,
     closed_form_of_all,
 )
-from robocal_ros.core.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
-from robocal_ros.core.hand_eye.camera_model import linearised
-from robocal_ros.core.hand_eye.camera_quality import distances, rms
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs
-from robocal_ros.core.hand_eye.streams import pair_streams, pairs_at
-from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
+from robocal_ros.hand_eye.camera_fit import GivenNoise, PairFit, fit_pairs
+from robocal_ros.hand_eye.camera_model import linearised
+from robocal_ros.hand_eye.camera_quality import distances, rms
+from robocal_ros.hand_eye.pose_pairs import PosePairs
+from robocal_ros.hand_eye.streams import pair_streams, pairs_at
 
 Array = NDArray[np.float64]
 

@@ -23,18 +23,18 @@ from bench.hand_eye_worlds import (
     squared_error,
 )
 from bench.tables import Goal, Table
-from robocal_ros.core import frames
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.hand_eye.joint import solve_joint
-from robocal_ros.core.hand_eye.mount_problem import pivot_of
-from robocal_ros.core.hand_eye.quality import expected_error_m
-from robocal_ros.core.hand_eye.result import HandEyeResult, at_origin, increment
-from robocal_ros.core.hand_eye.solve import field_of
-from robocal_ros.sim.cell_plan import rigid_robot
-from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.ur10_station import Q_NEAR
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Robot, view
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.hand_eye.joint import solve_joint
+from robocal_ros.hand_eye.mount_problem import pivot_of
+from robocal_ros.hand_eye.quality import expected_error_m
+from robocal_ros.hand_eye.result import HandEyeResult, at_origin, increment
+from robocal_ros.hand_eye.solve import field_of
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 

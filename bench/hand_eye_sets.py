@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.ur10_campaigns import data_folder
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.board import Chessboard, Image, decode_image
-from robocal_ros.core.hand_eye.camera_closed_forms import closed_form
-from robocal_ros.core.hand_eye.pose_pairs import Placement, PosePairs
-from robocal_ros.core.hand_eye.streams import PoseStream, stream_of
-from robocal_ros.storage.hand_eye_tables import write_pose_table
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.board import Chessboard, Image, decode_image
+from robocal_ros.hand_eye.camera_closed_forms import closed_form
+from robocal_ros.hand_eye.pose_pairs import Placement, PosePairs
+from robocal_ros.hand_eye.streams import PoseStream, stream_of
+from robocal_ros.hand_eye.tables import write_pose_table
 
 Array = NDArray[np.float64]
 

@@ -15,20 +15,20 @@ from bench.hand_eye_worlds import (
     T_BASE_USER,
     calibrated,
 )
-from robocal_ros.core import frames
-from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.mount_fit import MountFit
-from robocal_ros.core.hand_eye.profile import profile_of
-from robocal_ros.core.hand_eye.quality import HandEyeSettings
-from robocal_ros.core.hand_eye.result import HandEyeResult
-from robocal_ros.core.hand_eye.solve import solve_task
-from robocal_ros.core.hand_eye.step_task import StepTask
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
-from robocal_ros.core.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
-from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Robot, Shots
-from robocal_ros.sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
-from robocal_ros.sim.thermal import Warmth
-from robocal_ros.sim.ur10_station import Q_NEAR
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Robot, Shots
+from robocal_ros.cell_sim.hand_eye_sets import edge_shots, sphere_shots, step_shots
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.estimation.edge import EdgeRule
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.mount_fit import MountFit
+from robocal_ros.hand_eye.profile import profile_of
+from robocal_ros.hand_eye.quality import HandEyeSettings
+from robocal_ros.hand_eye.result import HandEyeResult
+from robocal_ros.hand_eye.solve import solve_task
+from robocal_ros.hand_eye.step_task import StepTask
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask, Task
 
 Array = NDArray[np.float64]
 

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.tracker import solve_best, spread
-from robocal_ros.core.hand_eye.tracker_classic import solve_classic
-from robocal_ros.core.hand_eye.tracker_data import TrackerNoise
-from robocal_ros.core.hand_eye.tracker_state import SENSOR
-from robocal_ros.sim.laser_tracker import Sizes, TrackerCell
-from robocal_ros.sim.tracker_cells import prp_cell, six_axis_cell
-from robocal_ros.sim.ur10_station import Q_NEAR
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.laser_tracker import Sizes, TrackerCell
+from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
+from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.tracker import solve_best, spread
+from robocal_ros.hand_eye.tracker_classic import solve_classic
+from robocal_ros.hand_eye.tracker_data import TrackerNoise
+from robocal_ros.hand_eye.tracker_state import SENSOR
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 

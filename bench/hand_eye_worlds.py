@@ -18,27 +18,21 @@ from bench.hand_eye_bound import (
     least_covariance,
     piercings,
 )
-from robocal_ros.core import frames
-from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.diagnosis import look
-from robocal_ros.core.hand_eye.mount_fit import MountFit, fit_mount, require_seen
-from robocal_ros.core.hand_eye.mount_problem import (
-    MountProblem,
-    MountState,
-    PoseNoise,
-    View,
-    pivot_of,
-)
-from robocal_ros.core.hand_eye.result import increment
-from robocal_ros.core.hand_eye.sightings import Index, Sightings, TargetModel
-from robocal_ros.core.hand_eye.step_task import StepTask
-from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.core.hand_eye.tasks import LineTask, SphereTask, Task
-from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot
-from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.profile_targets import Scene
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot
+from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.profile_targets import Scene
+from robocal_ros.estimation.edge import EdgeRule
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.diagnosis import look
+from robocal_ros.hand_eye.mount_fit import MountFit, fit_mount, require_seen
+from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View, pivot_of
+from robocal_ros.hand_eye.result import increment
+from robocal_ros.hand_eye.sightings import Index, Sightings, TargetModel
+from robocal_ros.hand_eye.step_task import StepTask
+from robocal_ros.hand_eye.target_models import LineModel, SphereModel
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.hand_eye.tasks import LineTask, SphereTask, Task
 
 Array = NDArray[np.float64]
 

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import MEASURING, poses
-from robocal_ros.sim.motion import readings
-from robocal_ros.sim.shift import MOVE_S, Shift, ShiftPlan, simulate
-from robocal_ros.sim.sphere_cloud import sphere_cloud
-from robocal_ros.storage.bag_types import encode
-from robocal_ros.storage.bag_writer import BagWriter, ros_time
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bag_types import encode
+from robocal_ros.bags.bag_writer import BagWriter, ros_time
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.drift import MEASURING, poses
+from robocal_ros.cell_sim.motion import readings
+from robocal_ros.cell_sim.shift import MOVE_S, Shift, ShiftPlan, simulate
+from robocal_ros.cell_sim.sphere_cloud import sphere_cloud
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 Record = tuple[float, str, str, bytes]

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from robocal_ros.core import frames
-from robocal_ros.core.descent import chi2_quantile
-from robocal_ros.core.identification import CellModel, Identification, identify
-from robocal_ros.core.samples import Measurements
-from robocal_ros.sim import kr150
-from robocal_ros.sim.robot import Effects
-from robocal_ros.sim.thermal import Warmth
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import CellModel, Identification, identify
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 

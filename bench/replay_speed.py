@@ -14,12 +14,12 @@ from rosbags.highlevel import AnyReader
 
 from bench.long_shift import JOINTS, ROBOT, LongShift, write_shift
 from bench.tables import Goal, Table
-from robocal_ros.core.samples import JointBlock, joint_sample
-from robocal_ros.core.streams import StandstillRule
-from robocal_ros.sessions.observations import ObservationDesk
-from robocal_ros.sessions.replay import one_by_one
-from robocal_ros.storage.bags import BagReader, bag_info
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagReader, bag_info
+from robocal_ros.bags.replay import one_by_one
+from robocal_ros.ground.samples import JointBlock, joint_sample
+from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.observations import ObservationDesk
 
 ROOT = Path(__file__).resolve().parent.parent
 GOLDEN = ROOT / "out" / "golden_shift.mcap"  # of bags/make_golden_shift.py

@@ -19,11 +19,11 @@ from bench.soaking import soak_main
 from bench.startup import EXECUTABLES
 from bench.stream_probe import STATES, TARGETS, Probe, Stream, Subject, drifted, offered
 from bench.tables import Goal, Table
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.clamping import correction_between
 from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 Array = NDArray[np.float64]
 

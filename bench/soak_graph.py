@@ -18,13 +18,13 @@ from std_srvs.srv import SetBool
 
 from bench.processes import ENDS_WITH_PARENT, resident_mb
 from bench.startup import EXECUTABLES
-from robocal_ros.core.codes import Code
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import Proposal
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import time_message
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import Proposal
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import time_message
 
 SERIAL, ROBOT = "SOAK-1", "kr150_r3100"
 THERMAL, CORRECTION = "thermal_node", "joint_correction_node"

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Cell, Goal, Table
-from robocal_ros.core import frames
-from robocal_ros.core.identification import CellModel, identify
-from robocal_ros.core.identification.cell import CellProblem, make_layout
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.universal_robots import link_transform
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import CellModel, identify
+from robocal_ros.identification.cell import CellProblem, make_layout
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.universal_robots import link_transform
 
 Array = NDArray[np.float64]
 

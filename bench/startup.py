@@ -124,7 +124,7 @@ def _first_answer(name: str, command: list[str]) -> float:
 
 
 def _bag(folder: Path) -> Path:
-    from robocal_ros.storage.bags import BagWriter
+    from robocal_ros.bags.bags import BagWriter
 
     path = folder / "one.mcap"
     with BagWriter(path) as bag:

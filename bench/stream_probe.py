@@ -23,11 +23,11 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
 from bench.processes import resident_mb
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import header, kinematic_model
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import header, kinematic_model
 
 Array = NDArray[np.float64]
 

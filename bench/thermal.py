@@ -15,29 +15,23 @@ from numpy.typing import NDArray
 from bench import thermal_real, thermal_setup, thermal_tracking
 from bench.tables import Goal, Table
 from bench.thermal_shifts import PARTS, SEEDS, SIGMA_M, Measured, cell_of
-from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.cycle_verdict import judge_cycle
-from robocal_ros.core.thermal.drift_history import DriftHistory, share_within
-from robocal_ros.core.thermal.identification import identify_cycle
-from robocal_ros.core.thermal.learning import learn_drift
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process_learning import EarlierShift, LearnedProcess, learn_process
-from robocal_ros.core.thermal.screening import screen
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.core.thermal.subset import subset_drift
-from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import (
-    LENGTHS,
-    MEASURING,
-    DriftingCell,
-    DriftPlan,
-    record,
-)
-from robocal_ros.sim.robot import Effects
-from robocal_ros.sim.sphere_cloud import CloudScene, sphere_cloud
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.drift import LENGTHS, MEASURING, DriftingCell, DriftPlan, record
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.sphere_cloud import CloudScene, sphere_cloud
+from robocal_ros.estimation.sphere import SphereRule, fit_sphere
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.cycle_verdict import judge_cycle
+from robocal_ros.thermal.drift_history import DriftHistory, share_within
+from robocal_ros.thermal.identification import identify_cycle
+from robocal_ros.thermal.learning import learn_drift
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.process_learning import EarlierShift, LearnedProcess, learn_process
+from robocal_ros.thermal.screening import screen
+from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.subset import subset_drift
 
 Array = NDArray[np.float64]
 

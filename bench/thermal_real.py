@@ -6,12 +6,12 @@ import numpy as np
 
 from bench.tables import Table
 from bench.ur10_campaigns import data_folder, load_campaign
-from robocal_ros.core.assessment import summarise
-from robocal_ros.core.identification import Identification, identify
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process import STEADY_TIME_S
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.estimation.assessment import summarise
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import Identification, identify
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.process import STEADY_TIME_S
 
 FIRST_H = 10.0
 BLOCK = 300  # poses, 1.1 hours of measuring

@@ -10,23 +10,23 @@ from scipy.spatial.transform import Rotation
 from bench.tables import Goal, Table
 from bench.thermal_shifts import MEASURING, SIGMA_M
 from docs.examples.make_thermal import poses
-from robocal_ros.core import frames
-from robocal_ros.core.identification import CellModel
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.pose_planning import (
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import CellModel
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.pose_planning import (
     Design,
     PosePlan,
     SensorField,
     candidate_poses,
     plan_poses,
 )
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.sensor_calibration import calibrate_sensor
-from robocal_ros.sim import kr150
-from robocal_ros.sim.robot import Effects
-from robocal_ros.sim.thermal import Warmth
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.sensor_calibration import calibrate_sensor
 
 Array = NDArray[np.float64]
 

@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.identification import CellModel
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.reference import capture_reference
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import MEASURING as MEASURING
-from robocal_ros.sim.drift import DriftingCell, DriftRecord, drifting_cell, poses
-from robocal_ros.sim.robot import Effects
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.drift import MEASURING as MEASURING
+from robocal_ros.cell_sim.drift import DriftingCell, DriftRecord, drifting_cell, poses
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import CellModel
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.reference import capture_reference
+from robocal_ros.thermal.spots import ColdSpots
 
 Array = NDArray[np.float64]
 

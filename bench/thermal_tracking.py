@@ -13,26 +13,21 @@ from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
 from bench.thermal_shifts import MEASURING, PARTS, SEEDS, Measured, cell_of
-from robocal_ros.core.descent import chi2_quantile
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.identification import identify_cycle
-from robocal_ros.core.thermal.learning import learn_drift
-from robocal_ros.core.thermal.process_learning import (
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.drift import DriftingCell, DriftPlan, DriftRecord, record
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.thermal.identification import identify_cycle
+from robocal_ros.thermal.learning import learn_drift
+from robocal_ros.thermal.process_learning import (
     EarlierShift,
     LearnedProcess,
     learn_gains,
     learn_process,
     visit_noise,
 )
-from robocal_ros.core.thermal.tracking import Innovation
-from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import (
-    DriftingCell,
-    DriftPlan,
-    DriftRecord,
-    record,
-)
-from robocal_ros.sim.robot import Effects
+from robocal_ros.thermal.tracking import Innovation
 
 Array = NDArray[np.float64]
 

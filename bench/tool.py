@@ -12,18 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.tables import Goal, Table
-from robocal_ros.core import frames
-from robocal_ros.core.tool.beam_edges import BeamEdge
-from robocal_ros.core.tool.circle_edges import CircleMotion, label_edges
-from robocal_ros.core.tool.classic_run import classic_tool
-from robocal_ros.core.tool.crossed_beams import closed_form, fit_circle
-from robocal_ros.core.tool.crossed_model import Held
-from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.core.tool.quick_check import CheckRule, quick_check
-from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
-from robocal_ros.sim.beam_moves import Circle
-from robocal_ros.sim.beams import (
+from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
+from robocal_ros.cell_sim.beam_moves import Circle
+from robocal_ros.cell_sim.beams import (
     NO_NOISE,
     PERFECT,
     BeamStation,
@@ -33,9 +24,18 @@ from robocal_ros.sim.beams import (
     TrueNoise,
     beams_of,
 )
-from robocal_ros.sim.tool_cell import MeasuredRun, RunPlan, ToolCell
-from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.tool_cell import MeasuredRun, RunPlan, ToolCell
+from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, TAUGHT
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.tool.beam_edges import BeamEdge
+from robocal_ros.tool.circle_edges import CircleMotion, label_edges
+from robocal_ros.tool.classic_run import classic_tool
+from robocal_ros.tool.crossed_beams import closed_form, fit_circle
+from robocal_ros.tool.crossed_model import Held
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.tool.quick_check import CheckRule, quick_check
 
 Array = NDArray[np.float64]
 

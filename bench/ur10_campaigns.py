@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from robocal_ros.core import frames
-from robocal_ros.core.assessment import hold_out, pose_groups
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.robots import load_robot
-from robocal_ros.storage.tables import write_measurements
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.estimation.assessment import hold_out, pose_groups
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.tables import write_measurements
 
 SERIES = {
     "A": "measurements_grid.csv",

@@ -1,8 +1,4 @@
-"""The house rules that a reader relies on: who may import whom, and how large a room may be.
-
-`correction` and `motion` are rooms of the new house, one for each capability; the others are still
-layers.
-"""
+"""The house rules that a reader relies on: who may import whom, and how large a file may be."""
 
 import ast
 from pathlib import Path
@@ -12,32 +8,38 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "robocal_ros"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
-# room -> rooms of ours that it may import
+GROUND = {"ground", "estimation", "kinematics", "identification", "history", "session"}
+BELOW = GROUND | {"ros", "motion", "bags"}  # the capabilities, which know nothing of each other
+CAPABILITIES = {"thermal", "tool", "hand_eye", "correction"}
+ABOVE = BELOW | CAPABILITIES | {"maintenance"}
+# room -> rooms of ours that it may import beside itself
 MAY_IMPORT = {
-    "core": {"core"},
-    "motion": {"core", "motion"},
-    "correction": {"core", "motion", "correction"},
-    "sessions": {"core", "motion", "correction", "sessions"},  # maintenance asks the capabilities
-    "storage": {"core", "storage"},
-    "sim": {"core", "motion", "sim"},
-    "report": {"core", "report"},
-    "cli": {"core", "motion", "correction", "sessions", "storage", "sim", "report", "cli"},
-    "nodes": {
-        "core", "motion", "correction", "sessions", "storage", "sim", "report", "nodes",
-    },
-}  # fmt: skip
-ROOMS = {"correction", "motion"}  # each with its own files for ROS, which are nodes as well
+    "ground": set(),
+    "estimation": {"ground"},
+    "kinematics": {"ground", "estimation"},
+    "identification": {"ground", "estimation", "kinematics"},
+    "history": {"ground", "estimation", "kinematics"},
+    "session": {"ground", "estimation", "kinematics", "history"},
+    "ros": GROUND,
+    "motion": GROUND | {"ros"},
+    "bags": GROUND | {"ros", "motion"},
+    **dict.fromkeys(CAPABILITIES, BELOW),
+    "maintenance": BELOW | CAPABILITIES,
+    "report": ABOVE,
+    "cell_sim": ABOVE | {"report"},
+    "cli": ABOVE | {"report", "cell_sim"},
+}
 ROS_FILES = {
-    "node", "messages", "action", "settings", "report", "graph", "driver", "topics", "log",
-    "command_sources", "health", "settled_streams", "stream_messages", "path_messages",
-    "gap_sources",
+    "node", "messages", "action", "settings", "report", "graph", "driver", "gap_sources",
+    "outputs", "services", "controller", "source_guard", "replay_node", "recorder_node",
+    "recorded_topics", "replay_topics", "set_up_services",
 }  # fmt: skip
 ROS = {
     "rclpy", "robocal_msgs", "sensor_msgs", "geometry_msgs", "std_msgs", "std_srvs",
-    "trajectory_msgs", "control_msgs",
+    "trajectory_msgs", "control_msgs", "action_msgs", "builtin_interfaces", "lifecycle_msgs",
 }  # fmt: skip
-LONGEST_MODULE = {False: 300, True: 700}  # in a layer, in a room
-LONGEST_FUNCTION = {False: 40, True: 60}  # without its docstring
+LONGEST_FILE = 700
+LONGEST_FUNCTION = 60  # without its docstring
 
 
 def imported(tree: ast.AST) -> set[str]:
@@ -55,37 +57,63 @@ def room(path: Path) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
+def imports_of_ours(path: Path) -> set[Path]:
+    """Files of the package that a file needs when it is imported."""
+    found = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("robocal_ros"):
+            base = PACKAGE.parent.joinpath(*(node.module or "").split("."))
+            files = [base / f"{alias.name}.py" for alias in node.names]
+            found |= {file if file.exists() else base.with_suffix(".py") for file in files}
+    return {file for file in found if file.exists()}
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_imports_run_one_way(path):
     own = room(path)
-    for_ros = own == "nodes" or (own in ROOMS and path.stem in ROS_FILES)
-    allowed = MAY_IMPORT.get(own, set()) | {"single_thread"}
-    if for_ros:
-        allowed |= MAY_IMPORT["nodes"]
+    for_ros = own == "ros" or path.stem in ROS_FILES
     for name in imported(ast.parse(path.read_text())):
         parts = name.split(".")
         if parts[0] in ROS:
             assert for_ros, f"{path} imports {name}: only what a node is made of may"
-        if parts[0] == "robocal_ros" and len(parts) > 1 and own in MAY_IMPORT:
+        if parts[0] == "robocal_ros" and len(parts) > 1 and own:
+            allowed = MAY_IMPORT[own] | {own, "single_thread"}
             assert parts[1] in allowed, f"{own} imports {name}"
 
 
+def test_no_file_needs_itself():
+    needs = {path: imports_of_ours(path) for path in MODULES}
+    done: set[Path] = set()
+
+    def walk(path: Path, way: tuple[Path, ...]) -> None:
+        assert path not in way, f"a circle: {[p.stem for p in way[way.index(path) :]]}"
+        if path not in done:
+            for needed in needs[path]:
+                walk(needed, (*way, path))
+            done.add(path)
+
+    for path in MODULES:
+        walk(path, ())
+
+
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_rooms_stay_small(path):
-    text, in_room = path.read_text(), room(path) in ROOMS
-    assert len(text.splitlines()) <= LONGEST_MODULE[in_room]
+def test_files_and_functions_stay_small(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= LONGEST_FILE
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             docstring = ast.get_docstring(node, clean=False) or ""
             body = node.end_lineno - node.lineno + 1 - len(docstring.splitlines())
-            assert body <= LONGEST_FUNCTION[in_room], f"{path.name}: {node.name} has {body} lines"
+            assert body <= LONGEST_FUNCTION, f"{path.name}: {node.name} has {body} lines"
 
 
-def test_a_class_name_occurs_once_in_the_rooms():
+def test_a_class_name_occurs_once():
     seen: dict[str, Path] = {}
+    twice = []
     for path in MODULES:
-        if room(path) in ROOMS:
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.ClassDef):
-                    assert node.name not in seen, f"{node.name}: {seen[node.name]} and {path}"
-                    seen[node.name] = path
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef):
+                if node.name in seen:
+                    twice.append(f"{node.name}: {seen[node.name]} and {path}")
+                seen[node.name] = path
+    assert not twice, "\n".join(twice)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, StepTarget
-from robocal_ros.core.point_clouds import cloud_points
-from robocal_ros.storage.bags import BagMessage, bag_info, read_bag
-from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
-from robocal_ros.storage.hand_eye_targets import read_target
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagMessage, bag_info, read_bag
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.point_clouds import cloud_points
+from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.hand_eye.tables import read_pose_table, read_profiles
+from robocal_ros.hand_eye.target_files import read_target
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.kinematics.robots import load_robot
 
 EVENTS = "/hand_eye_node/session_events"
 BAGS = Path(__file__).parent.parent / "bags"

@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.kinematics.documents import arm_of
-from robocal_ros.core.point_clouds import cloud_points
+from robocal_ros.bags.bags import bag_info, read_bag
+from robocal_ros.bags.replay import replay
+from robocal_ros.cell_sim import kr150
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.replay import replay
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.sessions.thermal_config import ThermalConfig
-from robocal_ros.sim import kr150
-from robocal_ros.storage.bags import bag_info, read_bag
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.estimation.sphere import SphereRule, fit_sphere
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.point_clouds import cloud_points
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.session import ThermalSession
 
 BAGS = Path(__file__).parent.parent / "bags"
 BAG = BAGS / "thermal_shift.mcap"

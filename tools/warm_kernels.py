@@ -5,14 +5,14 @@ Numba keeps the machine code beside the source, so that no node pays for it at i
 
 import numpy as np
 
-from robocal_ros.core import frames, mcap_records, serialized_joints
-from robocal_ros.core.hand_eye.camera_fit import fit_pairs
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs
-from robocal_ros.core.identification import identify
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.inverse import inverse
-from robocal_ros.core.samples import Measurements
 from robocal_ros.correction.session import load_kernels
+from robocal_ros.ground import frames, mcap_records, serialized_joints
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.hand_eye.camera_fit import fit_pairs
+from robocal_ros.hand_eye.pose_pairs import PosePairs
+from robocal_ros.identification import identify
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.inverse import inverse
 
 POSES = 30
 

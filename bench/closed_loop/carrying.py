@@ -3,16 +3,16 @@
 from collections.abc import Callable
 
 from bench.closed_loop.words import tool_answer
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.maintenance import MaintenanceSession
+from robocal_ros.maintenance import requests as ask
+from robocal_ros.maintenance.requests import Answer
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.maintenance import MaintenanceSession
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import ToolDriver
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.tool.driving import ToolDriver
+from robocal_ros.tool.session import ToolSession
 
 
 class Carrier:

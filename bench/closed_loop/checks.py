@@ -34,12 +34,12 @@ from bench.closed_loop.faults import (
 from bench.closed_loop.plant import equipped
 from bench.closed_loop.shift import ROBOT
 from bench.tables import Goal, Table
-from robocal_ros.core.codes import Code
-from robocal_ros.sessions.tool_results import FULL, QUICK
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_faults import Fault
-from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_faults import Fault
+from robocal_ros.cell_sim.kr150_cell import kr150_cell
+from robocal_ros.ground.codes import Code
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.tool.results import FULL, QUICK
 
 SEEN_BY_CHECK: tuple[Fault, ...] = (
     "collision",

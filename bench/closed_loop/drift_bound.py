@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from bench.closed_loop import setting
 from bench.closed_loop.earlier import seen, taught
 from bench.tables import Goal, Table
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.accuracy import AccuracyForecast, Work
-from robocal_ros.core.thermal.process_learning import LearnedProcess
-from robocal_ros.core.thermal.tracking import DriftTracker
-from robocal_ros.sessions.drift_following import default_process
-from robocal_ros.sim.drift import PERIOD_S, DriftPlan
-from robocal_ros.sim.kr150_cell import DUTY, kr150_cell, poses
-from robocal_ros.sim.robot import TrueRobot
-from robocal_ros.sim.thermal import Warmth
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.drift import PERIOD_S, DriftPlan
+from robocal_ros.cell_sim.kr150_cell import DUTY, kr150_cell, poses
+from robocal_ros.cell_sim.robot import TrueRobot
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.accuracy import AccuracyForecast, Work
+from robocal_ros.thermal.drift_following import default_process
+from robocal_ros.thermal.process_learning import LearnedProcess
+from robocal_ros.thermal.tracking import DriftTracker
 
 Array = NDArray[np.float64]
 

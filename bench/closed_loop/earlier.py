@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from bench.thermal_shifts import Measured
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.process_learning import EarlierShift, LearnedProcess, learn_gains
-from robocal_ros.sim.drift import PLANS, DriftingCell, DriftPlan, record
-from robocal_ros.sim.kr150_cell import poses
-from robocal_ros.sim.robot import TrueRobot
+from robocal_ros.cell_sim.drift import PLANS, DriftingCell, DriftPlan, record
+from robocal_ros.cell_sim.kr150_cell import poses
+from robocal_ros.cell_sim.robot import TrueRobot
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.thermal.process_learning import EarlierShift, LearnedProcess, learn_gains
 
 
 def seen(

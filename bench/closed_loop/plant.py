@@ -11,25 +11,25 @@ from numpy.typing import NDArray
 
 from bench.closed_loop import setting
 from bench.closed_loop.suite import Clock, Record, Suite, unrecorded
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.process_learning import LearnedProcess
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_outputs import Happened
+from robocal_ros.cell_sim.cell_samples import CellSamples, Sample
+from robocal_ros.cell_sim.kr150_cell import poses
+from robocal_ros.cell_sim.production import programme
 from robocal_ros.correction.inputs import TrajectoryCommand
 from robocal_ros.correction.refusals import RefusedError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.maintenance import CycleResult
+from robocal_ros.maintenance.ways import STATION
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.travel import joint_way
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.maintenance import CycleResult
-from robocal_ros.sessions.maintenance.ways import STATION
-from robocal_ros.sessions.tool_results import REFERENCE
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_outputs import Happened
-from robocal_ros.sim.cell_samples import CellSamples, Sample
-from robocal_ros.sim.kr150_cell import poses
-from robocal_ros.sim.production import programme
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.process_learning import LearnedProcess
+from robocal_ros.tool.results import REFERENCE
 
 Array = NDArray[np.float64]
 

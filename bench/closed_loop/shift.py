@@ -18,12 +18,12 @@ from bench.closed_loop.plant import (
     equipped,
 )
 from bench.closed_loop.suite import Record, unrecorded
-from robocal_ros.sessions.accuracy import Accuracy
-from robocal_ros.sessions.thermal_config import Prior
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_faults import Fault
-from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_faults import Fault
+from robocal_ros.cell_sim.kr150_cell import kr150_cell
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.accuracy_state import Accuracy
+from robocal_ros.thermal.config import Prior
 
 Array = NDArray[np.float64]
 

@@ -11,30 +11,36 @@ from bench.closed_loop import setting
 from bench.closed_loop.carrying import Carrier
 from bench.closed_loop.words import drift_of, model_of, told_by, tool_of
 from robocal_ros import __version__
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import JOINTS, MEASURED_POINT, SPHERE_CLOUD, JointSample, PointSample
-from robocal_ros.core.thermal.process_documents import process_document
-from robocal_ros.core.thermal.process_learning import LearnedProcess
-from robocal_ros.core.tool.edge_samples import EdgeSample
-from robocal_ros.core.tool.laser_frame import LaserFrame
+from robocal_ros.cell_sim.cell_samples import Sample
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.correction.session import CorrectionSession
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    SPHERE_CLOUD,
+    JointSample,
+    PointSample,
+)
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_description
+from robocal_ros.maintenance import MaintenanceSession
+from robocal_ros.maintenance.accuracy import Accuracy
 from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.sessions import events
-from robocal_ros.sessions.drift_following import EXPECTED
-from robocal_ros.sessions.edge_log import EDGES
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.maintenance import MaintenanceSession
-from robocal_ros.sessions.maintenance.accuracy import Accuracy
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import ToolDriver
-from robocal_ros.sim.cell_samples import Sample
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_description
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.drift_following import EXPECTED
+from robocal_ros.thermal.process_documents import process_document
+from robocal_ros.thermal.process_learning import LearnedProcess
+from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.tool.driving import ToolDriver
+from robocal_ros.tool.edge_log import EDGES
+from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.session import ToolSession
 
 Array = NDArray[np.float64]
 

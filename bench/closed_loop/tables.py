@@ -35,7 +35,7 @@ from bench.closed_loop.judging import (
 )
 from bench.closed_loop.shift import MIDWORK, ShiftPlan, ShiftRecord, run_shift
 from bench.tables import Goal, Table
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.thermal.accuracy import AccuracyLevel
 
 WITHIN = 0.95  # of the directions below 0.1 mm, in every hour after the first
 RECOVERED_GAPS = 2

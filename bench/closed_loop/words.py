@@ -6,11 +6,11 @@ from bench.closed_loop import setting
 from robocal_ros.correction.inputs import OfferedModel, OfferedTool
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.status import ToldCorrection
-from robocal_ros.sessions.events import Outcome
-from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.maintenance.accuracy import Drift
+from robocal_ros.maintenance.requests import Answer
+from robocal_ros.session.events import Outcome
+from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.tool.session import ToolSession
 
 
 def model_of(session: ThermalSession, now_ns: int) -> OfferedModel:

@@ -20,13 +20,13 @@ from bench.closed_loop.plant import Plant
 from bench.closed_loop.suite import Suite
 from bench.live.graph import LiveError
 from bench.startup import ROOT
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_faults import Fault
-from robocal_ros.sim.cell_samples import CellSamples
-from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.laser_files import LaserFile, write_laser
-from robocal_ros.storage.robots import load_robot, save_robot
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_faults import Fault
+from robocal_ros.cell_sim.cell_samples import CellSamples
+from robocal_ros.cell_sim.kr150_cell import kr150_cell
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot, save_robot
+from robocal_ros.tool.laser_files import LaserFile, write_laser
 
 ROBOT, SERIAL = "kr150_r3100", setting.SERIAL
 PARAMETERS = ROOT / "config" / "cells" / "kr150_shift.yaml"
@@ -82,7 +82,7 @@ def commission(folder: Path) -> Commissioned:
 
 def write_settings(made: Commissioned, recordings: Path, path: Path) -> None:
     """Write the parameters of each node beside `PARAMETERS`."""
-    from robocal_ros.nodes.recorder_node import TOPICS
+    from robocal_ros.bags.recorder_node import TOPICS
 
     motion: dict[str, object] = {"motion_silence_s": 0.5, "motion_late_s": LATE_S}
     motion |= {"deviation_mm": 5.0}  # at 1.5 m/s, where the usual 2 mm go with 0.25 m/s

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 
 from bench.processes import ENDS_WITH_PARENT
 from bench.startup import EXECUTABLES
-from robocal_ros.nodes import qos
+from robocal_ros.ros import qos
 
 PATIENCE_S = 30.0
 END_S = 5.0

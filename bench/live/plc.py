@@ -24,11 +24,11 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.live.cell import PROGRAM, ROBOT, TRUTH
 from bench.live.graph import CellController, LiveError
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes import qos
-from robocal_ros.sim.kr150_cell import poses
-from robocal_ros.sim.production import programme
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.kr150_cell import poses
+from robocal_ros.cell_sim.production import programme
+from robocal_ros.ground.codes import Code
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
 
 BEAT_S = 0.05  # a PLC's program goes round many times for each beat
 GAP_S = 120.0  # an upper bound; the robot is taken back as soon as it is free

@@ -8,12 +8,12 @@ device stands elsewhere, the ball is mounted anew, the robot is the same.
 from pathlib import Path
 
 import numpy as np
-
 from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.robots import load_description
-from robocal_ros.storage.tables import write_measurements
+
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_description
+from robocal_ros.kinematics.tables import write_measurements
 
 FOLDER = Path(__file__).parent
 NOISE_M = 5e-5

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.sim import kr150
-from robocal_ros.sim.drift import MEASURING, DriftRecord, drifting_cell, poses, record
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.drift import MEASURING, DriftRecord, drifting_cell, poses, record
+from robocal_ros.kinematics.robots import load_robot
 
 ROBOT, SEED = "kr150_r3100", 1
 SHOWN = (5, 30, 89)

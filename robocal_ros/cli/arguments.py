@@ -6,10 +6,10 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
-    from robocal_ros.storage.robots import RobotDescription
+    from robocal_ros.kinematics.robots import RobotDescription
 
 PARTS = ("base", "tool", "geometry")
 ROBOT_HELP = "robot file, or name of a shipped robot (ur10, kr150_r3100 …)"
@@ -137,7 +137,7 @@ def describe_robot(name: str, warnings: list[str]) -> "RobotDescription":
     InputError
         When there is no such robot, or its file is not as docs/robot_file.md says.
     """
-    from robocal_ros.storage.robots import load_description
+    from robocal_ros.kinematics.robots import load_description
 
     description = load_description(name)
     warnings += [f"{description.path}: {note}" for note in description.notes]

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.storage.bags import BagReader
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.ground.errors import InputError
 
 Array = NDArray[np.float64]
 Transforms = list[tuple[int, Array]]

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.kinematics import SerialArm
+    from robocal_ros.kinematics import SerialArm
 
 NAME = "fk"
 HELP = "pose of the flange, and of the tool, at given joint values"
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     import numpy as np
 
-    from robocal_ros.core.frame_texts import transform_document
+    from robocal_ros.ground.frame_texts import transform_document
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -7,26 +7,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.hand_eye_bags import DATA_SET, read_data_set
+from robocal_ros.bags.replay import topic_kind
 from robocal_ros.cli.recording import open_recording
-from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.tasks import HandEyeData
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.streams import StandstillRule
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_data import data_set_of
-from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
-from robocal_ros.sessions.hand_eye_shots import PROFILE
-from robocal_ros.sessions.hand_eye_standstills import (
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.data import data_set_of
+from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.hand_eye.recorded import is_hand_eye_session
+from robocal_ros.hand_eye.shots import PROFILE
+from robocal_ros.hand_eye.standstills import (
     StandingShot,
     Standstills,
     captured_marks,
     first_of_each,
 )
-from robocal_ros.sessions.hand_eye_thermal import flange_poses
-from robocal_ros.sessions.replay import topic_kind
-from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.hand_eye_bags import DATA_SET, read_data_set
+from robocal_ros.hand_eye.tasks import HandEyeData
+from robocal_ros.hand_eye.thermal import flange_poses
+from robocal_ros.kinematics import SerialArm
 
 if TYPE_CHECKING:
     from robocal_ros.cli.recording import Recording

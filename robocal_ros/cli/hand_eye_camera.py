@@ -73,7 +73,7 @@ def _add_other_options(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.hand_eye.result import hand_eye_document
+    from robocal_ros.hand_eye.result import hand_eye_document
 
     document = hand_eye_document(calibrate(args))
     return Outcome(document, partial(_show, document=document))

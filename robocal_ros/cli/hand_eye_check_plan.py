@@ -18,17 +18,17 @@ from robocal_ros.cli.hand_eye_shots import (
 from robocal_ros.cli.hand_eye_view import show_sigma, show_verdict
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.tool_frames import three_numbers
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
     from rich.console import Console
 
-    from robocal_ros.core.hand_eye.mount_problem import PoseNoise
-    from robocal_ros.core.hand_eye.planning import PlannedTarget, PlanReport, SensorRange
-    from robocal_ros.core.hand_eye.quality import HandEyeSettings
-    from robocal_ros.storage.hand_eye_targets import Target
+    from robocal_ros.hand_eye.mount_problem import PoseNoise
+    from robocal_ros.hand_eye.planning import PlannedTarget, PlanReport, SensorRange
+    from robocal_ros.hand_eye.quality import HandEyeSettings
+    from robocal_ros.hand_eye.target_files import Target
 
 NAME = "check-plan"
 HELP = "tell before the robot moves what planned poses would give, and which others would do"
@@ -83,9 +83,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.hand_eye.planning import check_plan
-    from robocal_ros.storage.hand_eye_files import read_flange_mount
-    from robocal_ros.storage.hand_eye_tables import read_pose_table, write_pose_table
+    from robocal_ros.hand_eye.files import read_flange_mount
+    from robocal_ros.hand_eye.planning import check_plan
+    from robocal_ros.hand_eye.tables import read_pose_table, write_pose_table
 
     settings, sensor = settings_of(args), _sensor(args)
     known = given_target(args.target_kind, args.target, args.radius_mm)
@@ -102,7 +102,7 @@ def run(args: argparse.Namespace) -> Outcome:
 
 
 def _sensor(args: argparse.Namespace) -> "SensorRange":
-    from robocal_ros.core.hand_eye.planning import SensorRange
+    from robocal_ros.hand_eye.planning import SensorRange
 
     if args.near_mm >= args.far_mm:
         raise InputError(f"--near-mm {args.near_mm:g} must be below --far-mm {args.far_mm:g}")
@@ -115,7 +115,7 @@ def _sensor(args: argparse.Namespace) -> "SensorRange":
 
 
 def _noise(settings: "HandEyeSettings") -> "PoseNoise":
-    from robocal_ros.core.hand_eye.mount_problem import PoseNoise
+    from robocal_ros.hand_eye.mount_problem import PoseNoise
 
     return settings.noise() or PoseNoise(ROBOT_SIGMA_MM * 1e-3, 0.0)
 
@@ -128,8 +128,8 @@ def _planned(
 ) -> "PlannedTarget":
     import numpy as np
 
-    from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
-    from robocal_ros.core.hand_eye.targets import SphereTarget, StepTarget
+    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+    from robocal_ros.hand_eye.targets import SphereTarget, StepTarget
 
     if isinstance(target, SphereTarget):
         if center_mm is None:
@@ -146,7 +146,7 @@ def _planned(
 
 def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[str] | None:
     """Marks of the stairs on which proposed poses lay the light."""
-    from robocal_ros.core.hand_eye.planned_targets import PlannedStep
+    from robocal_ros.hand_eye.planned_targets import PlannedStep
 
     return list(target.lit(T_base_sensor)) if isinstance(target, PlannedStep) else None
 
@@ -154,8 +154,8 @@ def _lit(target: "PlannedTarget", T_base_sensor: "NDArray[np.float64]") -> list[
 def _document(report: "PlanReport", names: tuple[str, ...]) -> Document:
     from math import degrees
 
-    from robocal_ros.core.assessment import verdict_document
-    from robocal_ros.core.frame_texts import transform_document
+    from robocal_ros.estimation.assessment import verdict_document
+    from robocal_ros.ground.frame_texts import transform_document
 
     sigma, error_m, better_m = report.sigma, report.working_error_m, report.proposed_error_m
     return {

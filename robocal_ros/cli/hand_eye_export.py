@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.frame_texts import transform_document
-    from robocal_ros.core.hand_eye.exports import exported
-    from robocal_ros.storage.hand_eye_files import read_mount
+    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.hand_eye.exports import exported
+    from robocal_ros.hand_eye.files import read_mount
 
     mount = read_mount(args.result, accepted=True)
     T, parent = mount.T_parent_sensor, args.parent or PARENTS[mount.parent]

@@ -21,12 +21,12 @@ from robocal_ros.cli.hand_eye_shots import (
 )
 from robocal_ros.cli.hand_eye_view import show_mount
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
-    from robocal_ros.core.hand_eye.tasks import Task
-    from robocal_ros.core.kinematics import SerialArm
+    from robocal_ros.hand_eye.tasks import Task
+    from robocal_ros.kinematics import SerialArm
 
 NAME = "joint"
 HELP = "place a line laser on the flange from the shots of two or three targets together"
@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.hand_eye.joint import solve_joint
-    from robocal_ros.core.hand_eye.result import hand_eye_document
+    from robocal_ros.hand_eye.joint import solve_joint
+    from robocal_ros.hand_eye.result import hand_eye_document
 
     arm, settings = arm_of(args), settings_of(args)
     folders = {kind: getattr(args, kind) for kind in KINDS if getattr(args, kind) is not None}

@@ -5,16 +5,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.hand_eye_shots import arm_of, require_unused, robot_sigma_of
-from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
-    from robocal_ros.core.hand_eye.board import Chessboard, Intrinsics, SeenBoards
-    from robocal_ros.core.hand_eye.camera import CameraSettings
-    from robocal_ros.core.hand_eye.pose_pairs import PosePairs
-    from robocal_ros.core.hand_eye.result import HandEyeResult
-    from robocal_ros.core.hand_eye.streams import PoseStream
-    from robocal_ros.storage.hand_eye_tables import PoseTable
+    from robocal_ros.hand_eye.board import Chessboard, Intrinsics, SeenBoards
+    from robocal_ros.hand_eye.camera import CameraSettings
+    from robocal_ros.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.hand_eye.result import HandEyeResult
+    from robocal_ros.hand_eye.streams import PoseStream
+    from robocal_ros.hand_eye.tables import PoseTable
 
 
 def calibrate(args: argparse.Namespace) -> "HandEyeResult":
@@ -25,7 +25,7 @@ def calibrate(args: argparse.Namespace) -> "HandEyeResult":
     InputError
         When files or options are wrong.
     TooFewSamplesError, RankDeficientError, ResidualError
-        As `robocal_ros.core.hand_eye.camera.calibrate_camera`.
+        As `robocal_ros.hand_eye.camera.calibrate_camera`.
     """
     settings = _settings(args)
     if args.measured is not None:
@@ -44,8 +44,8 @@ def calibrate(args: argparse.Namespace) -> "HandEyeResult":
 
 
 def _settings(args: argparse.Namespace) -> "CameraSettings":
-    from robocal_ros.core.hand_eye.camera import CameraSettings
-    from robocal_ros.core.hand_eye.camera_fit import GivenNoise
+    from robocal_ros.hand_eye.camera import CameraSettings
+    from robocal_ros.hand_eye.camera_fit import GivenNoise
 
     return CameraSettings(args.method, GivenNoise(*robot_sigma_of(args)), args.limit_mm * 1e-3)
 
@@ -54,7 +54,7 @@ def _tables(
     args: argparse.Namespace, file_column: str | None
 ) -> "tuple[PoseTable, PoseTable | None]":
     """The robot's poses that solve, and those that judge."""
-    from robocal_ros.storage.hand_eye_tables import read_pose_table
+    from robocal_ros.hand_eye.tables import read_pose_table
 
     arm = arm_of(args)
     used = read_pose_table(args.poses, arm, file_column)
@@ -66,10 +66,10 @@ def _tables(
 
 
 def _from_images(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
-    from robocal_ros.core.hand_eye.board import Chessboard
-    from robocal_ros.core.hand_eye.board_pairs import intrinsics_document
-    from robocal_ros.core.hand_eye.camera import CheckPairs, calibrate_camera
-    from robocal_ros.storage.camera_files import read_intrinsics
+    from robocal_ros.hand_eye.board import Chessboard
+    from robocal_ros.hand_eye.board_pairs import intrinsics_document
+    from robocal_ros.hand_eye.camera import CheckPairs, calibrate_camera
+    from robocal_ros.hand_eye.camera_files import read_intrinsics
 
     columns, rows = args.board
     board = Chessboard(columns, rows, args.square_mm * 1e-3)
@@ -93,9 +93,9 @@ def _pairs_of_images(
     table: "PoseTable", args: argparse.Namespace, board: "Chessboard",
     intrinsics: "Intrinsics | None",
 ) -> "tuple[PosePairs, SeenBoards]":  # fmt: skip
-    from robocal_ros.core.hand_eye.board import see_boards
-    from robocal_ros.core.hand_eye.board_pairs import board_pairs
-    from robocal_ros.storage.camera_files import read_images
+    from robocal_ros.hand_eye.board import see_boards
+    from robocal_ros.hand_eye.board_pairs import board_pairs
+    from robocal_ros.hand_eye.camera_files import read_images
 
     images, unread = read_images(args.profiles, table)
     seen = see_boards(images, board, intrinsics)
@@ -104,9 +104,9 @@ def _pairs_of_images(
 
 
 def _from_poses(args: argparse.Namespace, settings: "CameraSettings") -> "HandEyeResult":
-    from robocal_ros.core.hand_eye.camera import CheckPairs, calibrate_camera
-    from robocal_ros.core.hand_eye.streams import calibrate_streams
-    from robocal_ros.storage.hand_eye_tables import read_pose_table
+    from robocal_ros.hand_eye.camera import CheckPairs, calibrate_camera
+    from robocal_ros.hand_eye.streams import calibrate_streams
+    from robocal_ros.hand_eye.tables import read_pose_table
 
     robot, check = _tables(args, None)
     camera = read_pose_table(args.measured, None, None)
@@ -146,7 +146,7 @@ def _stamps(table: "PoseTable") -> Any:
 
 
 def _stream(table: "PoseTable", origin_ns: int) -> "PoseStream":
-    from robocal_ros.core.hand_eye.streams import stream_of
+    from robocal_ros.hand_eye.streams import stream_of
 
     return stream_of(_stamps(table), table.T_base_flange, table.names, origin_ns, table.path)
 
@@ -155,7 +155,7 @@ def _paired(
     robot: "PoseTable", camera: "PoseTable", mount: Any
 ) -> "tuple[PosePairs, dict[str, str]]":
     """Pairs of the same sample, or row; and the samples that only one table has."""
-    from robocal_ros.core.hand_eye.pose_pairs import PosePairs
+    from robocal_ros.hand_eye.pose_pairs import PosePairs
 
     if not robot.named and not camera.named and len(robot) != len(camera):
         raise InputError(

@@ -8,12 +8,12 @@ import numpy as np
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
-from robocal_ros.core.frame_texts import transform_document
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.proposals import Head
-from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
-from robocal_ros.sessions.hand_eye_recorded import hand_eye_session_as_recorded
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.ground.proposals import Head
+from robocal_ros.hand_eye.inputs import take_hand_eye_message
+from robocal_ros.hand_eye.recorded import hand_eye_session_as_recorded
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
 
 
 def replay_hand_eye(

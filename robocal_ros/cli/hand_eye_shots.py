@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, positive
-from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
-    from robocal_ros.core.hand_eye.quality import HandEyeSettings
-    from robocal_ros.core.hand_eye.tasks import HandEyeData, Task
-    from robocal_ros.core.kinematics import SerialArm
-    from robocal_ros.storage.hand_eye_tables import PoseTable
-    from robocal_ros.storage.hand_eye_targets import Target
+    from robocal_ros.hand_eye.quality import HandEyeSettings
+    from robocal_ros.hand_eye.tables import PoseTable
+    from robocal_ros.hand_eye.target_files import Target
+    from robocal_ros.hand_eye.tasks import HandEyeData, Task
+    from robocal_ros.kinematics import SerialArm
 
 KINDS = ("sphere", "step", "line")
 FEATURES = ("edge", "groove")
@@ -137,7 +137,7 @@ def settings_of(args: argparse.Namespace) -> "HandEyeSettings":
     InputError
         For an orientation's noise alone.
     """
-    from robocal_ros.core.hand_eye.quality import HandEyeSettings
+    from robocal_ros.hand_eye.quality import HandEyeSettings
 
     if args.robot_sigma_mm is None and args.robot_sigma_deg is not None:
         raise InputError("--robot-sigma-deg goes with --robot-sigma-mm: give both, or the latter")
@@ -146,7 +146,7 @@ def settings_of(args: argparse.Namespace) -> "HandEyeSettings":
 
 def arm_of(args: argparse.Namespace) -> "SerialArm | None":
     """The robot that is named, if any. Raises as `load_robot`."""
-    from robocal_ros.storage.robots import load_robot
+    from robocal_ros.kinematics.robots import load_robot
 
     return None if args.robot is None else load_robot(args.robot)
 
@@ -186,8 +186,8 @@ def given_shots(
 
 def read_shots(poses: Path, profiles: Path, arm: "SerialArm | None") -> Shots:
     """Read a table and its profiles. Raises as `read_pose_table` and `read_profiles`."""
-    from robocal_ros.core.hand_eye.tasks import HandEyeData
-    from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
+    from robocal_ros.hand_eye.tables import read_pose_table, read_profiles
+    from robocal_ros.hand_eye.tasks import HandEyeData
 
     table = read_pose_table(poses, arm)
     seen = read_profiles(profiles, table)
@@ -216,7 +216,7 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Ta
         When too little or too much is given, or the file is of another kind; further as
         `read_target`.
     """
-    from robocal_ros.core.hand_eye.targets import SphereTarget
+    from robocal_ros.hand_eye.targets import SphereTarget
 
     if radius_mm is not None:
         if kind != "sphere":
@@ -234,9 +234,9 @@ def given_target(kind: str, target: Path | None, radius_mm: float | None) -> "Ta
 
 def read_target_of(kind: str, path: Path) -> "Target":
     """Read a target file of this kind. Raises as `given_target`."""
-    from robocal_ros.core.hand_eye.target_documents import KIND_OF
-    from robocal_ros.core.hand_eye.targets import BoardTarget
-    from robocal_ros.storage.hand_eye_targets import read_target
+    from robocal_ros.hand_eye.target_documents import KIND_OF
+    from robocal_ros.hand_eye.target_files import read_target
+    from robocal_ros.hand_eye.targets import BoardTarget
 
     target = read_target(path)
     found = KIND_OF[type(target)]
@@ -250,11 +250,11 @@ def task_of(target: "Target | None", feature: str | None, classic: bool = False)
 
     ``classic``: corners and edges in the published form.
     """
-    from robocal_ros.core.fitting.edge import EdgeRule
-    from robocal_ros.core.fitting.polyline import CornerRule
-    from robocal_ros.core.hand_eye.step_task import StepTask
-    from robocal_ros.core.hand_eye.targets import SphereTarget, StepTarget
-    from robocal_ros.core.hand_eye.tasks import LineTask, SphereTask
+    from robocal_ros.estimation.edge import EdgeRule
+    from robocal_ros.estimation.polyline import CornerRule
+    from robocal_ros.hand_eye.step_task import StepTask
+    from robocal_ros.hand_eye.targets import SphereTarget, StepTarget
+    from robocal_ros.hand_eye.tasks import LineTask, SphereTask
 
     if isinstance(target, SphereTarget):
         return SphereTask(target)

@@ -18,7 +18,7 @@ from robocal_ros.cli.hand_eye_shots import (
 )
 from robocal_ros.cli.hand_eye_view import show_mount
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 METHODS = ("best", "classic")
 
@@ -39,9 +39,9 @@ def add_target_action(parser: argparse.ArgumentParser) -> None:
 
 def run_target(kind: str, args: argparse.Namespace, radius_mm: float | None = None) -> Outcome:
     """Place the sensor. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.hand_eye.result import hand_eye_document
-    from robocal_ros.core.hand_eye.solve import solve_task
-    from robocal_ros.core.hand_eye.verification import held_out, judged
+    from robocal_ros.hand_eye.result import hand_eye_document
+    from robocal_ros.hand_eye.solve import solve_task
+    from robocal_ros.hand_eye.verification import held_out, judged
 
     arm, settings = arm_of(args), settings_of(args)
     target = given_target(kind, args.target, radius_mm)

@@ -10,13 +10,13 @@ from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, positive, warn
 from robocal_ros.cli.hand_eye_shots import add_limit
 from robocal_ros.cli.hand_eye_view import show_judged, show_placed
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.hand_eye.tracker_data import TrackerData, TrackerNoise
-    from robocal_ros.core.kinematics import SerialArm
+    from robocal_ros.hand_eye.tracker_data import TrackerData, TrackerNoise
+    from robocal_ros.kinematics import SerialArm
 
 NAME = "tracker"
 HELP = "place a profile sensor by a laser tracker that sees the flange, and a cube with a sphere"
@@ -71,10 +71,10 @@ def _add_limits(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.hand_eye.result import hand_eye_document
-    from robocal_ros.core.hand_eye.tracker import solve_tracker
-    from robocal_ros.core.hand_eye.tracker_data import TrackerTarget
-    from robocal_ros.storage.tracker_tables import read_tracker_target
+    from robocal_ros.hand_eye.result import hand_eye_document
+    from robocal_ros.hand_eye.tracker import solve_tracker
+    from robocal_ros.hand_eye.tracker_data import TrackerTarget
+    from robocal_ros.hand_eye.tracker_tables import read_tracker_target
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm
@@ -94,7 +94,7 @@ def _noise(args: argparse.Namespace) -> "TrackerNoise":
     """What is given of it; the rest as `TrackerNoise` has it."""
     from math import radians
 
-    from robocal_ros.core.hand_eye.tracker_data import TrackerNoise
+    from robocal_ros.hand_eye.tracker_data import TrackerNoise
 
     given = {}
     if args.tracker_sigma_mm is not None:
@@ -108,11 +108,11 @@ def _noise(args: argparse.Namespace) -> "TrackerNoise":
 
 def _read(args: argparse.Namespace, arm: "SerialArm") -> tuple["TrackerData", dict[str, str]]:
     """All measurements, and the profiles that show next to nothing, with why."""
-    from robocal_ros.core.errors import TooFewSamplesError
-    from robocal_ros.core.hand_eye.profile import Profile
-    from robocal_ros.core.hand_eye.tracker_data import TrackerData
-    from robocal_ros.storage.hand_eye_tables import read_pose_table, read_profiles
-    from robocal_ros.storage.tracker_tables import read_tracker_points
+    from robocal_ros.ground.errors import TooFewSamplesError
+    from robocal_ros.hand_eye.profile import Profile
+    from robocal_ros.hand_eye.tables import read_pose_table, read_profiles
+    from robocal_ros.hand_eye.tracker_data import TrackerData
+    from robocal_ros.hand_eye.tracker_tables import read_tracker_points
 
     points = read_tracker_points(args.points, arm)
     table = read_pose_table(args.poses, arm)

@@ -45,11 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.assessment import errors_document, summarise, verdict_document
-    from robocal_ros.core.frame_texts import transform_document
-    from robocal_ros.core.hand_eye.result import by_shot
-    from robocal_ros.core.hand_eye.verification import verify
-    from robocal_ros.storage.hand_eye_files import read_flange_mount
+    from robocal_ros.estimation.assessment import errors_document, summarise, verdict_document
+    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.hand_eye.files import read_flange_mount
+    from robocal_ros.hand_eye.result import by_shot
+    from robocal_ros.hand_eye.verification import verify
 
     settings = settings_of(args)
     T_flange_sensor = read_flange_mount(args.result)

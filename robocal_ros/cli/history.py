@@ -19,11 +19,11 @@ from robocal_ros.cli.history_view import (
     show_list,
 )
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.proposals import BEFORE_ANY, Decision, Entry
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.proposals import BEFORE_ANY, Decision, Entry
 
 if TYPE_CHECKING:
-    from robocal_ros.storage.calibrations import CalibrationHistory
+    from robocal_ros.history.calibrations import CalibrationHistory
 
 NAME = "history"
 HELP = "list the calibrations of a robot; accept, reject or roll back"
@@ -71,9 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.storage.calibrations import CalibrationHistory
-    from robocal_ros.storage.history_damage import damaged_files
-    from robocal_ros.storage.history_paths import known_serials, state_folder
+    from robocal_ros.history.calibrations import CalibrationHistory
+    from robocal_ros.history.history_damage import damaged_files
+    from robocal_ros.history.history_paths import known_serials, state_folder
 
     folder = state_folder() if args.state is None else args.state.absolute()
     serial = args.robot_serial
@@ -144,14 +144,14 @@ def _corrections(history: "CalibrationHistory", args: argparse.Namespace) -> Ans
 
 
 def _acknowledge(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    from robocal_ros.storage.history_damage import acknowledge
+    from robocal_ros.history.history_damage import acknowledge
 
     files = acknowledge(history.path, _by(args), time.time_ns())
     return {"acknowledged": [str(path) for path in files], "by": _by(args)}, show_acknowledged
 
 
 def _accept(history: "CalibrationHistory", args: argparse.Namespace) -> Answer:
-    from robocal_ros.sessions.decisions import measured_with
+    from robocal_ros.session.decisions import measured_with
 
     head = history.accept(
         args.id,

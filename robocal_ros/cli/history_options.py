@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 
 from robocal_ros.cli.arguments import count, text
-from robocal_ros.core.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, hand_eye_kind
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.files import quoted
+from robocal_ros.ground.proposals import HEALTHY_TOOL, MANDREL, THERMAL, TOOL, hand_eye_kind
 
 _PREVIOUS = "previous"
 _NOMINAL = "nominal"

@@ -6,21 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.core.assessment import hold_out, pose_groups
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.identification import (
-    JudgedIdentification,
-    Method,
-    Part,
-    identify_and_judge,
-)
-from robocal_ros.core.identification.documents import identification_document
-from robocal_ros.core.identification.mismatch import explain_mismatch, require_match
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.files import quoted
-from robocal_ros.storage.tables import beyond_limits, read_measurements
+from robocal_ros.estimation.assessment import hold_out, pose_groups
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.files import quoted
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import JudgedIdentification, Method, Part, identify_and_judge
+from robocal_ros.identification.documents import identification_document
+from robocal_ros.identification.mismatch import explain_mismatch, require_match
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.tables import beyond_limits, read_measurements
 
 Document = dict[str, Any]
 

@@ -6,23 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros import __version__
-from robocal_ros.cli.arguments import (
-    PARTS,
-    ROBOT_HELP,
-    describe_robot,
-    parts,
-    seed,
-    share,
-    warn,
-)
+from robocal_ros.cli.arguments import PARTS, ROBOT_HELP, describe_robot, parts, seed, share, warn
 from robocal_ros.cli.identify_view import headline, show_identification
 from robocal_ros.cli.output import DONE, NO_ANSWER, Outcome, refusal, tell
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from robocal_ros.cli.identification import Answer, Request
-    from robocal_ros.storage.robots import RobotDescription
+    from robocal_ros.kinematics.robots import RobotDescription
 
 NAME = "identify"
 HELP = "identify a robot's model from a table of measurements, and judge it on unseen ones"
@@ -140,7 +132,7 @@ def _save(
     warnings: list[str],
 ) -> None:
     """Write the identified robot file, if the verdict accepts: a script may use it at once."""
-    from robocal_ros.storage.robots import save_robot
+    from robocal_ros.kinematics.robots import save_robot
 
     verdict = answer.judged.verdict
     if not verdict.accept:

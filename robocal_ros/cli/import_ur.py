@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
     from rich.console import Console
 
-    from robocal_ros.core.kinematics import SerialArm
+    from robocal_ros.kinematics import SerialArm
 
     Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.storage.robots import save_robot
+    from robocal_ros.kinematics.robots import save_robot
 
     name = args.name or args.output.stem
     nominal, factory, dh = _arms(args.nominal, args.calibration, name)
@@ -72,13 +72,13 @@ def _arms(nominal: Path, calibration: Path, name: str) -> "tuple[SerialArm, Seri
     """The arm as designed, as calibrated, and as calibrated in the controller's own numbers."""
     from dataclasses import replace
 
-    from robocal_ros.core.kinematics.universal_robots import (
+    from robocal_ros.ground.files import read_text
+    from robocal_ros.kinematics.universal_robots import (
         factory_arm,
         factory_dh,
         nominal_arm,
         parse_settings,
     )
-    from robocal_ros.storage.files import read_text
 
     settings = [
         parse_settings(read_text(path, "configuration"), str(path))

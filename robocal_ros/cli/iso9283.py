@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.storage.files import nearest, quoted
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.ground.files import nearest, quoted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.iso9283 import Repeated
+    from robocal_ros.identification.iso9283 import Repeated
 
 NAME = "iso9283"
 HELP = (
@@ -52,8 +52,8 @@ def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     import numpy as np
 
-    from robocal_ros.core.iso9283 import CYCLES, repeated
-    from robocal_ros.storage.position_tables import read_positions
+    from robocal_ros.identification.iso9283 import CYCLES, repeated
+    from robocal_ros.identification.position_tables import read_positions
 
     table = read_positions(args.data)
     commanded = _by_target(args.commanded, list(table), str(args.data))

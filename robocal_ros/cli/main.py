@@ -38,7 +38,7 @@ from robocal_ros.cli.parsing import (
     UsageError,
     with_negative_values,
 )
-from robocal_ros.core.errors import InputError, RobocalError
+from robocal_ros.ground.errors import InputError, RobocalError
 
 COMMANDS = {
     "fk": "fk",

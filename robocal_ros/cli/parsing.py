@@ -5,7 +5,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 _NEGATIVE = re.compile(r"-\.?\d")
 

@@ -3,10 +3,10 @@
 import contextlib
 
 from robocal_ros.cli.arguments import describe_robot
-from robocal_ros.core.errors import InputError, WrongRobotError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.events import Command
-from robocal_ros.storage.robots import robot_folders
+from robocal_ros.ground.errors import InputError, WrongRobotError
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import robot_folders
+from robocal_ros.session.events import Command
 
 
 def find_robot(name: str | None, warnings: list[str], configured: Command | None) -> SerialArm:

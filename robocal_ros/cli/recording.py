@@ -5,12 +5,8 @@ from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import Any
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
-from robocal_ros.sessions.edge_log import EDGES
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.hand_eye_shots import SHOTS
-from robocal_ros.sessions.replay import (
+from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.replay import (
     EVENTS,
     first_configuration,
     input_topics,
@@ -18,7 +14,11 @@ from robocal_ros.sessions.replay import (
     read_events,
     topic_kind,
 )
-from robocal_ros.storage.bags import BagMessage, BagReader
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import JOINTS, MEASURING, TEMPERATURES, stamp_ns
+from robocal_ros.hand_eye.shots import SHOTS
+from robocal_ros.session.events import Command
+from robocal_ros.tool.edge_log import EDGES
 
 MEASURED = (*MEASURING, EDGES, *SHOTS)
 UNASKED = "while this was recorded nobody gave its node a command"

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 from robocal_ros.cli.arguments import ROBOT_HELP, input_topic, warn
 from robocal_ros.cli.output import BAD_REQUEST, DONE, NO_ANSWER, Outcome, progress_console, tell
 from robocal_ros.cli.replay_view import show_replay
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
+    from robocal_ros.bags.bags import BagMessage
     from robocal_ros.cli.recording import Recording
-    from robocal_ros.storage.bags import BagMessage
 
 NAME = "replay"
 HELP = "run a recorded bag (MCAP) through the sessions of the live nodes"

@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 from robocal_ros import __version__
+from robocal_ros.bags.replay import ReplayReport, replay
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.streams import JointStream
-from robocal_ros.sessions.commanded import Commanded
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.replay import ReplayReport, replay
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.streams import JointStream
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.commanded import Commanded
+from robocal_ros.session.events import Command, Outcome
 
 S = TypeVar("S", bound=Commanded)
 AsRecorded = Callable[[SerialArm, CalibrationHistory, Command, str], S]

@@ -8,32 +8,27 @@ from pathlib import Path
 from typing import Any
 
 from robocal_ros import __version__
+from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.replay import ReplayReport, feed, one_by_one, replay
 from robocal_ros.cli.hand_eye_replaying import replay_hand_eye
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recording import UNASKED, Recording, open_recording
 from robocal_ros.cli.replay_parts import command_document, gaps_document, seconds
 from robocal_ros.cli.tool_replaying import replay_tool
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.found_cycles import accepting, automatic_commands, window_commands
-from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
-from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.maintenance.session import RUN as MAINTAIN
-from robocal_ros.sessions.replay import (
-    ReplayReport,
-    feed,
-    one_by_one,
-    replay,
-)
-from robocal_ros.sessions.seeding import is_thermal_session, session_as_recorded
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.sessions.thermal_config import ThermalConfig
-from robocal_ros.sessions.tool_recorded import is_tool_session
-from robocal_ros.storage.bags import BagMessage, BagReader
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.errors import InputError
+from robocal_ros.hand_eye.recorded import is_hand_eye_session
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.maintenance.session import RUN as MAINTAIN
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.found_cycles import accepting, automatic_commands, window_commands
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.seeding import is_thermal_session, session_as_recorded
+from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.tool.recorded import is_tool_session
 
 Window = tuple[float, float]
 Commands = Sequence[tuple[Command, Mapping[str, Any]]]

@@ -8,21 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cli.output import Document
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.identification.cell import CellModel
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.cycle_verdict import judge_cycle
-from robocal_ros.core.thermal.documents import cycle_document, flange_sensor_document
-from robocal_ros.core.thermal.flange_identification import identify_and_judge_flange_sensor
-from robocal_ros.core.thermal.identification import CycleDrift, identify_cycle, identify_subset
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.core.thermal.visits import ONLY_CYCLE, Visits, require_cold_counterparts
-from robocal_ros.storage.prior_files import read_prior
-from robocal_ros.storage.sensor_files import PlacedSensor, read_sensor
-from robocal_ros.storage.tables import read_measurements
-from robocal_ros.storage.visit_tables import read_visits
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.identification.cell import CellModel
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.tables import read_measurements
+from robocal_ros.thermal.cycle_verdict import judge_cycle
+from robocal_ros.thermal.documents import cycle_document, flange_sensor_document
+from robocal_ros.thermal.flange_identification import identify_and_judge_flange_sensor
+from robocal_ros.thermal.identification import CycleDrift, identify_cycle, identify_subset
+from robocal_ros.thermal.prior_files import read_prior
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.sensor_files import PlacedSensor, read_sensor
+from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.visit_tables import read_visits
+from robocal_ros.thermal.visits import ONLY_CYCLE, Visits, require_cold_counterparts
 
 
 @dataclass(frozen=True)

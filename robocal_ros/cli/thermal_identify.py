@@ -7,7 +7,7 @@ from pathlib import Path
 from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, text, warn
 from robocal_ros.cli.identify_view import show_identification
 from robocal_ros.cli.output import Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 NAME = "identify"
 HELP = "identify a thermal drift, or the geometry of a measuring robot, and judge it"

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robocal_ros.cli.output import Document
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.cycle_planning import plan_cycle
-from robocal_ros.core.thermal.pose_planning import PosePlan, SensorField
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.storage.files import write_text
-from robocal_ros.storage.prior_files import read_prior
-from robocal_ros.storage.sensor_files import read_sensor
-from robocal_ros.storage.tables import read_measurements
+from robocal_ros.ground.files import write_text
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.tables import read_measurements
+from robocal_ros.thermal.cycle_planning import plan_cycle
+from robocal_ros.thermal.pose_planning import PosePlan, SensorField
+from robocal_ros.thermal.prior_files import read_prior
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.sensor_files import read_sensor
 
 Array = NDArray[np.float64]
 

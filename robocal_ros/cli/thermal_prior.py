@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, add_sigma, describe_robot, warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -47,9 +47,9 @@ def run(args: argparse.Namespace) -> Outcome:
     import numpy as np
 
     from robocal_ros.cli.thermal_identification import cold_spots, warm_visits
-    from robocal_ros.core.thermal.learning import learn_drift
-    from robocal_ros.storage.prior_files import write_prior
-    from robocal_ros.storage.sensor_files import read_sensor
+    from robocal_ros.thermal.learning import learn_drift
+    from robocal_ros.thermal.prior_files import write_prior
+    from robocal_ros.thermal.sensor_files import read_sensor
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, count, describe_robot, positive, warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.kinematics import SerialArm
-    from robocal_ros.core.thermal.drift_history import DriftHistory
+    from robocal_ros.kinematics import SerialArm
+    from robocal_ros.thermal.drift_history import DriftHistory
 
 NAME = "screen"
 HELP = "find which parameters a drift needs, by what is left at check poses"
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.thermal.screening import screen
+    from robocal_ros.thermal.screening import screen
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm
@@ -93,8 +93,8 @@ def run(args: argparse.Namespace) -> Outcome:
 
 def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
     from robocal_ros.cli.thermal_identification import check_visits, cold_spots, warm_visits
-    from robocal_ros.core.thermal.drift_history import DriftHistory
-    from robocal_ros.storage.sensor_files import read_sensor
+    from robocal_ros.thermal.drift_history import DriftHistory
+    from robocal_ros.thermal.sensor_files import read_sensor
 
     cold, spots = cold_spots(arm, read_sensor(args.sensor, arm), args.cold)
     warm = warm_visits(args.warm, arm, cold)
@@ -116,8 +116,8 @@ def _history(args: argparse.Namespace, arm: "SerialArm") -> "DriftHistory":
 def _best_subset(args: argparse.Namespace, history: "DriftHistory") -> Document | None:
     if not args.best_subset:
         return None
-    from robocal_ros.core.thermal.best_subset import best_subset
-    from robocal_ros.core.thermal.drift_history import share_within
+    from robocal_ros.thermal.best_subset import best_subset
+    from robocal_ros.thermal.drift_history import share_within
 
     found = best_subset(history, args.wanted)
     chosen = [history.names.index(name) for name in found.names]

@@ -34,10 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.thermal.documents import sensor_document
-    from robocal_ros.core.thermal.sensor_calibration import calibrate_sensor
-    from robocal_ros.storage.sensor_files import write_sensor
-    from robocal_ros.storage.tables import read_measurements
+    from robocal_ros.kinematics.tables import read_measurements
+    from robocal_ros.thermal.documents import sensor_document
+    from robocal_ros.thermal.sensor_calibration import calibrate_sensor
+    from robocal_ros.thermal.sensor_files import write_sensor
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

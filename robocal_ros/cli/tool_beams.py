@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from robocal_ros.cli.arguments import ROBOT_HELP, SIGMA_MM, describe_robot, positive, text, warn
 from robocal_ros.cli.output import Document, Outcome
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.tool.laser_frame import LaserFrame
+    from robocal_ros.tool.laser_frame import LaserFrame
 
 NAME = "beams"
 HELP = "place two crossed light beams from the edges A1 to D4 of a cylinder at the flange"
@@ -50,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.tool.documents import laser_document
-    from robocal_ros.core.tool.laser_frame import calibrate_laser
-    from robocal_ros.storage.tool_tables import read_beam_points
+    from robocal_ros.tool.documents import laser_document
+    from robocal_ros.tool.laser_frame import calibrate_laser
+    from robocal_ros.tool.tables import read_beam_points
 
     _require_together(args)
     radius_m = None if args.radius_mm is None else args.radius_mm * 1e-3
@@ -80,7 +80,7 @@ def _require_together(args: argparse.Namespace) -> None:
 
 
 def _write(args: argparse.Namespace, laser: "LaserFrame") -> None:
-    from robocal_ros.storage.laser_files import LaserFile, write_laser
+    from robocal_ros.tool.laser_files import LaserFile, write_laser
 
     warnings: list[str] = []
     arm = describe_robot(args.robot, warnings).arm

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 from robocal_ros.cli.arguments import positive
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.tool_crossed_run import add_run_options, run_whole
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.tool.beam_edges import InputRule
+    from robocal_ros.tool.beam_edges import InputRule
 
 NAME = "crossed"
 HELP = "find a tool from the edges of a whole run, or its axis from one circle at constant speed"
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from math import isfinite
 
-    from robocal_ros.core.tool.beam_edges import InputRule
+    from robocal_ros.tool.beam_edges import InputRule
 
     if not isfinite(args.sample_period_s) or args.sample_period_s < 0.0:
         raise InputError("--sample-period-s must be a finite number, not below 0")
@@ -101,11 +101,11 @@ def _given(args: argparse.Namespace, names: tuple[str, ...]) -> list[str]:
 def _circle(args: argparse.Namespace, rule: "InputRule") -> Document:
     from math import isfinite, radians
 
-    from robocal_ros.core.tool.beam_edges import debounced
-    from robocal_ros.core.tool.circle_edges import CircleMotion
-    from robocal_ros.core.tool.crossed_beams import fit_circle
-    from robocal_ros.core.tool.documents import circle_document
-    from robocal_ros.storage.tool_tables import read_edges
+    from robocal_ros.tool.beam_edges import debounced
+    from robocal_ros.tool.circle_edges import CircleMotion
+    from robocal_ros.tool.crossed_beams import fit_circle
+    from robocal_ros.tool.documents import circle_document
+    from robocal_ros.tool.tables import read_edges
 
     start_deg = args.start_deg or 0.0
     beam_angle_deg = 90.0 if args.beam_angle_deg is None else args.beam_angle_deg

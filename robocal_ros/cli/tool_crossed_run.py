@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from robocal_ros.cli.arguments import ROBOT_HELP, describe_robot, warn
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.tool_frames import add_frame_options, given_frame
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.tool.beam_edges import InputRule
+    from robocal_ros.tool.beam_edges import InputRule
 
 NEEDED = ("joints", "robot", "laser")
 
@@ -35,13 +35,13 @@ def add_run_options(parser: "argparse._ActionsContainer") -> None:
 
 def run_whole(args: argparse.Namespace, rule: "InputRule") -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.tool.crossed_run import estimate_tool
-    from robocal_ros.core.tool.documents import classic_run_document, run_document
-    from robocal_ros.core.tool.driven_circle import classic_from_path
-    from robocal_ros.core.tool.judging import KnownTool, ToolLimits, judge_run
-    from robocal_ros.core.tool.named_steps import named_steps
-    from robocal_ros.storage.laser_files import read_laser_for
-    from robocal_ros.storage.tool_tables import read_joint_path, read_step_edges
+    from robocal_ros.tool.crossed_run import estimate_tool
+    from robocal_ros.tool.documents import classic_run_document, run_document
+    from robocal_ros.tool.driven_circle import classic_from_path
+    from robocal_ros.tool.judging import KnownTool, ToolLimits, judge_run
+    from robocal_ros.tool.laser_files import read_laser_for
+    from robocal_ros.tool.named_steps import named_steps
+    from robocal_ros.tool.tables import read_joint_path, read_step_edges
 
     missing = [f"--{name}" for name in NEEDED if getattr(args, name) is None]
     if missing:

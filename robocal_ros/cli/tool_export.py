@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from robocal_ros.cli.arguments import positive
 from robocal_ros.cli.output import Document, Outcome
 from robocal_ros.cli.tool_frames import add_frame_options, given_frame, three_numbers
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from robocal_ros.core.tool.exports import Load
+    from robocal_ros.tool.exports import Load
 
 NAME = "export"
 HELP = "print a tool's frame for a controller, or for URDF"
@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.frame_texts import transform_document
-    from robocal_ros.core.tool.exports import exported
+    from robocal_ros.ground.frame_texts import transform_document
+    from robocal_ros.tool.exports import exported
 
     T_flange_tool = given_frame(args)
     if T_flange_tool is None:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> Outcome:
 
 
 def _load(args: argparse.Namespace) -> "Load | None":
-    from robocal_ros.core.tool.exports import Load
+    from robocal_ros.tool.exports import Load
 
     if args.mass_kg is None and args.cog_mm is None:
         return None

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.storage.files import quoted
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import quoted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,8 +60,8 @@ def given_frame(args: argparse.Namespace) -> "NDArray[np.float64] | None":
     """
     import numpy as np
 
-    from robocal_ros.core import frames
-    from robocal_ros.storage.tool_files import read_tool
+    from robocal_ros.ground import frames
+    from robocal_ros.tool.files import read_tool
 
     R = None if args.rpy_deg is None else frames.rotation_from_rpy(np.radians(args.rpy_deg))
     if args.tool is not None and args.xyz_mm is not None:

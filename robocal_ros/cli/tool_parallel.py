@@ -44,11 +44,11 @@ def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
     from math import isfinite
 
-    from robocal_ros.core.errors import InputError
-    from robocal_ros.core.tool.documents import parallel_document
-    from robocal_ros.core.tool.parallel_beams import ParallelBeams
-    from robocal_ros.core.tool.parallel_sweeps import fit_parallel
-    from robocal_ros.storage.tool_tables import read_sweeps
+    from robocal_ros.ground.errors import InputError
+    from robocal_ros.tool.documents import parallel_document
+    from robocal_ros.tool.parallel_beams import ParallelBeams
+    from robocal_ros.tool.parallel_sweeps import fit_parallel
+    from robocal_ros.tool.tables import read_sweeps
 
     if not all(map(isfinite, (args.up_mm, args.down_mm, args.x_mm or 0.0))):
         raise InputError("--up-mm, --down-mm and --x-mm must be finite numbers")

@@ -34,9 +34,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Outcome:
     """Do it. Raises `RobocalError` for what a user can mend."""
-    from robocal_ros.core.tool.documents import touch_document
-    from robocal_ros.core.tool.touch_points import fit_four, fit_seven
-    from robocal_ros.storage.tool_tables import read_flange_poses
+    from robocal_ros.tool.documents import touch_document
+    from robocal_ros.tool.tables import read_flange_poses
+    from robocal_ros.tool.touch_points import fit_four, fit_seven
 
     fit = {"four": fit_four, "seven": fit_seven}[args.method]
     sigma_m = None if args.sigma_mm is None else args.sigma_mm * 1e-3

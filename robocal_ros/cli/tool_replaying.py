@@ -3,17 +3,17 @@
 from collections.abc import Iterable
 from typing import Any
 
+from robocal_ros.bags.replay import ReplayReport
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
 from robocal_ros.cli.replay_parts import commanded_document, replay_commanded, seconds
-from robocal_ros.core.frame_texts import transform_document
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sessions.events import Outcome
-from robocal_ros.sessions.replay import ReplayReport
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_inputs import take_tool_message
-from robocal_ros.sessions.tool_recorded import tool_session_as_recorded
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.session.events import Outcome
+from robocal_ros.tool.inputs import take_tool_message
+from robocal_ros.tool.recorded import tool_session_as_recorded
+from robocal_ros.tool.session import ToolSession
 
 
 def replay_tool(

@@ -26,8 +26,8 @@ from robocal_ros.cli.output import (
     tell,
 )
 from robocal_ros.cli.warm_workers import warm_up
-from robocal_ros.core.codes import Code
-from robocal_ros.storage.files import write_text
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.files import write_text
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -156,12 +156,7 @@ def _keep_figures(folder: Path, name: str, result: "Validated") -> None:
 def _write(folder: Path, report: Document, html: str) -> None:
     import json
 
-    from robocal_ros.report.validation import (
-        bags_table,
-        cycles_table,
-        decisions_table,
-        hours_table,
-    )
+    from robocal_ros.report.validation import bags_table, cycles_table, decisions_table, hours_table
 
     bags = report["bags"]
     texts = {

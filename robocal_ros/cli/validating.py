@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.replay import EVENTS, first_configuration, read_events, topic_kind
 from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth, above, is_simulated
 from robocal_ros.cli.output import Document, refusal
 from robocal_ros.cli.recorded_robot import find_robot
@@ -24,19 +26,17 @@ from robocal_ros.cli.validating_parts import (
     tool_runs,
 )
 from robocal_ros.cli.validating_thermal import Forecasts, ThermalHistory
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.hand_eye.recorded import is_hand_eye_session
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.report.validation_figures import Drawn, cell_drawn, thermal_figures, tool_figures
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.hand_eye_recorded import is_hand_eye_session
-from robocal_ros.sessions.replay import EVENTS, first_configuration, read_events, topic_kind
-from robocal_ros.sessions.seeding import is_thermal_session
-from robocal_ros.sessions.thermal_config import ThermalConfig
-from robocal_ros.sessions.tool_recorded import is_tool_session
-from robocal_ros.storage.bags import BagMessage, BagReader
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.seeding import is_thermal_session
+from robocal_ros.tool.recorded import is_tool_session
 
 _SESSIONS = (is_thermal_session, is_tool_session, is_hand_eye_session)
 ROUTINE = (events.START, events.CAPTURE, events.SAMPLE, events.TOOL_STEP, events.STEP_BEGINS)

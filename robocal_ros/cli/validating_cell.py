@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.replay import topic_kind
+from robocal_ros.cell_sim.cell_faults import SIZES
 from robocal_ros.cli.bag_truth import BagTruth, ToldStates, above, finite
 from robocal_ros.report.validation_cell import CellCourse
-from robocal_ros.sessions.replay import topic_kind
-from robocal_ros.sim.cell_faults import SIZES
-from robocal_ros.storage.bags import BagReader
 
 Array = NDArray[np.float64]
 

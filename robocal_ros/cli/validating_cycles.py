@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.validating_thermal import CycleErrors, ReplayedCycle
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.report.drift import TOLERANCE_MM, ShiftErrors
 
 Array = NDArray[np.float64]

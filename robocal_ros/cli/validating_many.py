@@ -11,7 +11,7 @@ from typing import Any
 from robocal_ros.cli.output import crash
 from robocal_ros.cli.validating import Job, Validated, validate_bag
 from robocal_ros.cli.warm_workers import METHOD
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 PATIENCE_S = 10  # with a cluster
 Numbered = tuple[int, Validated]

@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from robocal_ros.bags.bags import BagMessage
 from robocal_ros.cli.bag_truth import CheckPoints
 from robocal_ros.cli.output import Document
 from robocal_ros.cli.recording import Recording
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.documents import arm_of
-from robocal_ros.core.proposals import THERMAL, Action, Entry
-from robocal_ros.core.samples import MEASURING, Measurements, stamp_ns
-from robocal_ros.core.thermal.achieved import measured_errors, true_errors
-from robocal_ros.core.thermal.reference import ColdReference, holds_drift, reference_of
+from robocal_ros.ground.proposals import THERMAL, Action, Entry
+from robocal_ros.ground.samples import MEASURING, Measurements, stamp_ns
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import arm_of
 from robocal_ros.report.drift import figures_of
-from robocal_ros.sessions.in_force import REFERENCE
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.storage.bags import BagMessage
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.thermal.achieved import measured_errors, true_errors
+from robocal_ros.thermal.in_force import REFERENCE
+from robocal_ros.thermal.reference import ColdReference, holds_drift, reference_of
+from robocal_ros.thermal.session import ThermalSession
 
 Array = NDArray[np.float64]
 EVERYTHING = 1_000_000

@@ -9,9 +9,9 @@ _CODE = [
     "distributed.worker",
     "robocal_ros.cli.validating",
     # what a bag needs in the course of things
-    "robocal_ros.core.kinematics.kernels",
-    "robocal_ros.core.mcap_records",
-    "robocal_ros.core.serialized_joints",
+    "robocal_ros.kinematics.kernels",
+    "robocal_ros.ground.mcap_records",
+    "robocal_ros.ground.serialized_joints",
     "matplotlib.backends.backend_agg",
     "matplotlib.backends.backend_svg",
     "scipy.special",

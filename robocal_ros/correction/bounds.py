@@ -6,11 +6,11 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection
 from robocal_ros.correction.limiter import SLIDING, TURNING, OffsetLimits
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.staged import StagedResult
+from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 

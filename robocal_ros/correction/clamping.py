@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import FADES_FROM, CorrectionConfig, Policy
 from robocal_ros.correction.rates import MOST_STEPS, STEP_AHEAD_S, VELOCITY_EXACT
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.staged import StagedCorrection, StagedResult
+from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.samples import stamp_ns
 from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import stamp_ns
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -41,11 +41,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import solution
 from robocal_ros.correction.rates import RATE_STEP_S, STEP_AHEAD_S
 from robocal_ros.correction.room import work_size
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 

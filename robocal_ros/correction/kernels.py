@@ -9,8 +9,8 @@ A free axis is the tool's z: a turn about it is left out of the residual and of 
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
-from robocal_ros.core.kinematics import newton
+from robocal_ros.ground.compiled import lean
+from robocal_ros.kinematics import newton
 
 Array = NDArray[np.float64]
 

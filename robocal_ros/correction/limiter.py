@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel, lean
+from robocal_ros.ground.compiled import kernel, lean
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,6 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import InputError
 from robocal_ros.correction.inputs import (
     Array,
     JointCommand,
@@ -25,7 +24,8 @@ from robocal_ros.correction.inputs import (
     trajectory_command,
 )
 from robocal_ros.correction.wire import JointWire, SerializedPath, read_path
-from robocal_ros.nodes.conversions import header
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ros.conversions import header
 
 POINT_FIELDS = ("positions", "velocities", "accelerations", "effort")
 POSITIONS, VELOCITIES, ACCELERATIONS, EFFORTS = FIELDS = range(4)

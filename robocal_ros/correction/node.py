@@ -15,8 +15,6 @@ from std_msgs.msg import Float64, Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import stamp_ns
 from robocal_ros.correction.action import TrajectoryProxy
 from robocal_ros.correction.graph import (
     CommandSources,
@@ -26,12 +24,7 @@ from robocal_ros.correction.graph import (
     Leases,
 )
 from robocal_ros.correction.inputs import TrajectoryCommand, offered_model, offered_tool
-from robocal_ros.correction.messages import (
-    ArrayMessage,
-    JointMessage,
-    PathMessage,
-    tail_message,
-)
+from robocal_ros.correction.messages import ArrayMessage, JointMessage, PathMessage, tail_message
 from robocal_ros.correction.output import SentPath
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.report import LOOK_S, CorrectionReport
@@ -46,15 +39,17 @@ from robocal_ros.correction.settings import (
 )
 from robocal_ros.correction.status import CorrectionState
 from robocal_ros.correction.wire import JointWire
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
+from robocal_ros.motion.source_guard import SourceGuard
 from robocal_ros.motion.speed_scaling import SpeedScaling
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import NO_SERIAL, POLL_S, HouseNode
-from robocal_ros.nodes.diagnostics import Health
-from robocal_ros.nodes.endpoints import trigger_text
-from robocal_ros.nodes.run import run
-from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.ros import qos
+from robocal_ros.ros.base import NO_SERIAL, POLL_S, HouseNode
+from robocal_ros.ros.diagnostics import Health
+from robocal_ros.ros.endpoints import trigger_text
+from robocal_ros.ros.run import run
 
 Array = NDArray[np.float64]
 

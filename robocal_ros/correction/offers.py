@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import ROUNDING, CorrectionConfig, Survey, survey
 from robocal_ros.correction.inputs import Array, OfferedModel, OfferedTool
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.refusals import Reason, RefusedError
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
 
 
 class CorrectionGate:

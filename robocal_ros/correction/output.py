@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import Array, Index
 from robocal_ros.correction.limiter import (
@@ -23,6 +22,7 @@ from robocal_ros.correction.limiter import (
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RESPONSE_S, TRACK_S, RobotState
 from robocal_ros.correction.staged import StagedCorrection
+from robocal_ros.kinematics import SerialArm
 
 
 @dataclass

@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
-from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction.room import Room, room_in
 from robocal_ros.correction.solution import CONVERGED, TCP_ROTATION, TCP_SHIFT, correct_staged
+from robocal_ros.ground.compiled import lean
+from robocal_ros.kinematics import newton
+from robocal_ros.kinematics.kernels import walk
 
 Array = NDArray[np.float64]
 

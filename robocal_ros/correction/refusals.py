@@ -2,8 +2,8 @@
 
 from enum import StrEnum
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
 
 
 class Reason(StrEnum):

@@ -15,19 +15,19 @@ from robocal_msgs.msg import CorrectionStatus as StatusMessage
 from robocal_msgs.msg import JointOffset
 
 from robocal_ros import __version__
-from robocal_ros.core import frames
-from robocal_ros.core.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.messages import doubles
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.session import CorrectionSession
 from robocal_ros.correction.settings import NOMINAL as NOMINAL_CHOICE
 from robocal_ros.correction.status import CorrectionStatus
-from robocal_ros.nodes.base import NO_SERIAL
-from robocal_ros.nodes.conversions import header, transform_message
-from robocal_ros.nodes.diagnostics import ERROR, WARN, Health
-from robocal_ros.nodes.history_settings import acknowledge_history, history_notice, open_history
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.history.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.ros.base import NO_SERIAL
+from robocal_ros.ros.conversions import header, transform_message
+from robocal_ros.ros.diagnostics import ERROR, WARN, Health
+from robocal_ros.ros.history_settings import acknowledge_history, history_notice, open_history
 
 TELL_S = 1.0  # the status goes out at least so often
 LOOK_S = 0.1  # between two looks at what has changed

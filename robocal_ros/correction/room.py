@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
-from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import turns_size
 from robocal_ros.correction import straight
 from robocal_ros.correction import straight_kinematics as six
+from robocal_ros.ground.compiled import lean
+from robocal_ros.kinematics import newton
+from robocal_ros.kinematics.kernels import turns_size
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,6 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.correction import limiter, staged, wire
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.desired import DesiredOffset
@@ -36,6 +34,8 @@ from robocal_ros.correction.status import CorrectionStatus, Offset
 from robocal_ros.correction.stepping import LARGEST, REDUCED, REMAINING, SHIFT
 from robocal_ros.correction.streams import Phase, TargetStream
 from robocal_ros.correction.trajectories import SETTLED, TrajectoryCorrector, require_times
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
+from robocal_ros.kinematics import SerialArm
 
 Answer = TypeVar("Answer")
 

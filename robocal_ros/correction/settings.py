@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig, Policy, ShiftBounds
 from robocal_ros.correction.limiter import OffsetLimits
-from robocal_ros.nodes.base import NO_SERIAL
-from robocal_ros.nodes.history_settings import STATE_DIR
-from robocal_ros.nodes.parameters import Setting
-from robocal_ros.storage.robots import (
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import (
     FULL_SPEED_IN_S,
     load_description,
     load_robot,
     robot_file_hash,
 )
+from robocal_ros.ros.base import NO_SERIAL
+from robocal_ros.ros.history_settings import STATE_DIR
+from robocal_ros.ros.parameters import Setting
 
 Array = NDArray[np.float64]
 

@@ -8,13 +8,13 @@ is that of `room`, with settled models. Equations: see `joint_correction`.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
-from robocal_ros.core.kinematics import newton
-from robocal_ros.core.kinematics.kernels import walk
 from robocal_ros.correction import kernels as k
 from robocal_ros.correction import straight, straight_damped
 from robocal_ros.correction import straight_kinematics as six
 from robocal_ros.correction.room import IS_STRAIGHT, PER_ERROR, STEEPNESS, Room, room_in, settle
+from robocal_ros.ground.compiled import lean
+from robocal_ros.kinematics import newton
+from robocal_ros.kinematics.kernels import walk
 
 Array = NDArray[np.float64]
 

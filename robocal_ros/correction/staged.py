@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import rates, solution, stepping
 from robocal_ros.correction.joint_correction import (
     DRIFT_SLOPE,
@@ -21,6 +20,7 @@ from robocal_ros.correction.joint_correction import (
     path_rates,
     plain,
 )
+from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 

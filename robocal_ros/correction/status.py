@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
-from robocal_ros.core.proposals import Head
 from robocal_ros.correction.inputs import Array
 from robocal_ros.correction.refusals import Reason
+from robocal_ros.ground.proposals import Head
 
 if TYPE_CHECKING:  # who hears a status needs no compiled code
     from robocal_ros.correction.bounds import Policy, Survey

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import lean
 from robocal_ros.correction.limiter import (
     DESIRED,
     OFFSET,
@@ -17,6 +16,7 @@ from robocal_ros.correction.limiter import (
 )
 from robocal_ros.correction.rates import velocity_by_chain, velocity_by_differences, within
 from robocal_ros.correction.solution import POSITION_ERROR, TCP_SHIFT, WEAK, correct_staged
+from robocal_ros.ground.compiled import lean
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,6 @@ that it needs more steps) a point is left to `straight_damped`.
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel, lean
-from robocal_ros.core.kinematics.sines import LARGEST_ANGLE
 from robocal_ros.correction.kernels import WEIGHT, WINDOW, lambda_square
 from robocal_ros.correction.straight_kinematics import (
     ACTUAL,
@@ -25,6 +23,8 @@ from robocal_ros.correction.straight_kinematics import (
     residual,
     walk,
 )
+from robocal_ros.ground.compiled import kernel, lean
+from robocal_ros.kinematics.sines import LARGEST_ANGLE
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,6 @@ eigenvectors come of so many rotations each. What that does not solve is left to
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.compiled import kernel, lean
 from robocal_ros.correction.kernels import WINDOW, lambda_square
 from robocal_ros.correction.straight import (
     AT_GOAL,
@@ -34,6 +33,7 @@ from robocal_ros.correction.straight_kinematics import (
     residual,
     walk,
 )
+from robocal_ros.ground.compiled import kernel, lean
 
 Array = NDArray[np.float64]
 Three = tuple[float, float, float]

@@ -8,8 +8,6 @@ from itertools import accumulate
 
 import numpy as np
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.clamping import ClampedCorrection
 from robocal_ros.correction.desired import DesiredOffset
@@ -26,6 +24,8 @@ from robocal_ros.correction.output import Output, hold_speeds
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.stepping import ADDS, TOO_FAST
+from robocal_ros.ground.samples import CORRECTED
+from robocal_ros.kinematics import SerialArm
 
 CATCH_UP_S = 0.1  # what came in may be so far ahead, at the joints' speeds; more is not followed
 HELD_PERIODS = 2.0  # after so long the controller holds the last output, and the robot stands

@@ -5,8 +5,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import CorrectionConfig, require_limits
 from robocal_ros.correction.desired import DesiredOffset
 from robocal_ros.correction.inputs import (
@@ -31,6 +29,8 @@ from robocal_ros.correction.output import Output, SentPath, hold_speeds, spline,
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.robot_state import RobotState
 from robocal_ros.correction.staged import StagedResult
+from robocal_ros.ground.samples import CORRECTED
+from robocal_ros.kinematics import SerialArm
 
 # A cubic from rest to rest is so many times faster than its mean (a quintic: 1.875).
 SPLINE_PEAK = 1.875

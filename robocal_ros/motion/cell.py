@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.inverse import follow, require_within_limits
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.inverse import follow, require_within_limits
 from robocal_ros.motion.housing import Housing, ToolBody
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan

@@ -21,15 +21,15 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.plan import REACTION_S, JointPlan
 from robocal_ros.motion.robot_watch import MotionReport, RobotWatch
 from robocal_ros.motion.settings import trajectory_message
 from robocal_ros.motion.speed_scaling import SpeedScaling
-from robocal_ros.nodes import conversions, qos
-from robocal_ros.nodes.endpoints import EndpointNode
-from robocal_ros.nodes.parameters import Setting
+from robocal_ros.ros import conversions, qos
+from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.parameters import Setting
 
 CONTROLLER = (
     Setting(

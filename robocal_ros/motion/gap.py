@@ -4,7 +4,7 @@ import secrets
 
 import numpy as np
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 LONGEST_GAP_S = 86_400.0
 STALL_S = 0.1  # between two looks: more is a pause of the own process

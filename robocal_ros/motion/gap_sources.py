@@ -7,9 +7,9 @@ from rclpy.qos import ReliabilityPolicy
 from robocal_msgs.msg import GapOpen
 from std_msgs.msg import Bool
 
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.endpoints import EndpointNode
-from robocal_ros.nodes.parameters import Setting
+from robocal_ros.ros import qos
+from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.parameters import Setting
 
 GAP_OPEN = "gap_open"
 STATUS = "maintenance_node/status"

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 
 Array = NDArray[np.float64]
 

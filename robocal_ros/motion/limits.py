@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.ground.errors import InputError
+from robocal_ros.kinematics import SerialArm
 
 Array = NDArray[np.float64]
 # How far from where a step begins each joint may stand.

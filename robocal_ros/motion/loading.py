@@ -5,9 +5,9 @@ from contextlib import suppress
 
 import numpy as np
 
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.inverse import inverse
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.stopping import stop
 

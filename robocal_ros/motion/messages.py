@@ -17,9 +17,9 @@ from builtin_interfaces.msg import Duration, Time
 from numpy.typing import ArrayLike, NDArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.samples import stamp_ns
+from robocal_ros.ground.samples import stamp_ns
 from robocal_ros.motion.plan import LEAD_S, REACTION_S, JointPlan
-from robocal_ros.nodes.conversions import NS
+from robocal_ros.ros.conversions import NS
 
 Array = NDArray[np.float64]
 

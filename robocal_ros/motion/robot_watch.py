@@ -8,8 +8,8 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.limits import start_near

@@ -9,15 +9,15 @@ from control_msgs.msg import JointTolerance
 from numpy.typing import NDArray
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.ground.errors import InputError
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.messages import joint_trajectory
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import UNSAID_S
-from robocal_ros.nodes.parameters import Setting, length
+from robocal_ros.ros.parameters import Setting, length
 
 NS = 1_000_000_000
 GOAL_TIME_S = 12  # the nodes wait less for a robot that does not come to rest where a motion ends

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.ground.errors import InputError
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
+from robocal_ros.ground import frames
 from robocal_ros.motion.timing import Ride
 
 Array = NDArray[np.float64]

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.kinematics.inverse import require_within_limits
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics.inverse import require_within_limits
 from robocal_ros.motion import tip_path
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.plan import JointPlan, joined

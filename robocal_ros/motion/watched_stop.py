@@ -7,7 +7,7 @@ decelerates from where it is.
 
 import numpy as np
 
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.kinematics import SerialArm
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import REST_RAD, VELOCITY_S, RobotWatch

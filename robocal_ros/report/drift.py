@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core.assessment import summarise
+from robocal_ros.estimation.assessment import summarise
 
 Array = NDArray[np.float64]
 

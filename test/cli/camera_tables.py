@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, moving_flange
-from robocal_ros.storage.hand_eye_tables import write_pose_table
+from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, moving_flange
+from robocal_ros.hand_eye.tables import write_pose_table
 
 NOISE = BoardNoise(1e-4, 2e-4, (2e-4, 2e-4, 2e-4), (5e-4, 5e-4, 5e-4))
 CELL = BoardCell(noise=NOISE)

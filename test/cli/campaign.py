@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.robots import load_robot
-from robocal_ros.storage.tables import write_measurements
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.tables import write_measurements
 
 ROBOT = "kr150_r3100"
 NOISE_M = 5e-5

@@ -7,16 +7,16 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "sessions"))  # for hand_eye_
 
 from hand_eye_driver import ARM, FRAME, START_NS, TYPE, Driver, Recorded
 
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_recorded import configuration
-from robocal_ros.sessions.records import arguments_text, outcome_text
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.recorded import configuration
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.records import arguments_text, outcome_text
 
 EVENTS = "/hand_eye_node/session_events"
 

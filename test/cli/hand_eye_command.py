@@ -11,7 +11,7 @@ from command import conforms
 from hand_eye_tables import TRUE
 
 from robocal_ros.cli.main import main
-from robocal_ros.core import frames
+from robocal_ros.ground import frames
 
 
 def robocal(action: str, *words: object, status: int = 0) -> Any:

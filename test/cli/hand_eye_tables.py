@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
-from robocal_ros.sim.hand_eye_sets import (
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_sets import (
     TrueStairs,
     edge_shots,
     groove_shots,
     sphere_shots,
     step_shots,
 )
-from robocal_ros.storage.hand_eye_tables import write_shots
-from robocal_ros.storage.hand_eye_targets import Target, write_target
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.tables import write_shots
+from robocal_ros.hand_eye.target_files import Target, write_target
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
 
 Array = NDArray[np.float64]
 

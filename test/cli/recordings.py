@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 from campaign import NOISE_M, POINTS, ROBOT, postures, true_arm
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import JointSample, PointSample
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.records import arguments_text, outcome_text
-from robocal_ros.sessions.seeding import configuration
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import JointSample, PointSample
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.session.records import arguments_text, outcome_text
+from robocal_ros.thermal.seeding import configuration
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 NS = 1_000_000_000
 START_NS = 1_700_000_000 * NS

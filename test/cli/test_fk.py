@@ -9,8 +9,8 @@ import pytest
 from command import conforms
 
 from robocal_ros.cli.main import main
-from robocal_ros.core import frames
-from robocal_ros.storage.robots import load_robot, save_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_robot, save_robot
 
 
 def answer(command: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, Any]]:

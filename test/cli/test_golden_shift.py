@@ -13,13 +13,13 @@ from command import robocal_json
 
 from bench.closed_loop import setting
 from bench.closed_loop.shift import Incident, ShiftPlan, ShiftRecord, run_shift
-from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.sessions.replay import NOT_BITS
-from robocal_ros.storage.bags import BagReader, bag_info
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.bags.bags import BagReader, bag_info
+from robocal_ros.bags.replay import NOT_BITS
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import TOOL
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.tool.judging import KnownTool
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "golden_excerpt.mcap"

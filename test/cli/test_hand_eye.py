@@ -26,18 +26,18 @@ from hand_eye_tables import (
 )
 from scipy.stats import chi2
 
+from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, Shots, View, view
+from robocal_ros.cell_sim.hand_eye_sets import DOWN, sphere_shots
+from robocal_ros.cell_sim.profile_targets import ball_on_table
+from robocal_ros.cell_sim.ur10_station import Q_NEAR
 from robocal_ros.cli.main import main
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.targets import LineTarget
-from robocal_ros.sim.cell_plan import rigid_robot
-from robocal_ros.sim.hand_eye_cell import ArmRobot, Shots, View, view
-from robocal_ros.sim.hand_eye_sets import DOWN, sphere_shots
-from robocal_ros.sim.profile_targets import ball_on_table
-from robocal_ros.sim.ur10_station import Q_NEAR
-from robocal_ros.storage.hand_eye_files import read_flange_mount
-from robocal_ros.storage.hand_eye_tables import read_pose_table, write_pose_table
-from robocal_ros.storage.hand_eye_targets import write_target
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.files import read_flange_mount
+from robocal_ros.hand_eye.tables import read_pose_table, write_pose_table
+from robocal_ros.hand_eye.target_files import write_target
+from robocal_ros.hand_eye.targets import LineTarget
+from robocal_ros.kinematics.robots import load_robot
 
 FOLDERS = ("sphere", "step", "line", "groove")
 LEFT_HANDED = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, -1.0], *np.ones((2, 4))])

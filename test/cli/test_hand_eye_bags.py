@@ -11,14 +11,14 @@ import pytest
 from hand_eye_command import chi_square, pose_of, robocal, target
 from scipy.stats import chi2
 
+from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
+from robocal_ros.bags.hand_eye_bags import write_data_set
+from robocal_ros.bags.replay import replay
 from robocal_ros.cli.recording import open_recording
-from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
-from robocal_ros.sessions.hand_eye_recorded import hand_eye_session_as_recorded
-from robocal_ros.sessions.replay import replay
-from robocal_ros.storage.bags import BagMessage, BagReader, BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.hand_eye_bags import write_data_set
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.hand_eye.inputs import take_hand_eye_message
+from robocal_ros.hand_eye.recorded import hand_eye_session_as_recorded
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
 
 BAGS = Path(__file__).parents[2] / "bags"
 EVENTS = "/hand_eye_node/session_events"

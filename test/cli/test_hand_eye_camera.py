@@ -11,17 +11,17 @@ from command import conforms
 from scipy.spatial.transform import Rotation
 
 from bench import hand_eye_sets
+from robocal_ros.cell_sim.board_camera import TruePose
 from robocal_ros.cli.hand_eye_camera import METHODS
 from robocal_ros.cli.main import main
-from robocal_ros.core.hand_eye.camera import METHODS as CORE_METHODS
-from robocal_ros.core.hand_eye.camera_closed_forms import CLOSED_FORMS
-from robocal_ros.core.hand_eye.camera_fit import fit_pairs
-from robocal_ros.core.hand_eye.camera_quality import distances
-from robocal_ros.sim.board_camera import TruePose
-from robocal_ros.storage.cells import write_cells
-from robocal_ros.storage.hand_eye_tables import write_pose_table
-from robocal_ros.storage.robots import load_robot
-from robocal_ros.storage.tables import joint_texts
+from robocal_ros.ground.cells import write_cells
+from robocal_ros.hand_eye.camera import METHODS as CORE_METHODS
+from robocal_ros.hand_eye.camera_closed_forms import CLOSED_FORMS
+from robocal_ros.hand_eye.camera_fit import fit_pairs
+from robocal_ros.hand_eye.camera_quality import distances
+from robocal_ros.hand_eye.tables import write_pose_table
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.tables import joint_texts
 
 TRUTH_MM = CELL.camera.t[0] * 1e3
 FILES = (".csv", ".yaml")

@@ -13,10 +13,10 @@ import pytest
 from command import conforms, environment, robocal, robocal_json
 from jsonschema import ValidationError
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.correction_record import CorrectionRecord
-from robocal_ros.core.proposals import Proposal, State
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import Proposal, State
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.correction_record import CorrectionRecord
 
 SERIAL = "KR/7"
 STAMP_NS = 1_700_000_000_123_456_789

@@ -10,7 +10,7 @@ from campaign import NOISE_M, ROBOT, edited, measured, renamed, table, true_arm,
 from command import conforms, robocal, robocal_json
 
 from robocal_ros.cli.main import main
-from robocal_ros.storage.robots import load_description, load_robot
+from robocal_ros.kinematics.robots import load_description, load_robot
 
 
 @pytest.fixture(scope="module")
@@ -400,7 +400,7 @@ def test_no_table_crashes_it(data: Path, folder: Path, identify) -> None:
 
 
 def _predicted(arm, base, ball, q):
-    from robocal_ros.core import frames
+    from robocal_ros.ground import frames
 
     T = frames.transform_from_quat(np.array(base["xyz_mm"]) * 1e-3, np.array(base["quat_xyzw"]))
     point = np.append(np.array(ball["xyz_mm"]) * 1e-3, 1.0)

@@ -27,10 +27,10 @@ from recordings import (
     write_samples,
 )
 
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter, read_bag
 from robocal_ros.cli.main import main
-from robocal_ros.core.samples import JointSample
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter, read_bag
+from robocal_ros.ground.samples import JointSample
 
 
 @pytest.fixture(scope="module")

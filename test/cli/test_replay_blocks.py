@@ -6,8 +6,8 @@ import pytest
 
 from robocal_ros.cli.recording import Recording
 from robocal_ros.cli.replaying import Request, replay_bag
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
 
 BAGS = Path(__file__).parents[2] / "bags"
 

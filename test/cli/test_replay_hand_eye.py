@@ -10,9 +10,9 @@ from command import robocal, robocal_json
 from hand_eye_bag import hand_eye_bag
 from hand_eye_driver import FRAME, sphere_set
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.storage.bags import BagReader
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
 
 SCHEMA = "replay.hand_eye.json"
 

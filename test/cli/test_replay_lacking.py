@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from command import ROOT, robocal, robocal_json
 
-from robocal_ros.core.codes import Code
-from robocal_ros.sessions.events import IDENTIFY, Command
-from robocal_ros.sessions.replay import needed_inputs
-from robocal_ros.storage.bags import BagReader, BagWriter
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.bags.replay import needed_inputs
+from robocal_ros.ground.codes import Code
+from robocal_ros.session.events import IDENTIFY, Command
 
 BAGS = ROOT / "bags"
 EXCERPT = BAGS / "golden_excerpt.mcap"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command import robocal, robocal_json
 
-from robocal_ros.storage.bags import BagReader
+from robocal_ros.bags.bags import BagReader
 
 BAGS = Path(__file__).parents[2] / "bags"
 BAG = BAGS / "tool_runs.mcap"

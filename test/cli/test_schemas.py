@@ -15,10 +15,10 @@ from tool_runs import run_tables
 from tool_tables import tool_tables
 from tracker_files import SCAN, tracker_files
 
+from robocal_ros.cell_sim.tracker_cells import prp_cell
 from robocal_ros.cli.main import COMMANDS
-from robocal_ros.core.frame_texts import transform_document
-from robocal_ros.sim.tracker_cells import prp_cell
-from robocal_ros.storage.robots import load_description
+from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.kinematics.robots import load_description
 
 UR_NOMINAL = """[DH]
 a = [0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]

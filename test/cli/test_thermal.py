@@ -8,8 +8,8 @@ import yaml
 from command import robocal, robocal_json
 from drift_tables import ROBOT, SIGMA, fixed_tables, session
 
-from robocal_ros.core import frames
-from robocal_ros.sim import kr150
+from robocal_ros.cell_sim import kr150
+from robocal_ros.ground import frames
 
 
 @pytest.fixture(scope="module")

@@ -28,8 +28,8 @@ from tool_runs import (
 )
 from tool_tables import POINT_COLUMNS, touch_rows, write
 
+from robocal_ros.cell_sim.beam_calibration import CYLINDER_M
 from robocal_ros.cli.main import main
-from robocal_ros.sim.beam_calibration import CYLINDER_M
 
 CYLINDER_MM = 1e3 * CYLINDER_M
 TAUGHT = ("--taught-mm", ",".join(map(str, TAUGHT_MM)))
@@ -134,7 +134,7 @@ def test_a_found_tool_is_taught_again_and_exported(crossed, answer, tmp_path):
 
 def test_the_robot_files_tool_is_the_taught_one(crossed, tmp_path):
     """Without options: a robot whose file carries the tool finds the same one."""
-    from robocal_ros.storage.robots import find_robot
+    from robocal_ros.kinematics.robots import find_robot
 
     text = find_robot("ur10").read_text()
     assert "\ntool:" not in text

@@ -34,18 +34,18 @@ from recordings import (
     write_samples,
 )
 
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagWriter, read_bag
+from robocal_ros.bags.replay import NOT_BITS
 from robocal_ros.cli import validating_many
 from robocal_ros.cli.main import main
 from robocal_ros.cli.validating import Job
 from robocal_ros.cli.validating_many import validated
 from robocal_ros.cli.validating_parts import require_finite
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.records import arguments_text, outcome_text
-from robocal_ros.sessions.replay import NOT_BITS
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagWriter, read_bag
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.records import arguments_text, outcome_text
 
 TOOL_RUNS = ROOT / "bags/tool_runs.mcap"
 EXCERPT = ROOT / "bags/golden_excerpt.mcap"

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from robocal_ros.bags.bag_writer import BagWriter
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.bag_truth import HAND_EYE, TOOL, BagTruth
 from robocal_ros.cli.validating_cell import cell_courses
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 from robocal_ros.report.validation_cell import CellCourse
-from robocal_ros.storage.bag_writer import BagWriter
-from robocal_ros.storage.bags import BagReader
 
 NS = 1_000_000_000
 TOPIC = "/cell_sim_node/truth/state"

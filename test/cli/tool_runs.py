@@ -6,12 +6,9 @@ from pathlib import Path
 import numpy as np
 from tool_tables import write
 
-from robocal_ros.core import frames
-from robocal_ros.core.tool.crossed_model import BeamStep, RobotNoise
-from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
-from robocal_ros.sim.beam_moves import Sweep
-from robocal_ros.sim.beams import (
+from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
+from robocal_ros.cell_sim.beam_moves import Sweep
+from robocal_ros.cell_sim.beams import (
     BeamStation,
     RoundTool,
     TrueBeam,
@@ -21,9 +18,12 @@ from robocal_ros.sim.beams import (
     bent,
     crossings,
 )
-from robocal_ros.sim.tool_cell import MeasuredRun, ToolCell
-from robocal_ros.storage.laser_files import LaserFile, write_laser
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.tool_cell import MeasuredRun, ToolCell
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.tool.crossed_model import BeamStep, RobotNoise
+from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
 
 Q_NEAR = np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618])
 T_BASE_LASER = frames.transform(frames.exp_rotation([0.02, -0.04, 0.01]), [0.7994, -0.1263, 0.1945])

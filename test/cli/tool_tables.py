@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.sim.beam_moves import Circle
-from robocal_ros.sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.cell_sim.beam_moves import Circle
+from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.ground import frames
 
 PUBLISHED_MM = {  # thesis table 5-3
     "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),

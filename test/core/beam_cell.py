@@ -2,11 +2,18 @@
 
 import numpy as np
 
-from robocal_ros.core.tool.crossed_model import RobotNoise
-from robocal_ros.sim.beams import NO_NOISE, PERFECT, BeamStation, TrueInput, TrueNoise, beams_of
-from robocal_ros.sim.tool_cell import RunPlan, ToolCell
-from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, laser_of
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.beams import (
+    NO_NOISE,
+    PERFECT,
+    BeamStation,
+    TrueInput,
+    TrueNoise,
+    beams_of,
+)
+from robocal_ros.cell_sim.tool_cell import RunPlan, ToolCell
+from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, Q_NEAR, T_BASE_LASER, laser_of
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.tool.crossed_model import RobotNoise
 
 SILENT = RobotNoise(1e-7, 1e-7)
 

@@ -3,13 +3,11 @@
 import numpy as np
 from scipy.stats import chi2
 
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.board import (
-    Chessboard,
-)
-from robocal_ros.core.hand_eye.camera_fit import GivenNoise
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs
-from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
+from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.board import Chessboard
+from robocal_ros.hand_eye.camera_fit import GivenNoise
+from robocal_ros.hand_eye.pose_pairs import PosePairs
 
 MOUNTS = ("in-hand", "to-hand")
 EXACT = BoardNoise(0.0, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.identification import CellModel
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification import CellModel
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
 

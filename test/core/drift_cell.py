@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.identification.cell import CellModel
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.sim import kr150
+from robocal_ros.cell_sim import kr150
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell import CellModel
+from robocal_ros.kinematics import SerialArm
 
 SIGMA = 3e-5
 

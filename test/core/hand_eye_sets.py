@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.hand_eye.profile import profile_of
-from robocal_ros.core.hand_eye.result import HandEyeResult, increment
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.core.hand_eye.tasks import HandEyeData
-from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
-from robocal_ros.sim.hand_eye_sets import TrueStairs
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_sets import TrueStairs
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.hand_eye.profile import profile_of
+from robocal_ros.hand_eye.result import HandEyeResult, increment
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.hand_eye.tasks import HandEyeData
 
 POSE_M = 1e-4 / np.sqrt(3.0)  # along each axis: 0.1 mm in space
 CELL = HandEyeCell(robot=PoseRobot(POSE_M))

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.tool.measuring_plan import PlannedStep
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import Housing, ToolBody
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.tool.measuring_plan import PlannedStep
 
 POSTURES = {
     "ur10": np.array([0.047, -2.208, -1.248, 1.885, -1.571, 1.618]),

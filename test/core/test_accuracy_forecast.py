@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, postures, visit
 
-from robocal_ros.core.identification.solve import random_postures
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.accuracy import HORIZON_S, AccuracyForecast, Work
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process import DriftProcess
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.core.thermal.tracking import DriftTracker
-from robocal_ros.sim import kr150
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.identification.solve import random_postures
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.accuracy import HORIZON_S, AccuracyForecast, Work
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.process import DriftProcess
+from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.tracking import DriftTracker
 
 
 @pytest.fixture(scope="module")

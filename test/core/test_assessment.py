@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core.assessment import (
+from robocal_ros.estimation.assessment import (
     FEWEST_GROUPS,
     LARGEST_RMS_M,
     SIGNIFICANCE,
@@ -16,8 +16,8 @@ from robocal_ros.core.assessment import (
     summarise,
     too_narrow,
 )
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import TooFewSamplesError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import TooFewSamplesError
 
 
 def apart(count: int) -> np.ndarray:

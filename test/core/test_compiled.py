@@ -12,14 +12,14 @@ from typing import Any
 import pytest
 
 PACKAGE = Path(__file__).parents[2] / "robocal_ros"
-CORE = "robocal_ros.core.compiled"
+CORE = "robocal_ros.ground.compiled"
 KERNELS = sorted(
     path for path in PACKAGE.rglob("*.py") if f"from {CORE} import" in path.read_text()
 )
 
 WALK = """
 import numpy as np
-from robocal_ros.core.kinematics.kernels import walk
+from robocal_ros.kinematics.kernels import walk
 T = np.empty((4, 4))
 links = np.array([[0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0]])
 walk(np.array([0.5]), links, np.eye(4), np.empty(24), np.empty((1, 2, 3)), T)
@@ -122,7 +122,7 @@ with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     import numpy as np
     from robocal_ros.core import compiled
-    from robocal_ros.core.kinematics.newton import copy
+    from robocal_ros.kinematics.newton import copy
     cold = compiled.is_cold()
     out = np.empty((2, 3))
     copy(np.ones((2, 3)), out)

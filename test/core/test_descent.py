@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from robocal_ros.core.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent
-from robocal_ros.core.loss import Run
+from robocal_ros.estimation.descent import FIRST_TOLERANCE, STEP_TOLERANCE, Descent
+from robocal_ros.estimation.loss import Run
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.cycle_verdict import judge_cycle
-from robocal_ros.core.thermal.identification import identify_cycle, identify_subset
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.cycle_verdict import judge_cycle
+from robocal_ros.thermal.identification import identify_cycle, identify_subset
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.spots import ColdSpots
 
 
 @pytest.fixture(scope="module")

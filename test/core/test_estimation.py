@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.descent import chi2_quantile
-from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
-from robocal_ros.core.estimation import solve
-from robocal_ros.core.observability import describe, observability
+from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.estimation.estimation import solve
+from robocal_ros.estimation.observability import describe, observability
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
 
 TRUTH = frames.exp_rotation([0.4, -0.7, 1.1])
 START = frames.exp_rotation([0.1, -0.2, 0.3])

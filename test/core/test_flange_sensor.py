@@ -5,22 +5,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.flange_identification import (
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.flange_identification import (
     identify_and_judge_flange_sensor,
     identify_flange_sensor,
 )
-from robocal_ros.core.thermal.flange_sensor import (
+from robocal_ros.thermal.flange_sensor import (
     FlangeSensorProblem,
     MeasuringRobot,
     hand_eye_start,
     in_sessions,
 )
-from robocal_ros.storage.robots import load_robot
 
 SIGMA = 3e-5
 T_FLANGE_SENSOR = frames.transform(frames.exp_rotation([0.1, -0.4, 0.8]), [0.08, -0.05, 0.22])

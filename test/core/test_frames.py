@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core import frames
+from robocal_ros.ground import frames
 
 seeds = st.integers(0, 2**31)
 angles = st.one_of(st.floats(0.0, np.pi - 1e-3), st.floats(0.0, 1e-3), st.sampled_from([0.0, 1e-9]))

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from camera_pairs import MOUNTS, measured
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
-from robocal_ros.core.hand_eye.camera_closed_forms import (
-    closed_form,
-)
+from robocal_ros.ground.codes import Code
+from robocal_ros.hand_eye.camera import CameraSettings, CheckPairs, calibrate_camera
+from robocal_ros.hand_eye.camera_closed_forms import closed_form
 
 
 def test_classic_is_a_closed_form_alone() -> None:

@@ -7,12 +7,9 @@ import pytest
 from camera_pairs import BOARD, LENS, error, sound
 from scipy.stats import chi2
 
-from robocal_ros.core.errors import (
-    InputError,
-    RankDeficientError,
-    TooFewSamplesError,
-)
-from robocal_ros.core.hand_eye.board import (
+from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.hand_eye.board import (
     Chessboard,
     Intrinsics,
     boards_of_corners,
@@ -20,10 +17,9 @@ from robocal_ros.core.hand_eye.board import (
     find_corners,
     see_boards,
 )
-from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
-from robocal_ros.core.hand_eye.camera_fit import GivenNoise, fit_pairs
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs
-from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens
+from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera_fit import GivenNoise, fit_pairs
+from robocal_ros.hand_eye.pose_pairs import PosePairs
 
 
 def pixels(cell: BoardCell, count: int, seed: int, noise_px: float = 0.2):

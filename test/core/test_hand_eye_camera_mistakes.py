@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from camera_pairs import EXACT, KNOWN, MOUNTS, error, measured
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import (
+from robocal_ros.cell_sim.board_camera import BoardCell, TruePose
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import (
     InputError,
     RankDeficientError,
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.core.hand_eye.camera import CameraSettings, calibrate_camera
-from robocal_ros.core.hand_eye.camera_fit import fit_pairs
-from robocal_ros.core.hand_eye.camera_model import PairState, linearised
-from robocal_ros.core.hand_eye.camera_quality import left_out, unsettled
-from robocal_ros.core.hand_eye.pose_pairs import PosePairs
-from robocal_ros.sim.board_camera import BoardCell, TruePose
+from robocal_ros.hand_eye.camera import CameraSettings, calibrate_camera
+from robocal_ros.hand_eye.camera_fit import fit_pairs
+from robocal_ros.hand_eye.camera_model import PairState, linearised
+from robocal_ros.hand_eye.camera_quality import left_out, unsettled
+from robocal_ros.hand_eye.pose_pairs import PosePairs
 
 
 def scaled(T: np.ndarray, factor: float) -> np.ndarray:

@@ -7,22 +7,16 @@ import numpy as np
 import pytest
 from hand_eye_sets import CELL, CENTRE, POSE_M, RADIUS_M, T_BASE_USER, stairs_target
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.mount_fit import SETTLED, fit_mount
-from robocal_ros.core.hand_eye.mount_problem import (
-    MountProblem,
-    MountState,
-    PoseNoise,
-    View,
-    pivot_of,
-)
-from robocal_ros.core.hand_eye.quality import HandEyeSettings, judge
-from robocal_ros.core.hand_eye.restricted_noise import RestrictedLikelihood
-from robocal_ros.core.hand_eye.result import increment
-from robocal_ros.core.hand_eye.sightings import Sightings
-from robocal_ros.core.hand_eye.step_task import StepTask
-from robocal_ros.core.hand_eye.target_models import LineModel, SphereModel
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.hand_eye.mount_fit import SETTLED, fit_mount
+from robocal_ros.hand_eye.mount_problem import MountProblem, MountState, PoseNoise, View, pivot_of
+from robocal_ros.hand_eye.quality import HandEyeSettings, judge
+from robocal_ros.hand_eye.restricted_noise import RestrictedLikelihood
+from robocal_ros.hand_eye.result import increment
+from robocal_ros.hand_eye.sightings import Sightings
+from robocal_ros.hand_eye.step_task import StepTask
+from robocal_ros.hand_eye.target_models import LineModel, SphereModel
 
 X = CELL.T_flange_sensor
 FEATURE_M = 5e-6

@@ -15,18 +15,18 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.mount_problem import PoseNoise
-from robocal_ros.core.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
-from robocal_ros.core.hand_eye.planning import SensorRange, check_plan
-from robocal_ros.core.hand_eye.quality import HandEyeSettings, apart, expected_error_m
-from robocal_ros.core.hand_eye.result import at_origin
-from robocal_ros.core.hand_eye.solve import solve_sphere
-from robocal_ros.core.hand_eye.targets import SphereTarget, Staircase, StepTarget
-from robocal_ros.sim.hand_eye_cell import Shots
-from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
-from robocal_ros.sim.profile_targets import ball_on_table
+from robocal_ros.cell_sim.hand_eye_cell import Shots
+from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, sphere_shots, step_shots
+from robocal_ros.cell_sim.profile_targets import ball_on_table
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.hand_eye.mount_problem import PoseNoise
+from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+from robocal_ros.hand_eye.planning import SensorRange, check_plan
+from robocal_ros.hand_eye.quality import HandEyeSettings, apart, expected_error_m
+from robocal_ros.hand_eye.result import at_origin
+from robocal_ros.hand_eye.solve import solve_sphere
+from robocal_ros.hand_eye.targets import SphereTarget, Staircase, StepTarget
 
 SENSOR = SensorRange(width_m=0.09)
 NOISE = PoseNoise(POSE_M, 1e-6, 1e-4)

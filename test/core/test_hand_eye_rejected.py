@@ -1,6 +1,6 @@
 """Names of rejected samples: corners one by one, or a whole shot."""
 
-from robocal_ros.core.hand_eye.result import by_shot
+from robocal_ros.hand_eye.result import by_shot
 
 
 def test_a_single_corner_keeps_its_name():

@@ -18,34 +18,34 @@ from hand_eye_sets import (
     stairs_target,
 )
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import (
-    InputError,
-    RankDeficientError,
-    ResidualError,
-    RobocalError,
-    TooFewSamplesError,
-)
-from robocal_ros.core.fitting.edge import EdgeRule
-from robocal_ros.core.hand_eye.joint import solve_joint
-from robocal_ros.core.hand_eye.profile import profile_of
-from robocal_ros.core.hand_eye.quality import HandEyeSettings
-from robocal_ros.core.hand_eye.result import hand_eye_document, point_covariance
-from robocal_ros.core.hand_eye.solve import solve_line, solve_sphere, solve_step
-from robocal_ros.core.hand_eye.targets import SphereTarget
-from robocal_ros.core.hand_eye.tasks import HandEyeData, LineTask, SphereTask
-from robocal_ros.core.hand_eye.verification import held_out, verify
-from robocal_ros.sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
-from robocal_ros.sim.hand_eye_sets import (
+from robocal_ros.cell_sim.hand_eye_cell import HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_sets import (
     edge_block,
     edge_shots,
     groove_shots,
     sphere_shots,
     step_shots,
 )
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.profile_targets import Scene, ball_on_table
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.profile_targets import Scene, ball_on_table
+from robocal_ros.estimation.edge import EdgeRule
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import (
+    InputError,
+    RankDeficientError,
+    ResidualError,
+    RobocalError,
+    TooFewSamplesError,
+)
+from robocal_ros.hand_eye.joint import solve_joint
+from robocal_ros.hand_eye.profile import profile_of
+from robocal_ros.hand_eye.quality import HandEyeSettings
+from robocal_ros.hand_eye.result import hand_eye_document, point_covariance
+from robocal_ros.hand_eye.solve import solve_line, solve_sphere, solve_step
+from robocal_ros.hand_eye.targets import SphereTarget
+from robocal_ros.hand_eye.tasks import HandEyeData, LineTask, SphereTask
+from robocal_ros.hand_eye.verification import held_out, verify
 
 SETTINGS = HandEyeSettings()
 TRUE = CELL.T_flange_sensor
@@ -336,7 +336,7 @@ class TestVerify:
         assert seen.verdict.accept
 
     def test_a_place_that_was_not_reached_blames_no_mount(self, result, monkeypatch):
-        monkeypatch.setattr("robocal_ros.core.descent.MOST_ITERATIONS", 1)
+        monkeypatch.setattr("robocal_ros.estimation.descent.MOST_ITERATIONS", 1)
         edge = data_of(edge_shots(CELL, T_BASE_USER, 12, np.random.default_rng(6)))
         with pytest.raises(RankDeficientError, match="still crept"):
             verify(LineTask(None, EdgeRule()), edge, result.T_flange_sensor, SETTINGS)

@@ -7,11 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.hand_eye.camera import CameraSettings
-from robocal_ros.core.hand_eye.camera_fit import GivenNoise, correlation
-from robocal_ros.core.hand_eye.streams import (
+from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, moving_flange
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.hand_eye.camera import CameraSettings
+from robocal_ros.hand_eye.camera_fit import GivenNoise, correlation
+from robocal_ros.hand_eye.streams import (
     PoseStream,
     calibrate_streams,
     coarse_offset,
@@ -19,7 +20,6 @@ from robocal_ros.core.hand_eye.streams import (
     pairs_at,
     stream_of,
 )
-from robocal_ros.sim.board_camera import BoardCell, BoardNoise, moving_flange
 
 MOUNTS = ("in-hand", "to-hand")
 NOISE = BoardNoise(1e-4, 2e-4, (4e-4, 4e-4, 4e-4), (1e-3, 1e-3, 1e-3))

@@ -6,10 +6,10 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.target_documents import target_document, target_of
-from robocal_ros.core.hand_eye.targets import (
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.hand_eye.target_documents import target_document, target_of
+from robocal_ros.hand_eye.targets import (
     BoardTarget,
     LineTarget,
     SphereTarget,

@@ -6,28 +6,28 @@ from functools import cache
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import (
+from robocal_ros.cell_sim.laser_tracker import TrackerCell
+from robocal_ros.cell_sim.profile_targets import Prism, Stem
+from robocal_ros.cell_sim.tracker_cells import prp_cell, six_axis_cell
+from robocal_ros.cell_sim.ur10_station import Q_NEAR
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import (
     InputError,
     RankDeficientError,
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.core.hand_eye import tracker
-from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.tracker import solve_best, solve_tracker, spread
-from robocal_ros.core.hand_eye.tracker_classic import solve_classic
-from robocal_ros.core.hand_eye.tracker_data import Arc, TrackerData
-from robocal_ros.core.hand_eye.tracker_features import fit_caps
-from robocal_ros.core.hand_eye.tracker_quality import states_without
-from robocal_ros.core.hand_eye.tracker_scan import Scan
-from robocal_ros.core.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
-from robocal_ros.sim.laser_tracker import TrackerCell
-from robocal_ros.sim.profile_targets import Prism, Stem
-from robocal_ros.sim.tracker_cells import prp_cell, six_axis_cell
-from robocal_ros.sim.ur10_station import Q_NEAR
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.hand_eye import tracker
+from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.hand_eye.tracker import solve_best, solve_tracker, spread
+from robocal_ros.hand_eye.tracker_classic import solve_classic
+from robocal_ros.hand_eye.tracker_data import Arc, TrackerData
+from robocal_ros.hand_eye.tracker_features import fit_caps
+from robocal_ros.hand_eye.tracker_quality import states_without
+from robocal_ros.hand_eye.tracker_scan import Scan
+from robocal_ros.hand_eye.tracker_state import SENSOR, UNKNOWNS, adjoint
+from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")
 RUNS = 40

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.descent import chi2_quantile
-from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.core.identification import CellModel, identify, identify_and_judge
-from robocal_ros.core.identification.cell import CellProblem, make_layout
-from robocal_ros.core.identification.start import linear_start
+from robocal_ros.estimation.descent import chi2_quantile
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.identification import CellModel, identify, identify_and_judge
+from robocal_ros.identification.cell import CellProblem, make_layout
+from robocal_ros.identification.start import linear_start
 
 # the sliding arm's limits depend on what was bought
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")

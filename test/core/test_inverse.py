@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_cell import POSTURES
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.kinematics.inverse import SMALLEST_SINGULAR_VALUE, follow, inverse
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics.inverse import SMALLEST_SINGULAR_VALUE, follow, inverse
+from robocal_ros.kinematics.robots import load_robot
 
 P_FLANGE = np.array([0.02, -0.03, 0.2])
 H = 1e-4

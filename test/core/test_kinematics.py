@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import ParameterSet, SerialArm, kernels
-from robocal_ros.core.kinematics.parameters import ALPHA, BETA
-from robocal_ros.core.kinematics.universal_robots import (
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import ParameterSet, SerialArm, kernels
+from robocal_ros.kinematics.parameters import ALPHA, BETA
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.kinematics.universal_robots import (
     factory_arm,
     factory_dh,
     hayati_from_dh,
     nominal_arm,
     parse_settings,
 )
-from robocal_ros.storage.robots import load_robot
 
 # the sliding arm's limits depend on what was bought
 pytestmark = pytest.mark.filterwarnings("ignore:.*joint limits not given")

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.identification.mismatch import explain_mismatch
-from robocal_ros.core.identification.start import linear_start
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.mismatch import explain_mismatch
+from robocal_ros.identification.start import linear_start
+from robocal_ros.kinematics import SerialArm
 
 T_FRAME_BASE = frames.transform(frames.exp_rotation(np.array([0.3, -0.2, 1.0])), [2.0, 1.0, -0.5])
 POINT = np.array([0.10, 0.05, 0.20, 1.0])

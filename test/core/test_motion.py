@@ -20,15 +20,15 @@ from motion_cell import (
     upright,
 )
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, LimitError
-from robocal_ros.core.kinematics.inverse import inverse
-from robocal_ros.core.tool.laser_frame import LaserFrame
-from robocal_ros.core.tool.measuring_plan import MeasuringPlan
+from robocal_ros.cell_sim.beams import beams_of
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, LimitError
+from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.motion.measuring import approach, measuring, start_pose, turn_s
 from robocal_ros.motion.timing import Ride
-from robocal_ros.sim.beams import beams_of
+from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.measuring_motion import approach, measuring, start_pose, turn_s
+from robocal_ros.tool.measuring_plan import MeasuringPlan
 
 ROBOTS = pytest.mark.parametrize("robot", POSTURES)
 MICROMETRE = 1e-6

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core.errors import InputError
+from robocal_ros.ground.errors import InputError
 from robocal_ros.motion.housing import Housing, ToolBody
 
 HOUSING = Housing(clear_radius_m=0.04, top_m=0.02, floor_m=-0.08, retract_m=0.04)

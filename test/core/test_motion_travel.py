@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from motion_cell import POSTURES, make_motion_cell, shifted, upright
 
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.kinematics.inverse import inverse
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics.inverse import inverse
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.travel import departure, joint_way

@@ -5,8 +5,8 @@ from types import SimpleNamespace as Message
 import numpy as np
 import pytest
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.point_clouds import cloud_points
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.point_clouds import cloud_points
 
 POINTS = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 3))
 

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import LimitError, TooFewSamplesError
-from robocal_ros.core.identification.cell import CellModel
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.thermal.identification import identify_cycle
-from robocal_ros.core.thermal.pose_planning import (
+from robocal_ros.cell_sim import kr150
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import LimitError, TooFewSamplesError
+from robocal_ros.identification.cell import CellModel
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.identification import identify_cycle
+from robocal_ros.thermal.pose_planning import (
     Design,
     SensorField,
     candidate_poses,
@@ -19,11 +21,9 @@ from robocal_ros.core.thermal.pose_planning import (
     plan_poses,
     shortest_way,
 )
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process import SETUP_SIGMA_M
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.sim import kr150
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.process import SETUP_SIGMA_M
+from robocal_ros.thermal.spots import ColdSpots
 
 FIELD = SensorField()
 

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core.identification import identify
-from robocal_ros.core.identification.priors import (
+from robocal_ros.identification import identify
+from robocal_ros.identification.priors import (
     SMALLEST_SCALE,
     TOLERANCE_ANGLE_RAD,
     TOLERANCE_LENGTH_M,
     default_prior,
     fitted_prior,
 )
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.kinematics.robots import load_robot
 
 NOISE_M = 5e-5
 

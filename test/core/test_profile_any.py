@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from profile_shapes import COLUMNS, arc_profile, polyline_profile, stairs
 
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.fitting.arc import ArcRule, fit_arc
-from robocal_ros.core.fitting.edge import EdgeRule, fit_edge
-from robocal_ros.core.fitting.polyline import CornerRule, fit_corners
+from robocal_ros.estimation.arc import ArcRule, fit_arc
+from robocal_ros.estimation.edge import EdgeRule, fit_edge
+from robocal_ros.estimation.polyline import CornerRule, fit_corners
+from robocal_ros.ground.errors import RobocalError
 
 FITS = {
     "arc": lambda points: fit_arc(points, ArcRule(0.02)),

@@ -12,8 +12,8 @@ from profile_shapes import (
     stairs,
 )
 
-from robocal_ros.core.errors import InputError, ResidualError, TooFewSamplesError
-from robocal_ros.core.fitting.arc import ArcFit, ArcRule, fit_arc
+from robocal_ros.estimation.arc import ArcFit, ArcRule, fit_arc
+from robocal_ros.ground.errors import InputError, ResidualError, TooFewSamplesError
 
 R = 0.02
 

@@ -11,8 +11,8 @@ from profile_shapes import (
     stairs,
 )
 
-from robocal_ros.core.errors import ResidualError, TooFewSamplesError
-from robocal_ros.core.fitting.polyline import CornerRule, fit_corners
+from robocal_ros.estimation.polyline import CornerRule, fit_corners
+from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
 
 STEPS = 4
 COUNT = 2 * STEPS - 1

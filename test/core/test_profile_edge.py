@@ -11,8 +11,8 @@ from profile_shapes import (
     turned,
 )
 
-from robocal_ros.core.errors import ResidualError, TooFewSamplesError
-from robocal_ros.core.fitting.edge import EdgeRule, fit_edge
+from robocal_ros.estimation.edge import EdgeRule, fit_edge
+from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
 
 COLUMN_M = float(COLUMNS[1] - COLUMNS[0])
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError, TooFewSamplesError
-from robocal_ros.core.tool.beam_edges import BeamError
-from robocal_ros.core.tool.run_traits import (
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError, TooFewSamplesError
+from robocal_ros.tool.beam_edges import BeamError
+from robocal_ros.tool.run_traits import (
     ClockError,
     RunTraits,
     TraitLimits,

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import CORRECTED, TAUGHT, joint_sample
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import CORRECTED, TAUGHT, joint_sample
 
 
 def reading(frame: str) -> SimpleNamespace:

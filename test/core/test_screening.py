@@ -8,14 +8,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from robocal_ros.core.errors import InputError, RankDeficientError, TooFewSamplesError
-from robocal_ros.core.thermal.best_subset import best_subset
-from robocal_ros.core.thermal.drift_history import DriftHistory, share_within
-from robocal_ros.core.thermal.screening import Screening, screen
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.core.thermal.subset import entangled, subset_drift
-from robocal_ros.sim import kr150
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.best_subset import best_subset
+from robocal_ros.thermal.drift_history import DriftHistory, share_within
+from robocal_ros.thermal.screening import Screening, screen
+from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.subset import entangled, subset_drift
 
 ARM = load_robot("kr150_r3100")
 NAMES = ARM.parameters.names

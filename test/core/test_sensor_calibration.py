@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import RankDeficientError, TooFewSamplesError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.sensor_calibration import calibrate_sensor
-from robocal_ros.sim import kr150
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.sensor_calibration import calibrate_sensor
 
 SIGMA = 2e-5
 T_SENSOR_BASE, BALL = kr150.T_SENSOR_BASE, kr150.BALL

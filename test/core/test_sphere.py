@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import ResidualError, TooFewSamplesError
-from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.sim.sphere_cloud import CloudScene, sphere_cloud
+from robocal_ros.cell_sim.sphere_cloud import CloudScene, sphere_cloud
+from robocal_ros.estimation.sphere import SphereRule, fit_sphere
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import ResidualError, TooFewSamplesError
 
 RADIUS = 0.01905
 RULE = SphereRule(RADIUS)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core.errors import TooFewSamplesError
-from robocal_ros.core.thermal.stationarity import LAGS, autocorrelation, stationarity
+from robocal_ros.ground.errors import TooFewSamplesError
+from robocal_ros.thermal.stationarity import LAGS, autocorrelation, stationarity
 
 CYCLES, SERIES = 90, 20_000
 

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.assessment import Judgement
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, ResidualError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.cycle_verdict import judge_cycle
-from robocal_ros.core.thermal.identification import CycleDrift, identify_cycle
-from robocal_ros.core.thermal.priors import drift_prior, learned_prior
-from robocal_ros.core.thermal.reference import ColdReference, capture_reference
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.estimation.assessment import Judgement
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, ResidualError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.cycle_verdict import judge_cycle
+from robocal_ros.thermal.identification import CycleDrift, identify_cycle
+from robocal_ros.thermal.priors import drift_prior, learned_prior
+from robocal_ros.thermal.reference import ColdReference, capture_reference
 
 SIGMA_M = 2e-5
 BALL = np.array([0.10, 0.05, 0.20, 1.0])

@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import ResidualError
-from robocal_ros.core.tool.beam_edges import BeamEdge, BeamError
-from robocal_ros.core.tool.circle_edges import CircleMotion, label_edges
-from robocal_ros.core.tool.crossed_beams import (
+from robocal_ros.cell_sim.beam_moves import Circle
+from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import ResidualError
+from robocal_ros.tool.beam_edges import BeamEdge, BeamError
+from robocal_ros.tool.circle_edges import CircleMotion, label_edges
+from robocal_ros.tool.crossed_beams import (
     CircleProblem,
     CircleState,
     classic_distances,
     closed_form,
     fit_circle,
 )
-from robocal_ros.sim.beam_moves import Circle
-from robocal_ros.sim.beams import NO_NOISE, PERFECT, BeamStation, RoundTool, beams_of
 
 RADIUS, PERIOD, START = 0.012, 2.0, np.radians(45.0)
 BETA = np.radians(92.2)

@@ -4,17 +4,11 @@ import numpy as np
 import pytest
 from beam_cell import make_cell
 
-from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.tool.beam_edges import (
-    BeamEdge,
-    BeamError,
-    InputRule,
-    debounced,
-    edges_of,
-)
-from robocal_ros.core.tool.flange_path import JointPath
-from robocal_ros.sim.tool_cell import joints_at
-from robocal_ros.sim.ur10_station import TAUGHT
+from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.cell_sim.ur10_station import TAUGHT
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.tool.beam_edges import BeamEdge, BeamError, InputRule, debounced, edges_of
+from robocal_ros.tool.flange_path import JointPath
 
 SIGMA = 2e-5
 

@@ -5,18 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, RankDeficientError
-from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.core.tool.tool_axis import (
-    axis_from_centres,
-    first_rotation,
-    minimal_rotation,
-    retaught,
-    upright_pose,
-)
-from robocal_ros.sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
-from robocal_ros.sim.beams import (
+from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, laser_points, point_sigma
+from robocal_ros.cell_sim.beams import (
     NO_NOISE,
     PERFECT,
     BeamStation,
@@ -25,7 +15,17 @@ from robocal_ros.sim.beams import (
     TrueNoise,
     beams_of,
 )
-from robocal_ros.sim.ur10_station import BETA_RAD, GAP_M, T_BASE_LASER, laser_of
+from robocal_ros.cell_sim.ur10_station import BETA_RAD, GAP_M, T_BASE_LASER, laser_of
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, RankDeficientError
+from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.tool.tool_axis import (
+    axis_from_centres,
+    first_rotation,
+    minimal_rotation,
+    retaught,
+    upright_pose,
+)
 
 PUBLISHED_MM = {  # thesis table 5-3
     "A1": (793.67, -128.61, 207.45), "A2": (793.68, -123.65, 207.46),

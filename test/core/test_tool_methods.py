@@ -3,23 +3,18 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import (
+from robocal_ros.cell_sim.beam_moves import Sweep
+from robocal_ros.cell_sim.beams import RoundTool, TrueBeam, bent, crossings
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import (
     InputError,
     RankDeficientError,
     ResidualError,
     TooFewSamplesError,
 )
-from robocal_ros.core.tool.parallel_beams import (
-    ParallelBeams,
-    parallel_tip,
-    straighten,
-    sweep_axis,
-)
-from robocal_ros.core.tool.touch_points import fit_four, fit_seven, pose_from_euler
-from robocal_ros.sim.beam_moves import Sweep
-from robocal_ros.sim.beams import RoundTool, TrueBeam, bent, crossings
+from robocal_ros.tool.parallel_beams import ParallelBeams, parallel_tip, straighten, sweep_axis
+from robocal_ros.tool.touch_points import fit_four, fit_seven, pose_from_euler
 
 TIP = np.array([0.012, -0.034, 0.21])
 POINT = np.array([0.9, 0.2, 0.5])

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from drift_cell import SIGMA, cell_of, drifted, postures, visit
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, StaleError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.core.thermal.heat import Heat, HeatGains, joints_of
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process import DriftProcess
-from robocal_ros.core.thermal.spots import ColdSpots
-from robocal_ros.core.thermal.tracking import DriftTracker
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, StaleError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.thermal.heat import Heat, HeatGains, joints_of
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.process import DriftProcess
+from robocal_ros.thermal.spots import ColdSpots
+from robocal_ros.thermal.tracking import DriftTracker
 
 PERIOD_S = 300.0
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bench.ur10_campaigns import halves, load_campaign
-from robocal_ros.core.assessment import pose_groups
-from robocal_ros.core.codes import Code
-from robocal_ros.core.identification import identify_and_judge
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.estimation.assessment import pose_groups
+from robocal_ros.ground.codes import Code
+from robocal_ros.identification import identify_and_judge
+from robocal_ros.kinematics.robots import load_robot
 
 pytestmark = pytest.mark.data
 

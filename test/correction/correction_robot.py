@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool, TrajectoryCommand
 from robocal_ros.correction.joint_correction import JointCorrection
 from robocal_ros.correction.limiter import TURNING
 from robocal_ros.correction.refusals import Reason, RefusedError
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.storage.robots import load_description
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_description
 
 DESCRIPTION = load_description("kr150_r3100")
 NOMINAL = replace(DESCRIPTION.arm, T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2]))

@@ -5,18 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.bounds import CorrectionConfig, Policy
-from robocal_ros.correction.clamping import (
-    FADES_WITHIN,
-    ClampedCorrection,
-    correction_between,
-)
+from robocal_ros.correction.clamping import FADES_WITHIN, ClampedCorrection, correction_between
 from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.correction.staged import StagedCorrection
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 NOMINAL = replace(
     load_robot("kr150_r3100"), T_flange_tool=frames.transform(np.eye(3), [0.02, 0.0, 0.2])

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from correction_robot import FASTEST, LARGEST_A, ROUNDING
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.joint_correction import JointCorrection, pack_model
 from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.limiter import OFFSET, SLIDING, TURNING, OffsetLimiter
 from robocal_ros.correction.staged import StagedCorrection
 from robocal_ros.correction.straight import ITERATIONS
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
 BOUNDS = np.radians([[0.24] * 6, [5.0] * 6])

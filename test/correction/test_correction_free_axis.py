@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.joint_correction import CorrectionResult, JointCorrection, pack_model
 from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.staged import StagedCorrection
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 NM = 1e-9
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.5, 0.1]), [0.05, 0.02, 0.25])

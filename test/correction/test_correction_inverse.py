@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
 from robocal_ros.correction.bounds import FADES_FROM, CorrectionConfig
 from robocal_ros.correction.joint_correction import pack_model
 from robocal_ros.correction.staged import StagedCorrection
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_robot
 
 ARM = load_robot("kr150_r3100")
 CONFIG = CorrectionConfig()

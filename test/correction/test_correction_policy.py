@@ -23,10 +23,10 @@ from correction_robot import (
     still,
 )
 
-from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.bounds import Policy, ShiftBounds
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.refusals import Reason
+from robocal_ros.ground.samples import CORRECTED
 
 TIGHT = ShiftBounds(0.2e-3, np.radians(0.1), np.radians(0.3))
 WIDE = ShiftBounds(1e-3, np.radians(0.1), np.radians(0.3))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from correction_robot import FASTEST
 
-from robocal_ros.core import frames
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.inputs import JointCommand, OfferedModel, OfferedTool
 from robocal_ros.correction.session import CorrectionSession
-from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.robots import load_description
+from robocal_ros.ground import frames
+from robocal_ros.kinematics.robots import load_description
 
 BAGS = Path(__file__).parents[2] / "bags"
 PAUSE_S = 0.5  # nothing is commanded: the robot is read at its driver's rate meanwhile

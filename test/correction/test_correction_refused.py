@@ -15,9 +15,9 @@ from correction_robot import (
     swing,
 )
 
-from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.refusals import Reason
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])

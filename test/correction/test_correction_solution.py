@@ -9,15 +9,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction import solution, straight
 from robocal_ros.correction.joint_correction import RATE_STEP_S, JointCorrection, pack_model
 from robocal_ros.correction.kernels import LENGTH
 from robocal_ros.correction.rates import rates_batch
 from robocal_ros.correction.solution import MOST_OVER, REPORT
 from robocal_ros.correction.staged import EXACT, StagedCorrection
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 TOOL = frames.transform(frames.exp_rotation([0.3, 0.2, 0.1]), [0.05, 0.02, 0.25])
 NM = 1e-9

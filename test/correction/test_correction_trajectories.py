@@ -16,9 +16,9 @@ from correction_robot import (
     swing,
 )
 
-from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.correction.inputs import JointCommand
 from robocal_ros.correction.refusals import Reason
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 
 def test_a_trajectory_is_corrected_as_a_whole(warm: Robot) -> None:

@@ -8,9 +8,13 @@ import pytest
 from builtin_interfaces.msg import Time
 from correction_robot import HOME, NAMES, NOMINAL, Robot
 
+from robocal_ros.cell_sim.joint_motion import CYCLE_S, LAG_S, JointMotion
+from robocal_ros.cell_sim.trajectory import Trajectory
+from robocal_ros.cell_sim.trajectory_goal import ControllerOptions
 from robocal_ros.correction.inputs import JointCommand, TrajectoryCommand
 from robocal_ros.correction.node import FIRST_S
 from robocal_ros.correction.robot_stop import AHEAD_S, RobotStop, RobotTrack, on_its_path
+from robocal_ros.kinematics.robots import load_description
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.limits import MotionLimits
@@ -18,10 +22,6 @@ from robocal_ros.motion.messages import StatedController
 from robocal_ros.motion.robot_watch import RobotWatch
 from robocal_ros.motion.stopping import stop
 from robocal_ros.motion.watched_stop import STANDS_S, WatchedStop
-from robocal_ros.sim.joint_motion import CYCLE_S, LAG_S, JointMotion
-from robocal_ros.sim.trajectory import Trajectory
-from robocal_ros.sim.trajectory_goal import ControllerOptions
-from robocal_ros.storage.robots import load_description
 
 SPEED = 1.0  # rad/s of the first joint
 BRAKES = load_description("kr150_r3100").max_acceleration[0]

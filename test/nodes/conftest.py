@@ -23,7 +23,7 @@ from rclpy.qos import QoSProfile
 from trajectory_msgs.msg import JointTrajectory
 
 from bench.processes import ENDS_WITH_PARENT
-from robocal_ros.nodes import qos
+from robocal_ros.ros import qos
 
 ROOT = Path(__file__).parent.parent.parent
 # For the helper modules beside the tests.

@@ -12,12 +12,12 @@ from robocal_msgs.msg import HandEyeSample, HandEyeStatus
 from robocal_msgs.srv import CalibrateHandEye, CaptureHandEye, StartHandEye
 from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 
-from robocal_ros.core.hand_eye.targets import SphereTarget
-from robocal_ros.core.samples import JOINTS
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.storage.hand_eye_targets import write_target
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.hand_eye.target_files import write_target
+from robocal_ros.hand_eye.targets import SphereTarget
+from robocal_ros.ros import qos
 
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)
 TYPES = {JOINTS: JointState, PROFILE: PointCloud2, TARGET_POSE: PoseStamped, IMAGE: Image}

@@ -19,7 +19,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.samples import CORRECTED, TAUGHT
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
 
 # A drift of some millimetres.
 ACTUAL = drifted(times=10.0)

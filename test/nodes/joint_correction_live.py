@@ -14,13 +14,13 @@ from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.nodes import conversions, qos
-from robocal_ros.nodes.tool_messages import ToolMessages
-from robocal_ros.storage.robots import load_robot, robot_file_hash
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import load_robot, robot_file_hash
+from robocal_ros.ros import conversions, qos
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.messages import ToolMessages
 
 NOMINAL = load_robot("kr150_r3100")
 NAMES = list(NOMINAL.joint_names)

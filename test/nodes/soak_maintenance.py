@@ -20,9 +20,9 @@ from robocal_msgs.srv import Acknowledge, Decide, GetMaintenance, RunMaintenance
 from std_srvs.srv import Trigger
 from test_maintenance_calls import HOME_DEG, Plc, process, proposed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
 
 GAP_S = 150.0
 BEND_MM = "[1.5, -0.8, 0.4]"

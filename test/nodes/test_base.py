@@ -15,14 +15,14 @@ from robocal_msgs.srv import Decide
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, StaleError
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.diagnostics import WARN, Health
-from robocal_ros.nodes.endpoints import LOG_EVERY_S, LogLimit
-from robocal_ros.nodes.parameters import Setting
-from robocal_ros.sessions.ignored import MOST_REASONS
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, StaleError
+from robocal_ros.ros import qos
+from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.diagnostics import WARN, Health
+from robocal_ros.ros.endpoints import LOG_EVERY_S, LogLimit
+from robocal_ros.ros.parameters import Setting
+from robocal_ros.session.ignored import MOST_REASONS
 
 BUG = 5e5  # of this number the callback has a defect
 
@@ -304,5 +304,5 @@ def test_what_every_node_imports_brings_no_session_and_no_kernels(module: str) -
     told = subprocess.run(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, check=True, text=True
     )
-    heavy = {"numba", "scipy", "robocal_ros.sessions.thermal", "robocal_ros.sessions.accuracy"}
+    heavy = {"numba", "scipy", "robocal_ros.thermal.session", "robocal_ros.thermal.accuracy_state"}
     assert heavy.isdisjoint(told.stdout.split())

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 import yaml
 
+from robocal_ros.bags.recorder_node import RecorderNode
+from robocal_ros.cell_sim.kr150_cell import SPIN_RAD, TAUGHT, poses
+from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.nodes.base import AUTOSTART, SERIAL
-from robocal_ros.nodes.cell_sim_node import CellSimNode
-from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.recorder_node import RecorderNode
-from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.nodes.thermal_settings import session_config
-from robocal_ros.sim.kr150_cell import SPIN_RAD, TAUGHT, poses
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.ros.base import AUTOSTART, SERIAL
+from robocal_ros.thermal.node import ThermalNode
+from robocal_ros.thermal.settings import session_config
+from robocal_ros.tool.node import TcfNode
 
 ROOT = Path(__file__).parents[2]
 CELLS = sorted((ROOT / "config" / "cells").glob("*.yaml"))

@@ -16,17 +16,17 @@ from sensor_msgs.msg import JointState, PointCloud2, Temperature
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core import frames
-from robocal_ros.core.fitting.sphere import SphereRule, cloud_sample
-from robocal_ros.core.tool.laser_frame import LaserFrame, calibrate_laser
-from robocal_ros.core.tool.measuring_plan import MeasuringMotion, MeasuringPlan
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.cell_sim_node import CellSimNode
-from robocal_ros.nodes.cell_sim_settings import SETTINGS, laser_pose, straight_arm
-from robocal_ros.nodes.conversions import header, transform_message
-from robocal_ros.sim.beams import beams_of
-from robocal_ros.sim.kr150_cell import poses
-from robocal_ros.storage.tool_tables import read_beam_points
+from robocal_ros.cell_sim.beams import beams_of
+from robocal_ros.cell_sim.kr150_cell import poses
+from robocal_ros.cell_sim.node import CellSimNode
+from robocal_ros.cell_sim.settings import SETTINGS, laser_pose, straight_arm
+from robocal_ros.estimation.sphere import SphereRule, cloud_sample
+from robocal_ros.ground import frames
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import header, transform_message
+from robocal_ros.tool.laser_frame import LaserFrame, calibrate_laser
+from robocal_ros.tool.measuring_plan import MeasuringMotion, MeasuringPlan
+from robocal_ros.tool.tables import read_beam_points
 
 DEFAULTS = {setting.name: setting.default for setting in SETTINGS}
 ARM = straight_arm("ur10")

@@ -15,7 +15,7 @@ from tool_driver import TRUTH
 from trajectory_msgs.msg import JointTrajectory
 
 from robocal_ros.motion.graph import CommandPath
-from robocal_ros.nodes import qos
+from robocal_ros.ros import qos
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"

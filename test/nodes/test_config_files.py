@@ -12,20 +12,20 @@ from rclpy.qos import ReliabilityPolicy
 from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 
-from robocal_ros.core.tool.judging import ToolLimits
+from robocal_ros.bags.recorder_node import RecorderNode
+from robocal_ros.bags.replay_node import ReplayNode
+from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.node import JointCorrectionNode
+from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.maintenance.node import MaintenanceNode
 from robocal_ros.motion.settings import MOTION
-from robocal_ros.nodes.base import AUTOSTART, SERIAL
-from robocal_ros.nodes.cell_sim_node import CellSimNode
-from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.recorder_node import RecorderNode
-from robocal_ros.nodes.replay_node import ReplayNode
-from robocal_ros.nodes.tcf_node import INPUTS as TCF_INPUTS
-from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.nodes.thermal_node import INPUTS, ThermalNode
-from robocal_ros.sessions.thermal_config import ThermalConfig
+from robocal_ros.ros.base import AUTOSTART, SERIAL
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.node import INPUTS, ThermalNode
+from robocal_ros.tool.judging import ToolLimits
+from robocal_ros.tool.node import INPUTS as TCF_INPUTS
+from robocal_ros.tool.node import TcfNode
 
 CONFIG = Path(__file__).parents[2] / "config"
 NODES = (

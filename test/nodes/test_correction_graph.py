@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from robocal_ros.correction.graph import GraphWatch, JointSources, Leases
 from robocal_ros.correction.refusals import Reason
 from robocal_ros.motion.graph import own_endpoint
-from robocal_ros.nodes import qos
+from robocal_ros.ros import qos
 
 PATH = "/arm_controller/joint_trajectory"
 ACTION = "/arm_controller/follow_joint_trajectory"

@@ -13,9 +13,9 @@ from domains import free_domain
 
 from bench.live.cell import TRUTH
 from bench.processes import ENDS_WITH_PARENT
-from robocal_ros.core.codes import Code
-from robocal_ros.sim.joint_motion import ROOM
-from robocal_ros.storage.bags import BagReader
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.cell_sim.joint_motion import ROOM
+from robocal_ros.ground.codes import Code
 
 pytestmark = pytest.mark.cell
 

@@ -14,15 +14,15 @@ from tool_cell_live import written_laser
 from tool_driver import noisy_cell
 from trajectory_msgs.msg import JointTrajectory
 
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.recorded_names import RECORDED, graph_name, recorded_name
+from robocal_ros.bags.recorder_node import RecorderNode
+from robocal_ros.bags.recording_folders import recordings
+from robocal_ros.bags.replay_topics import chosen_topics, message_class
+from robocal_ros.cell_sim.node import CellSimNode
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.nodes.cell_sim_node import CellSimNode
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.recorder_node import RecorderNode
-from robocal_ros.nodes.replay_topics import chosen_topics, message_class
-from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.recorded_names import RECORDED, graph_name, recorded_name
-from robocal_ros.storage.recording_folders import recordings
+from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.tool.node import TcfNode
 
 COMMANDS = {  # what moves a robot, or says that it may be moved, by the name on the graph
     "/gap_open": GapOpen,

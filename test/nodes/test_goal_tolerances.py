@@ -9,7 +9,12 @@ import pytest
 from control_msgs.action import FollowJointTrajectory
 from rclpy.action import ActionServer
 
-from robocal_ros.core.kinematics import SerialArm
+from robocal_ros.cell_sim.joint_motion import JointMotion
+from robocal_ros.cell_sim.messages import tolerances_of
+from robocal_ros.cell_sim.trajectory import Trajectory
+from robocal_ros.cell_sim.trajectory_goal import GoalCode, GoalState, Tolerances, TrajectoryGoal
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.driver import MotionDriver
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
@@ -17,12 +22,7 @@ from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import UNSAID_S, MotionReport
 from robocal_ros.motion.settings import goal_tolerances
-from robocal_ros.nodes.cell_sim_messages import tolerances_of
-from robocal_ros.nodes.endpoints import EndpointNode
-from robocal_ros.sim.joint_motion import JointMotion
-from robocal_ros.sim.trajectory import Trajectory
-from robocal_ros.sim.trajectory_goal import GoalCode, GoalState, Tolerances, TrajectoryGoal
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ros.endpoints import EndpointNode
 
 ARM = load_robot("ur10")
 Q_START = np.radians([2.3, -124.4, -70.9, 107.7, -91.1, 91.8])

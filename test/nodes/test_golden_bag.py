@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from history_content import content
 
-from robocal_ros.core.codes import Code
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.history.calibrations import CalibrationHistory
 
 ROOT = Path(__file__).parents[2]
 CYCLES = 12

@@ -22,18 +22,19 @@ from robocal_msgs.msg import SessionEvent
 from tool_cell_live import STREAM
 
 from robocal_ros import __version__
+from robocal_ros.bags import replay
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.recording import Recording, open_recording
-from robocal_ros.core.samples import JOINTS
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.sessions import events, replay
-from robocal_ros.sessions.decisions import ONLY
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.tool_inputs import take_tool_message
-from robocal_ros.sessions.tool_recorded import tool_session_as_recorded
-from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.laser_files import LaserFile, write_laser
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.session import events
+from robocal_ros.session.decisions import ONLY
+from robocal_ros.session.events import Command
+from robocal_ros.tool.inputs import take_tool_message
+from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.node import TcfNode
+from robocal_ros.tool.recorded import tool_session_as_recorded
 
 
 @pytest.fixture

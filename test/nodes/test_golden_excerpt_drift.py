@@ -27,19 +27,20 @@ from std_srvs.srv import Trigger
 
 from bench.closed_loop import setting
 from robocal_ros import __version__
+from robocal_ros.bags import replay
+from robocal_ros.bags.bag_writer import BagWriter
+from robocal_ros.bags.bags import BagReader
 from robocal_ros.cli.recording import Recording, open_recording
-from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import THERMAL, Proposal
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.sessions import events, replay
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.seeding import session_as_recorded
-from robocal_ros.storage.bag_writer import BagWriter
-from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import THERMAL, Proposal
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
+from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.seeding import session_as_recorded
 
 
 @pytest.fixture

@@ -11,10 +11,12 @@ from hand_eye_live import STREAM, TYPES
 from rclpy.serialization import deserialize_message
 from robocal_msgs.msg import SessionEvent
 
-from robocal_ros.core.samples import JOINTS
-from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.sessions.events import (
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.hand_eye.shots import PROFILE
+from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.session.events import (
     ACCEPT,
     BREAK_OFF,
     CALIBRATE,
@@ -24,8 +26,6 @@ from robocal_ros.sessions.events import (
     START,
     Command,
 )
-from robocal_ros.sessions.hand_eye_shots import PROFILE
-from robocal_ros.storage.bags import BagReader, BagWriter
 
 BAGS = Path(__file__).parents[2] / "bags"
 EVENT_TOPIC = "/hand_eye_node/session_events"

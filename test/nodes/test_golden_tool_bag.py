@@ -10,14 +10,14 @@ from command import robocal_json
 from robocal_msgs.msg import SessionEvent
 from tool_cell_live import STREAM
 
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.sessions.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
-from robocal_ros.sessions.tool_config import ToolConfig
-from robocal_ros.storage.bags import BagReader, BagWriter
-from robocal_ros.storage.laser_files import LaserFile, write_laser
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.ground.codes import Code
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.session.events import ACCEPT, CONFIGURE, MEASURE_TOOL, TOOL_STEP, Command
+from robocal_ros.tool.config import ToolConfig
+from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.node import TcfNode
 
 BAGS = Path(__file__).parents[2] / "bags"
 EVENT_TOPIC = "/tcf_node/session_events"

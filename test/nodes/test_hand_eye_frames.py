@@ -13,11 +13,11 @@ from robocal_msgs.srv import Decide
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.diagnostics import ERROR
-from robocal_ros.nodes.frame_watch import FRESH_S
-from robocal_ros.sessions.events import ACCEPT, Command
+from robocal_ros.ground.codes import Code
+from robocal_ros.ros import qos
+from robocal_ros.ros.diagnostics import ERROR
+from robocal_ros.ros.frame_watch import FRESH_S
+from robocal_ros.session.events import ACCEPT, Command
 
 
 def below(parent: str, transform: Transform) -> TFMessage:

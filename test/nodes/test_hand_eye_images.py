@@ -12,10 +12,10 @@ from hand_eye_live import NAME, LiveSensor
 from robocal_msgs.msg import HandEyeSample, HandEyeStatus, SessionEvent
 from robocal_msgs.srv import HandEyeFile
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.storage.bags import BagWriter, read_bag
+from robocal_ros.bags.bags import BagWriter, read_bag
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ros.session_events import EVENTS
 
 COUNT = 8
 CAMERA = HandEyeStatus.CAMERA

@@ -24,19 +24,19 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.targets import LineTarget
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import pose_message
-from robocal_ros.nodes.diagnostics import ERROR
-from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.hand_eye_outputs import HandEyeOutputs
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.hand_eye_data import Capture
-from robocal_ros.storage.bags import BagWriter, read_bag
-from robocal_ros.storage.hand_eye_targets import write_target
+from robocal_ros.bags.bags import BagWriter, read_bag
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.hand_eye.data import Capture
+from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.hand_eye.outputs import HandEyeOutputs
+from robocal_ros.hand_eye.target_files import write_target
+from robocal_ros.hand_eye.targets import LineTarget
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import pose_message
+from robocal_ros.ros.diagnostics import ERROR
+from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.session.events import Command, Outcome
 
 NO_TEXT = "\ud800"  # cannot be carried: it has no UTF-8
 

@@ -15,17 +15,17 @@ from robocal_msgs.srv import CheckHandEyePlan, Decide, HandEyeFile
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.hand_eye.quality import HandEyeSettings
-from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import pose_message
-from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, step_shots
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.storage.hand_eye_bags import write_data_set
-from robocal_ros.storage.hand_eye_targets import write_target
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.hand_eye_bags import write_data_set
+from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, step_shots
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.hand_eye.quality import HandEyeSettings
+from robocal_ros.hand_eye.target_files import write_target
+from robocal_ros.hand_eye.targets import Staircase, StepTarget
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import pose_message
 
 TRUTH = sphere_set()[0].T_flange_sensor
 STAIRS = TrueStairs(frames.transform(frames.exp_rotation([0.02, -0.03, 0.4]), [0.75, -0.1, 0.1]))

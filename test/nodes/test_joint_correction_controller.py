@@ -20,7 +20,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from robocal_ros.nodes import conversions
+from robocal_ros.ros import conversions
 
 
 def controller_state(q: Any, scaling: float) -> Any:

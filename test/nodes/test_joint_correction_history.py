@@ -21,13 +21,13 @@ from robocal_msgs.msg import CorrectionStatus
 from std_srvs.srv import Trigger
 
 from robocal_ros import __version__
-from robocal_ros.core import frames
-from robocal_ros.core.correction_record import CALIBRATED, CorrectionRecord
-from robocal_ros.core.correction_record import NOMINAL as AS_NOMINAL
 from robocal_ros.correction import report as correction_log
-from robocal_ros.nodes.history_settings import history_notice
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_description, save_robot
+from robocal_ros.ground import frames
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.correction_record import CALIBRATED, CorrectionRecord
+from robocal_ros.history.correction_record import NOMINAL as AS_NOMINAL
+from robocal_ros.kinematics.robots import load_description, save_robot
+from robocal_ros.ros.history_settings import history_notice
 
 
 def kept(graph: Any, serial: str = "s1") -> list[CorrectionRecord]:

@@ -24,8 +24,8 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.nodes import conversions, qos
-from robocal_ros.storage.robots import load_description
+from robocal_ros.kinematics.robots import load_description
+from robocal_ros.ros import conversions, qos
 
 PERIOD_S = 0.02  # of the joint states
 RESTS_S = 0.5  # of a stream that begins: its first messages may be lost

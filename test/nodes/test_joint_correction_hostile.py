@@ -31,7 +31,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.storage.robots import load_description
+from robocal_ros.kinematics.robots import load_description
 
 # A drift of some millimetres.
 PARAMETERS = PATIENT | {

@@ -16,10 +16,10 @@ from std_srvs.srv import SetBool
 from trajectory_controllers import ARM, CONTROLLERS, HOME, NODE, Controlled, trajectory
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.samples import CORRECTED
-from robocal_ros.nodes import conversions, qos
-from robocal_ros.storage.robots import robot_file_hash
+from robocal_ros.ground.samples import CORRECTED
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import robot_file_hash
+from robocal_ros.ros import conversions, qos
 
 PERIOD_S, AHEAD_S = 0.1, 0.3  # of the stream; of its point, from when it is sent
 SPEED = np.array([0.3, 0.1, -0.1, 0.2, -0.1, 0.1])  # rad/s

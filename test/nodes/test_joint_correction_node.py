@@ -30,13 +30,13 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
-from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.settings import SETTINGS
-from robocal_ros.nodes import conversions, qos
-from robocal_ros.nodes.base import AUTOSTART, SERIAL
-from robocal_ros.nodes.diagnostics import OK, WARN
-from robocal_ros.nodes.source_guard import SourceGuard
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
+from robocal_ros.motion.source_guard import SourceGuard
+from robocal_ros.ros import conversions, qos
+from robocal_ros.ros.base import AUTOSTART, SERIAL
+from robocal_ros.ros.diagnostics import OK, WARN
 
 
 def test_off_until_enabled_then_reaches_the_taught_pose_and_back(graph: Any) -> None:

@@ -19,17 +19,17 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 from tool_driver import noisy_cell
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import THERMAL, TOOL
-from robocal_ros.core.tool.judging import KnownTool
 from robocal_ros.correction.bounds import CorrectionConfig
 from robocal_ros.correction.clamping import correction_between
 from robocal_ros.correction.joint_correction import pack_model
-from robocal_ros.nodes import qos
-from robocal_ros.sessions.history import bring_into_force
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.laser_files import LaserFile, write_laser
+from robocal_ros.ground.proposals import THERMAL, TOOL
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.ros import qos
+from robocal_ros.session.history import bring_into_force
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.laser_files import LaserFile, write_laser
 
 PERIOD_S = 0.02
 SPEED_RAD_S, SWING_RAD = 0.05, 0.1

@@ -24,9 +24,9 @@ from std_msgs.msg import Float64MultiArray, Header
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.core.samples import CORRECTED
 from robocal_ros.correction.node import ONE_SOURCE_S, JointCorrectionNode
-from robocal_ros.nodes import conversions
+from robocal_ros.ground.samples import CORRECTED
+from robocal_ros.ros import conversions
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ from robocal_msgs.msg import CorrectionStatus, MotionLease
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.diagnostics import WARN
+from robocal_ros.ros import qos
+from robocal_ros.ros.diagnostics import WARN
 
 # A stream is a stream although other work on the machine may hold its messages up.
 SLOW = {"stream_gap_s": 2.0}

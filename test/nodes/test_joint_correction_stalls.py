@@ -16,7 +16,7 @@ from robocal_msgs.msg import CorrectionStatus, KinematicModel
 from sensor_msgs.msg import JointState
 from stream_parts import BEGIN, PERIOD_S, WAY_RAD
 
-from robocal_ros.nodes import qos
+from robocal_ros.ros import qos
 
 PARTS = Path(__file__).with_name("stream_parts.py")
 DIRECT_RUNS = 10

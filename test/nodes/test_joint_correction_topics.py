@@ -28,8 +28,8 @@ from tool_driver import noisy_cell
 
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.settings import session_config
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.tcf_node import TcfNode
+from robocal_ros.ros import qos
+from robocal_ros.tool.node import TcfNode
 
 
 def test_joint_commands_reach_the_taught_pose(graph: Any) -> None:

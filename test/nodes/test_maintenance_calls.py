@@ -20,15 +20,15 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool
 from std_srvs.srv import Trigger
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import Proposal
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.maintenance_node import ACCURACY, MaintenanceNode
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import Proposal
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance import State
+from robocal_ros.maintenance.node import ACCURACY, MaintenanceNode
+from robocal_ros.ros import qos
+from robocal_ros.ros.session_events import EVENTS
 
 HOME_DEG = [0.0, -90.0, 90.0, -90.0, -90.0, 0.0]
 PERIOD_S = 0.05

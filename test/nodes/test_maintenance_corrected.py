@@ -9,13 +9,13 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 from test_maintenance_calls import HOME_DEG, proposed
 
-from robocal_ros.core.kinematics.documents import model_document
 from robocal_ros.correction.node import JointCorrectionNode
 from robocal_ros.correction.status import CorrectionState
-from robocal_ros.nodes import conversions, qos
-from robocal_ros.nodes.maintenance_node import ACCURACY, CORRECTION, MaintenanceNode
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.node import ACCURACY, CORRECTION, MaintenanceNode
+from robocal_ros.ros import conversions, qos
 
 ARM = load_robot("ur10")
 POSES = [" ".join(str(angle + 10.0) for angle in HOME_DEG)]

@@ -8,16 +8,16 @@ from control_msgs.msg import JointTrajectoryControllerState
 from std_msgs.msg import Float64
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.driver import MaintenanceDriver
+from robocal_ros.maintenance.requests import Move
 from robocal_ros.motion.driver import MotionDriver
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.robot_watch import RobotWatch
-from robocal_ros.nodes.endpoints import EndpointNode
-from robocal_ros.nodes.maintenance_driver import MaintenanceDriver
-from robocal_ros.sessions.maintenance.requests import Move
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ros.endpoints import EndpointNode
 
 ARM = load_robot("kr150_r3100")
 DRIVING = DrivingConfig(Housing(0.06, 0.03, -0.12, 0.05), 0.1, 0.008, 0.05, limits=MotionLimits())

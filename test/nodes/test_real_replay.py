@@ -15,12 +15,12 @@ from robocal_msgs.srv import Decide, Identify
 from std_msgs.msg import String
 
 from bench import ur10_campaigns
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.storage.bags import BagReader, BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.ground.codes import Code
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
+from robocal_ros.ros.session_events import EVENTS
 
 pytestmark = pytest.mark.data
 

@@ -18,14 +18,14 @@ from shift import Shift, built, postures
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import JointSample
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import time_message
-from robocal_ros.nodes.replay_topics import chosen_topics, message_class
-from robocal_ros.storage.bags import BagWriter
-from robocal_ros.storage.recorded_names import recorded_name
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagWriter
+from robocal_ros.bags.recorded_names import recorded_name
+from robocal_ros.bags.replay_topics import chosen_topics, message_class
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import time_message
 
 ROOT = Path(__file__).parents[2]
 NS = 1_000_000_000

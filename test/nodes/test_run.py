@@ -10,8 +10,8 @@ from std_srvs.srv import Trigger
 SCRIPT = """
 import sys
 from std_srvs.srv import Trigger
-from robocal_ros.nodes.base import HouseNode
-from robocal_ros.nodes.run import run
+from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.run import run
 
 class Sleeper(HouseNode):
     NAME = "sleeper"

@@ -5,8 +5,8 @@ import os
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.thermal_node import ThermalNode
+from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.thermal.node import ThermalNode
 
 
 @pytest.mark.parametrize("node_class", [ThermalNode, MaintenanceNode])

@@ -9,12 +9,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from robocal_msgs.msg import KinematicModel
 from sensor_msgs.msg import JointState
 
-from robocal_ros.core.errors import WrongRobotError
-from robocal_ros.nodes import qos, stamp_watch
-from robocal_ros.nodes.conversions import time_message
-from robocal_ros.nodes.history_settings import open_history
-from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.storage.robots import find_robot, load_robot, robot_file_hash
+from robocal_ros.ground.errors import WrongRobotError
+from robocal_ros.kinematics.robots import find_robot, load_robot, robot_file_hash
+from robocal_ros.ros import qos, stamp_watch
+from robocal_ros.ros.conversions import time_message
+from robocal_ros.ros.history_settings import open_history
+from robocal_ros.thermal.node import ThermalNode
 
 NAMES = load_robot("kr150_r3100").joint_names
 NS = 1_000_000_000

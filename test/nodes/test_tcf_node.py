@@ -14,11 +14,11 @@ from tf2_msgs.msg import TFMessage
 from tool_cell_live import LiveCell
 from tool_driver import TAUGHT, TRUTH
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointSample
-from robocal_ros.nodes import qos
-from robocal_ros.sim.beams import RoundTool, bent
+from robocal_ros.cell_sim.beams import RoundTool, bent
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.ros import qos
 
 FULL, QUICK = MeasureTool.Goal.FULL, MeasureTool.Goal.QUICK
 

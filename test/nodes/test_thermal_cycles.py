@@ -10,11 +10,11 @@ from robocal_msgs.msg import AccuracyState
 from sensor_msgs.msg import JointState, Temperature
 from shift import NS, Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointSample
-from robocal_ros.nodes.conversions import time_message
-from robocal_ros.sessions.thermal_config import ThermalConfig
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros.conversions import time_message
+from robocal_ros.thermal.config import ThermalConfig
 
 POSES = 6
 WARM_K = 15.0

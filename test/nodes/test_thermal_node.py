@@ -24,26 +24,26 @@ from sensor_msgs.msg import JointState
 from shift import Shift, built, postures, warmed
 
 from robocal_ros import __version__
-from robocal_ros.core.codes import Code
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import Head, Proposal, State
-from robocal_ros.core.samples import JointSample
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.conversions import time_message
-from robocal_ros.nodes.diagnostics import Health
-from robocal_ros.nodes.hand_eye_node import HandEyeNode
-from robocal_ros.nodes.history_settings import history_notice
-from robocal_ros.nodes.maintenance_node import MaintenanceNode
-from robocal_ros.nodes.session_events import EVENTS
-from robocal_ros.nodes.thermal_node import ThermalNode
-from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.replay import input_topics, read_events, replay
-from robocal_ros.sessions.seeding import config_of
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.storage.bags import BagReader, BagWriter
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_damage import acknowledge
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import BagReader, BagWriter
+from robocal_ros.bags.replay import input_topics, read_events, replay
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import Head, Proposal, State
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.hand_eye.node import HandEyeNode
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_damage import acknowledge
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.node import MaintenanceNode
+from robocal_ros.ros import qos
+from robocal_ros.ros.conversions import time_message
+from robocal_ros.ros.diagnostics import Health
+from robocal_ros.ros.history_settings import history_notice
+from robocal_ros.ros.session_events import EVENTS
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.node import ThermalNode
+from robocal_ros.thermal.seeding import config_of
+from robocal_ros.thermal.session import ThermalSession
 
 POSES = 8
 NS = 1_000_000_000

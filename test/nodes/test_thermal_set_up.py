@@ -7,10 +7,10 @@ from robocal_msgs.srv import CalibrateSensor, PlanPoses
 from sensor_msgs.msg import JointState
 from shift import BALL, T_SENSOR_BASE, Shift, built, postures
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.nodes import qos
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
 
 POSES = 10
 FIELD_MM = "[1500.0,1500.0,2000.0,500.0,4000.0]"

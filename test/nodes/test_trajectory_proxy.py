@@ -24,11 +24,11 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import CORRECTED, TAUGHT
 from robocal_ros.correction import action as trajectory_proxy
 from robocal_ros.correction.node import JointCorrectionNode
-from robocal_ros.nodes import qos
+from robocal_ros.ground.samples import CORRECTED, TAUGHT
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.ros import qos
 
 OWN = f"{NODE}/follow_joint_trajectory"
 Result = FollowJointTrajectory.Result

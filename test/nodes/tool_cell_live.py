@@ -12,13 +12,13 @@ from robocal_msgs.msg import BeamEvent, ToolStep
 from sensor_msgs.msg import JointState
 from tool_driver import TAUGHT, Driver, noisy_cell
 
-from robocal_ros.core.samples import JointSample
-from robocal_ros.nodes import qos
-from robocal_ros.nodes.cell_sim_messages import planned_step
-from robocal_ros.nodes.tcf_node import TcfNode
-from robocal_ros.sim.beams import RoundTool
-from robocal_ros.sim.tool_cell import ToolCell
-from robocal_ros.storage.laser_files import LaserFile, write_laser
+from robocal_ros.cell_sim.beams import RoundTool
+from robocal_ros.cell_sim.messages import planned_step
+from robocal_ros.cell_sim.tool_cell import ToolCell
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.ros import qos
+from robocal_ros.tool.laser_files import LaserFile, write_laser
+from robocal_ros.tool.node import TcfNode
 
 STATION = "north"
 STREAM = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=2000)

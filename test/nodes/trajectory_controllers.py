@@ -21,8 +21,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from robocal_ros.nodes import qos
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.ros import qos
 
 ARM = load_robot("ur10")
 NAMES = list(ARM.joint_names)

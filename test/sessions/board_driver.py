@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from hand_eye_driver import ARM, FRAME, Q_NEAR, Recorded
 
-from robocal_ros.sessions.hand_eye_shots import IMAGE
-from robocal_ros.sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose, true_pose
-from robocal_ros.sim.cell_plan import rigid_robot
-from robocal_ros.sim.hand_eye_cell import ArmRobot
-from robocal_ros.sim.robot import Effects
-from robocal_ros.storage.bag_writer import ros_time
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.cell_sim.board_camera import BoardCell, BoardNoise, TrueLens, TruePose, true_pose
+from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.hand_eye.shots import IMAGE
 
 COLUMNS, ROWS, SQUARE_M = 9, 6, 0.025
 LENS = TrueLens()

@@ -5,7 +5,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside the tests
 
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
 
 
 @pytest.fixture

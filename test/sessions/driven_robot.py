@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 from tool_driver import START_NS, TAUGHT, TRUTH, config_of, noisy_cell
 
-from robocal_ros.core.samples import JointSample
-from robocal_ros.core.tool.edge_samples import EdgeSample
+from robocal_ros.cell_sim.beams import RoundTool
+from robocal_ros.cell_sim.joint_motion import JointMotion
+from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.ground.samples import JointSample
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.gap import Gap
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.sessions.events import MEASURE_TOOL, TOOL_STEP, Command
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_driving import Phase, ToolDriver
-from robocal_ros.sim.beams import RoundTool
-from robocal_ros.sim.joint_motion import JointMotion
-from robocal_ros.sim.tool_cell import joints_at
+from robocal_ros.session.events import MEASURE_TOOL, TOOL_STEP, Command
+from robocal_ros.tool.driving import Phase, ToolDriver
+from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.session import ToolSession
 
 PERIOD_S = 0.008
 STALE_S = 0.5  # of the heartbeat

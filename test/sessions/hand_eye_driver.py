@@ -9,22 +9,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.target_documents import target_document
-from robocal_ros.core.hand_eye.targets import SphereTarget
-from robocal_ros.core.samples import JOINTS
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
-from robocal_ros.sessions.hand_eye_shots import IMAGE, PROFILE, TARGET_POSE
-from robocal_ros.sim.cell_plan import rigid_robot
-from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
-from robocal_ros.sim.hand_eye_sets import sphere_shots
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.robot import Effects
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, Shots
+from robocal_ros.cell_sim.hand_eye_sets import sphere_shots
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.inputs import take_hand_eye_message
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.hand_eye.target_documents import target_document
+from robocal_ros.hand_eye.targets import SphereTarget
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
 
 NS = 1_000_000_000
 START_NS = 1_700_000_000 * NS

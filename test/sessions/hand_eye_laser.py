@@ -9,13 +9,13 @@ from hand_eye_driver import (
     sphere_shots_of,
 )
 
-from robocal_ros.core import frames
-from robocal_ros.core.hand_eye.target_documents import target_document
-from robocal_ros.core.hand_eye.targets import Staircase, StepTarget
-from robocal_ros.sessions import events
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sim.hand_eye_sets import TrueStairs, edge_shots, groove_shots, step_shots
+from robocal_ros.cell_sim.hand_eye_sets import TrueStairs, edge_shots, groove_shots, step_shots
+from robocal_ros.ground import frames
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.target_documents import target_document
+from robocal_ros.hand_eye.targets import Staircase, StepTarget
+from robocal_ros.session import events
 
 SHOTS = list(sphere_shots_of(14))
 WARM = ARM.with_mdh(ARM.mdh * 1.0002)

@@ -2,7 +2,7 @@
 
 import json
 
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
 
 
 def content(history: CalibrationHistory) -> str:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.core.samples import JointBlock, JointSample
+from robocal_ros.ground.samples import JointBlock, JointSample
 
 
 def in_blocks(samples: Sequence[Any], sizes: Sequence[int]) -> Iterator[Any]:

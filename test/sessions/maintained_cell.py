@@ -13,12 +13,12 @@ from tool_driver import TAUGHT
 
 from bench.closed_loop.carrying import Carrier
 from bench.closed_loop.words import drift_of
-from robocal_ros.core.samples import JointSample, PointSample
+from robocal_ros.ground.samples import JointSample, PointSample
+from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.travel import joint_way
-from robocal_ros.sessions.events import CAPTURE_REFERENCE, Command, Outcome
-from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
+from robocal_ros.session.events import CAPTURE_REFERENCE, Command, Outcome
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 TICKS = 2  # of the robot, between two looks of the maintenance
 OFFSETS_DEG = [

@@ -12,22 +12,22 @@ from shift import warmed
 from tool_driver import TAUGHT, noisy_cell
 from tool_driver import config_of as tool_config
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
+from robocal_ros.maintenance import requests as ask
+from robocal_ros.maintenance.accuracy import Drift
+from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.ways import STATION, Ways
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.housing import Housing
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.sessions.maintenance import MaintenanceConfig, MaintenanceSession, State, Times
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.maintenance.ways import STATION, Ways
-from robocal_ros.sessions.tool_config import made_with
-from robocal_ros.sim.tool_cell import joints_at
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.tool.config import made_with
+from robocal_ros.tool.judging import KnownTool
 
 TICK_S = 0.02
 LAG_S = 0.02  # of the controller

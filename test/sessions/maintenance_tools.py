@@ -14,12 +14,12 @@ from maintenance_cell import (
     thermal_proposed,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions.maintenance import AcceptBounds
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import TOOL
+from robocal_ros.maintenance import AcceptBounds
+from robocal_ros.maintenance import requests as ask
+from robocal_ros.maintenance.requests import Answer
+from robocal_ros.thermal.accuracy import AccuracyLevel
 
 
 def level(cell: Cell, later_ns: int = 0) -> AccuracyLevel:

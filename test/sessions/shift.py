@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from robocal_ros.core import frames
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import REFERENCE_SPHERE, JointSample, PointSample
+from robocal_ros.ground import frames
+from robocal_ros.ground.samples import REFERENCE_SPHERE, JointSample, PointSample
+from robocal_ros.kinematics import SerialArm
 
 NS = 1_000_000_000
 PERIOD_NS = 10_000_000

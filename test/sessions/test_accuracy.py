@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.sessions.accuracy import Accuracy
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.thermal.accuracy_state import Accuracy
 
 
 def test_the_document_is_in_millimetres():

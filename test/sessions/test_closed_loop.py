@@ -8,14 +8,14 @@ import pytest
 from scipy.stats import chi2, norm
 from shift import BALL, NOISE_M, Shift, built, postures, warmed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.kinematics import SerialArm
 from robocal_ros.correction.joint_correction import JointCorrection
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 POSES = 8
 FAR = 0.3  # singular value; nearer to a singularity joints turn by degrees to move the tool

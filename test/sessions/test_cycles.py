@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from shift import Shift, built, fixed_points, knocked, of_kind, postures, warmed
 
-from robocal_ros.core import frames
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JOINTS, JointSample, PointSample
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions import events
-from robocal_ros.sessions.drift_following import CHECKPOINT_EVERY
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground import frames
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import JOINTS, JointSample, PointSample
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.thermal.drift_following import CHECKPOINT_EVERY
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 NS = 1_000_000_000
 POSES = 8

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from shift import NOISE_M, NS, Shift, built, postures, warmed
 
-from robocal_ros.core.samples import TemperatureSample
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.expectation import earlier_shifts, expected_drift
-from robocal_ros.sessions.follower_state import FollowerState
-from robocal_ros.sessions.temperatures import MotorTemperatures
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.samples import TemperatureSample
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.expectation import earlier_shifts, expected_drift
+from robocal_ros.thermal.follower_state import FollowerState
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.thermal.temperatures import MotorTemperatures
 
 POSES, CYCLES = 8, 12
 COLD_C = 21.0

@@ -13,18 +13,18 @@ from hand_eye_driver import (
 )
 from hand_eye_laser import SHOTS, WARM, begun, driver_of
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import THERMAL
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.hand_eye_data import data_set_of
-from robocal_ros.sessions.hand_eye_recorded import configuration, hand_eye_session_as_recorded
-from robocal_ros.sessions.history import bring_into_force
-from robocal_ros.sessions.records import digest
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.proposals import THERMAL
+from robocal_ros.hand_eye.data import data_set_of
+from robocal_ros.hand_eye.recorded import configuration, hand_eye_session_as_recorded
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.session.history import bring_into_force
+from robocal_ros.session.records import digest
 
 
 def test_a_saved_data_set_gives_the_identical_result(history, tmp_path):

@@ -19,21 +19,22 @@ from hand_eye_driver import ARM, CAMERA, FRAME, SPHERE, Driver, Recorded, namesp
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.target_documents import target_document
-from robocal_ros.sessions import events, hand_eye_shots
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_data import data_set_begun, data_set_of
-from robocal_ros.sessions.hand_eye_inputs import take_hand_eye_message
-from robocal_ros.sessions.hand_eye_planning import judged_plan
-from robocal_ros.sessions.hand_eye_shots import shot_of
-from robocal_ros.sessions.records import arguments_text, digest, outcome_text, read_command
-from robocal_ros.sessions.replay import replay
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.hand_eye_bags import read_data_set, write_data_set
-from robocal_ros.storage.hand_eye_targets import read_target
+from robocal_ros.bags.hand_eye_bags import read_data_set, write_data_set
+from robocal_ros.bags.replay import replay
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
+from robocal_ros.hand_eye import shots as hand_eye_shots
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.data import data_set_begun, data_set_of
+from robocal_ros.hand_eye.inputs import take_hand_eye_message
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.session_planning import judged_plan
+from robocal_ros.hand_eye.shots import shot_of
+from robocal_ros.hand_eye.target_documents import target_document
+from robocal_ros.hand_eye.target_files import read_target
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.session import events
+from robocal_ros.session.records import arguments_text, digest, outcome_text, read_command
 
 CONFIG = HandEyeConfig(sensor_frame=FRAME, limit_m=2e-3)  # as `robocal hand-eye camera`
 CORNERS = COLUMNS * ROWS

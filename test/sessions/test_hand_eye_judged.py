@@ -11,13 +11,13 @@ from hand_eye_driver import (
 )
 from hand_eye_laser import TARGETS
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.planning import SensorRange
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_data import data_set_begun
-from robocal_ros.sessions.hand_eye_planning import judged_plan
-from robocal_ros.sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.data import data_set_begun
+from robocal_ros.hand_eye.planning import SensorRange
+from robocal_ros.hand_eye.session_planning import judged_plan
 
 WIDE = SensorRange(0.17, 0.26, 0.1)
 

@@ -5,13 +5,12 @@ import pytest
 from hand_eye_driver import ARM, CENTRE, sphere_set
 from hand_eye_laser import driver_of
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError, LimitError
-from robocal_ros.core.hand_eye.planning import SensorRange
-from robocal_ros.core.samples import JointSample
-from robocal_ros.sessions import events
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_planning import (
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, LimitError
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.planning import SensorRange
+from robocal_ros.hand_eye.session_planning import (
     MOST_POSES,
     judged_plan,
     pose_of,
@@ -21,6 +20,7 @@ from robocal_ros.sessions.hand_eye_planning import (
     rough_mount,
     sphere_centre,
 )
+from robocal_ros.session import events
 
 TRUTH = sphere_set()[0].T_flange_sensor
 GIVEN = frames.transform(TRUTH[:3, :3], TRUTH[:3, 3] + 2e-3)

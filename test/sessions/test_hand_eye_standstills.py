@@ -15,19 +15,19 @@ from hand_eye_driver import (
     sphere_shots_of,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.streams import StandstillRule
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.hand_eye_standstills import (
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.standstills import (
     StandingShot,
     Standstills,
     captured_marks,
     first_of_each,
 )
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
 
 RULE = StandstillRule()
 SHOTS = list(sphere_shots_of(3))

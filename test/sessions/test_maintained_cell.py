@@ -11,21 +11,21 @@ import yaml
 from maintained_cell import POSES, TOLERANCE_M, MaintainedCell
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, InputError, RobocalError, StaleError
-from robocal_ros.core.proposals import THERMAL, TOOL, Proposal
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.core.thermal.priors import drift_prior
-from robocal_ros.core.thermal.process import DriftProcess
-from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK, Command
-from robocal_ros.sessions.maintenance import AcceptBounds
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sim import kr150_cell
-from robocal_ros.sim.beams import RoundTool, bent
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150_cell
+from robocal_ros.cell_sim.beams import RoundTool, bent
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.proposals import THERMAL, TOOL, Proposal
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance import AcceptBounds
+from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, Command
+from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.thermal.priors import drift_prior
+from robocal_ros.thermal.process import DriftProcess
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.session import ToolSession
 
 GAP_S = 240.0
 EVERY_S, HALF_S = 300.0, 29.0

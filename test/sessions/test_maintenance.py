@@ -29,16 +29,16 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError, StorageError
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, StorageError
+from robocal_ros.maintenance import State
+from robocal_ros.maintenance import requests as ask
+from robocal_ros.maintenance.accuracy import Drift
+from robocal_ros.maintenance.mover import Mover
 from robocal_ros.motion.plan import JointPlan
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
-from robocal_ros.sessions.events import LEAVE
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.accuracy import Drift
-from robocal_ros.sessions.maintenance.mover import Mover
+from robocal_ros.session.events import LEAVE
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 
 SMALL = ToolError(1e-4, 1.5e-4)
 

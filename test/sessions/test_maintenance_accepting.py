@@ -33,18 +33,18 @@ from maintenance_tools import (
 )
 from tool_driver import TAUGHT
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import StaleError
-from robocal_ros.core.proposals import THERMAL, TOOL, Action, Decision, Head
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import StaleError
+from robocal_ros.ground.proposals import THERMAL, TOOL, Action, Decision, Head
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_records import insert_decision
+from robocal_ros.maintenance import AcceptBounds
+from robocal_ros.maintenance.requests import Answer
 from robocal_ros.motion.gap import STALL_S
-from robocal_ros.sessions.decisions import decide
-from robocal_ros.sessions.events import ACCEPT, WITHHOLD, Command, Outcome
-from robocal_ros.sessions.maintenance import AcceptBounds
-from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.tool_config import rows_of
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_records import insert_decision
+from robocal_ros.session.decisions import decide
+from robocal_ros.session.events import ACCEPT, WITHHOLD, Command, Outcome
+from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.tool.config import rows_of
 
 UNSOUND = (AccuracyLevel.FAULT, None)  # None: silent
 BESIDE = np.eye(4) + 1e-5 * np.eye(4, k=3)  # a hundredth of a millimetre

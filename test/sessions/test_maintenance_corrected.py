@@ -15,10 +15,10 @@ from maintenance_cell import (
     proposed,
 )
 
-from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
 from robocal_ros.correction.status import CorrectionState, ToldCorrection
-from robocal_ros.sessions.maintenance import AcceptBounds
+from robocal_ros.ground.proposals import TOOL
+from robocal_ros.maintenance import AcceptBounds
+from robocal_ros.thermal.accuracy import AccuracyLevel
 
 SILENT_S = 5.0
 OFF = ToldCorrection(state=CorrectionState.OFF, enabled=False)

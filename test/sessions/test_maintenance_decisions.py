@@ -28,15 +28,15 @@ from maintenance_tools import (
     until_verified,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError, StorageError
-from robocal_ros.core.proposals import THERMAL, TOOL, Action
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.sessions.events import ACCEPT, REJECT, ROLLBACK
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.sessions.maintenance.deciding import Decider
-from robocal_ros.sessions.maintenance.settling import HELD_S
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, StorageError
+from robocal_ros.ground.proposals import THERMAL, TOOL, Action
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.maintenance import State
+from robocal_ros.maintenance.deciding import Decider
+from robocal_ros.maintenance.settling import HELD_S
+from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 
 
 @pytest.fixture

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from maintenance_cell import LONG_S, POSES, REFUSED, SILENT, Cell, config_of, kinds, opened
 
-from robocal_ros.core.codes import Code
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.sessions.maintenance import requests as ask
-from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.ground.codes import Code
+from robocal_ros.maintenance import State
+from robocal_ros.maintenance import requests as ask
+from robocal_ros.maintenance.requests import Answer
 
 UNKNOWN = set(Code) - {
     Code.NONE,

@@ -3,9 +3,9 @@
 import pytest
 from maintenance_cell import LONG_S, Cell, opened
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import StorageError
-from robocal_ros.sessions.maintenance.memory import VERSION
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import StorageError
+from robocal_ros.maintenance.memory import VERSION
 
 SPOILT = {
     "a part is missing": lambda kept: kept.pop("tool"),

@@ -23,14 +23,14 @@ from maintenance_cell import (
     proposed,
 )
 
-from robocal_ros.core.codes import Code
+from robocal_ros.ground.codes import Code
+from robocal_ros.maintenance import AcceptBounds, State
+from robocal_ros.maintenance.conductor import UNSAVED_S
+from robocal_ros.maintenance.hands import DEAF_S
+from robocal_ros.maintenance.requests import Stop
 from robocal_ros.motion.gap import DRAIN_S
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
-from robocal_ros.sessions.maintenance import AcceptBounds, State
-from robocal_ros.sessions.maintenance.conductor import UNSAVED_S
-from robocal_ros.sessions.maintenance.hands import DEAF_S
-from robocal_ros.sessions.maintenance.requests import Stop
-from robocal_ros.sessions.tool_driving import SETTLED_S
+from robocal_ros.tool.driving import SETTLED_S
 
 PAUSES_S = (0.3, 0.6, 3.0)
 FRESH_WITHIN_S = DRAIN_S + STALE_S  # after a pause

@@ -37,17 +37,17 @@ from maintenance_cell import (
 )
 from tool_driver import TAUGHT
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.proposals import Action
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.proposals import Action
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.maintenance import AcceptBounds, State
+from robocal_ros.maintenance.hands import DEAF_S
+from robocal_ros.maintenance.requests import Answer
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
-from robocal_ros.sessions.maintenance import AcceptBounds, State
-from robocal_ros.sessions.maintenance.hands import DEAF_S
-from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.tool_config import rows_of
-from robocal_ros.sessions.tool_driving import SETTLED_S
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.tool.config import rows_of
+from robocal_ros.tool.driving import SETTLED_S
 
 BUSY = (State.RUNNING, State.BREAKING_OFF)
 SERVICES = ("thermal", "arm", "disarm", "cancel", "measure", "sensor")

@@ -24,14 +24,14 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError, StorageError
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError, StorageError
+from robocal_ros.maintenance import State
+from robocal_ros.maintenance.hands import Hands
+from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.ways import Ways
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.sessions.maintenance.hands import Hands
-from robocal_ros.sessions.maintenance.requests import Answer
-from robocal_ros.sessions.maintenance.ways import Ways
+from robocal_ros.thermal.accuracy import AccuracyLevel
 
 
 @pytest.fixture

@@ -18,11 +18,11 @@ from maintenance_cell import (
 )
 from maintenance_tools import decide, level, measured_in_full, modes, until_measuring
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import THERMAL, TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel, ToolError
-from robocal_ros.sessions.events import ACCEPT, ROLLBACK
-from robocal_ros.sessions.maintenance.requests import Answer
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import THERMAL, TOOL
+from robocal_ros.maintenance.requests import Answer
+from robocal_ros.session.events import ACCEPT, ROLLBACK
+from robocal_ros.thermal.accuracy import AccuracyLevel, ToolError
 
 TOO_SHORT_FOR_FULL_S = 33.0
 DAY_NS = 86_400 * 10**9

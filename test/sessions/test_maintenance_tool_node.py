@@ -24,13 +24,13 @@ from maintenance_cell import (
     until_moving,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError
+from robocal_ros.maintenance import State
+from robocal_ros.maintenance.hands import DEAF_S
 from robocal_ros.motion.robot_watch import VELOCITY_S
 from robocal_ros.motion.stopping import SHORTEST_STOP_S
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.sessions.maintenance.hands import DEAF_S
-from robocal_ros.sessions.tool_driving import SETTLED_S
+from robocal_ros.tool.driving import SETTLED_S
 
 GONE_S = 6.0  # the tool node is looked for as long
 

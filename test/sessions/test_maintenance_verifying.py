@@ -26,13 +26,13 @@ from maintenance_tools import (
     until_verified,
 )
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import StorageError
-from robocal_ros.core.proposals import TOOL
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions.events import ACCEPT, REJECT
-from robocal_ros.sessions.maintenance import State
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import StorageError
+from robocal_ros.ground.proposals import TOOL
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.maintenance import State
+from robocal_ros.session.events import ACCEPT, REJECT
+from robocal_ros.thermal.accuracy import AccuracyLevel
 
 NO_POSES = POSES[:0]
 CHECK_ONLY_S = 24.0  # a gap that has no time for a full measurement after it

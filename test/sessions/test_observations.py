@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core.samples import (
+from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
     MEASURED_POINT,
@@ -12,10 +12,10 @@ from robocal_ros.core.samples import (
     PointSample,
     PoseSample,
 )
-from robocal_ros.core.streams import JointStream, Reading, StandstillRule
-from robocal_ros.sessions.ignored import MOST_REASONS
-from robocal_ros.sessions.observation import as_measurements
-from robocal_ros.sessions.observations import MOST_WAITING, ObservationDesk
+from robocal_ros.ground.streams import JointStream, Reading, StandstillRule
+from robocal_ros.session.ignored import MOST_REASONS
+from robocal_ros.thermal.observation import as_measurements
+from robocal_ros.thermal.observations import MOST_WAITING, ObservationDesk
 
 MS = 1_000_000
 NAMES = ("a", "b")

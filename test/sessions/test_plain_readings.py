@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from joint_blocks import in_blocks
 from tool_driver import config_of, noisy_cell
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import (
+from robocal_ros.bags.replay import replay
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import (
     JOINTS,
     JUMPS,
     MEASURED_POINT,
@@ -18,13 +19,12 @@ from robocal_ros.core.samples import (
     JointSample,
     PointSample,
 )
-from robocal_ros.core.streams import JointStream, StandstillRule
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome, joints_awaited_ns, reached
-from robocal_ros.sessions.observations import ObservationDesk
-from robocal_ros.sessions.replay import replay
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_inputs import take_tool_message
+from robocal_ros.ground.streams import JointStream, StandstillRule
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
+from robocal_ros.thermal.observations import ObservationDesk
+from robocal_ros.tool.inputs import take_tool_message
+from robocal_ros.tool.session import ToolSession
 
 MS = 1_000_000
 NAMES = ("a", "b")

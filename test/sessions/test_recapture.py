@@ -7,15 +7,15 @@ import pytest
 from maintenance_cell import config_of
 from shift import BALL, KNOCK, NOISE_M, Shift, built, knocked, postures, warmed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.thermal.accuracy import AccuracyLevel
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.maintenance.deciding import Decider
-from robocal_ros.sessions.seeding import configuration, session_as_recorded
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.maintenance.deciding import Decider
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.thermal.accuracy import AccuracyLevel
+from robocal_ros.thermal.seeding import configuration, session_as_recorded
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 POSES, KELVIN, NIGHT_H = 8, 15.0, 12.0
 STILL = np.eye(4)

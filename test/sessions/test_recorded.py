@@ -8,19 +8,22 @@ import pytest
 from hand_eye_driver import ARM
 from tool_driver import config_of, noisy_cell
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import THERMAL
-from robocal_ros.core.samples import JOINTS, JUMPS
-from robocal_ros.sessions import hand_eye_recorded, records, seeding, tool_recorded
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.hand_eye import HandEyeSession
-from robocal_ros.sessions.hand_eye_config import HandEyeConfig
-from robocal_ros.sessions.replay import read_events
-from robocal_ros.sessions.seeding import session_as_recorded
-from robocal_ros.sessions.thermal import ThermalSession
-from robocal_ros.sessions.thermal_config import ThermalConfig
-from robocal_ros.sessions.tool import ToolSession
+from robocal_ros.bags.replay import read_events
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.proposals import THERMAL
+from robocal_ros.ground.samples import JOINTS, JUMPS
+from robocal_ros.hand_eye import recorded as hand_eye_recorded
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.session import records
+from robocal_ros.session.events import Command
+from robocal_ros.thermal import seeding
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.seeding import session_as_recorded
+from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.tool import recorded as tool_recorded
+from robocal_ros.tool.session import ToolSession
 
 NS = 1_000_000_000
 KINDS = {

@@ -11,26 +11,26 @@ import pytest
 from joint_blocks import in_blocks
 from shift import Shift, built, postures, warmed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.proposals import Proposal
-from robocal_ros.core.samples import JOINTS, MEASURED_POINT, MEASURED_POSE, JointBlock, JointSample
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import CONFIGURE, Command
-from robocal_ros.sessions.found_cycles import automatic_commands, window_commands
-from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.records import arguments_text, digest, outcome_text, read_command
-from robocal_ros.sessions.replay import (
-    NOT_BITS,
-    feed,
-    input_topics,
-    read_events,
-    replay,
+from robocal_ros.bags.replay import NOT_BITS, feed, input_topics, read_events, replay
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.proposals import Proposal
+from robocal_ros.ground.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    JointBlock,
+    JointSample,
 )
-from robocal_ros.sessions.seeding import config_of, configuration
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import CONFIGURE, Command
+from robocal_ros.session.records import arguments_text, digest, outcome_text, read_command
+from robocal_ros.thermal.found_cycles import automatic_commands, window_commands
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.seeding import config_of, configuration
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 NS = 1_000_000_000
 POSES = 8

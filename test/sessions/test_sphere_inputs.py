@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from shift import Shift, built, postures, warmed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import (
+from robocal_ros.cell_sim.sphere_cloud import CloudScene, sphere_cloud
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import (
     JOINTS,
     MEASURED_POINT,
     SPHERE_CENTER,
     SPHERE_CLOUD,
     JointSample,
 )
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.inputs import take_message
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.sim.sphere_cloud import CloudScene, sphere_cloud
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 NS = 1_000_000_000
 POSES = 8

@@ -12,16 +12,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from shift import Shift, built, of_kind, postures, warmed
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JOINTS, MEASURED_POINT, JointSample, PointSample
-from robocal_ros.core.streams import StandstillRule
-from robocal_ros.sessions import events
-from robocal_ros.sessions.decisions import NEWEST, ONLY
-from robocal_ros.sessions.events import Command, Outcome
-from robocal_ros.sessions.records import digest
-from robocal_ros.sessions.thermal import ThermalConfig, ThermalSession
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import JOINTS, MEASURED_POINT, JointSample, PointSample
+from robocal_ros.ground.streams import StandstillRule
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.decisions import NEWEST, ONLY
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.records import digest
+from robocal_ros.thermal.session import ThermalConfig, ThermalSession
 
 NS = 1_000_000_000
 POSES = 8

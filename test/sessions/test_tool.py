@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics.documents import model_document
-from robocal_ros.core.proposals import THERMAL
-from robocal_ros.core.samples import JointSample
-from robocal_ros.core.tool.beam_edges import BeamEdge
-from robocal_ros.core.tool.edge_samples import EdgeSample
-from robocal_ros.core.tool.judging import KnownTool
-from robocal_ros.sessions.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
-from robocal_ros.sessions.history import bring_into_force
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_config import ToolConfig, rows_of
-from robocal_ros.sim.beams import RoundTool, bent
+from robocal_ros.cell_sim.beams import RoundTool, bent
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.proposals import THERMAL
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.session.events import ACCEPT, BREAK_OFF, ROLLBACK, TOOL_STEP, Command
+from robocal_ros.session.history import bring_into_force
+from robocal_ros.tool.beam_edges import BeamEdge
+from robocal_ros.tool.config import ToolConfig, rows_of
+from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.judging import KnownTool
+from robocal_ros.tool.session import ToolSession
 
 
 def driver_of(history, tool=TRUTH, cell=None, **changes) -> Driver:
@@ -218,7 +218,7 @@ def test_a_robot_moved_by_hand_in_between_is_refused(history):
         shifted = replace(driver.cell.station, beams=tuple(
             replace(b, start=b.start + moved, end=b.end + moved) for b in driver.cell.station.beams
         ))  # fmt: skip
-        from robocal_ros.sim.beam_program import step_move
+        from robocal_ros.cell_sim.beam_program import step_move
 
         move = step_move(step, edges[0].time_s - 0.55, 0.0, 0.0)
         return shifted.edges(driver.program.tool, move, move.window, np.random.default_rng(5))

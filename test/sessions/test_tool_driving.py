@@ -5,15 +5,15 @@ import pytest
 from driven_robot import LAG_S, PERIOD_S, AheadMotion, Robot
 from tool_driver import TAUGHT, TRUTH
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import ConflictError
-from robocal_ros.core.tool.edge_samples import EdgeSample
-from robocal_ros.core.tool.judging import KnownTool
+from robocal_ros.cell_sim.beams import bent
+from robocal_ros.cell_sim.tool_cell import joints_at
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError
 from robocal_ros.motion.limits import MotionLimits
-from robocal_ros.sessions.events import MEASURE_TOOL, Command
-from robocal_ros.sessions.tool_driving import Phase
-from robocal_ros.sim.beams import bent
-from robocal_ros.sim.tool_cell import joints_at
+from robocal_ros.session.events import MEASURE_TOOL, Command
+from robocal_ros.tool.driving import Phase
+from robocal_ros.tool.edge_samples import EdgeSample
+from robocal_ros.tool.judging import KnownTool
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 from tool_driver import TAUGHT, TRUTH, Driver, config_of, noisy_cell
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.samples import JointSample
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sim.beams import RoundTool
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.cell_sim.beams import RoundTool
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.tool.session import ToolSession
 
 RADIUS_M = 2.5e-3
 SECOND_NS = 1_000_000_000

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from tool_driver import TAUGHT, Driver, config_of, noisy_cell
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.proposals import TOOL, State
-from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_config import rows_of
-from robocal_ros.sim.beams import BeamStation, RoundTool, bent
-from robocal_ros.sim.cell_faults import Fault, Faults, size_of
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
+from robocal_ros.cell_sim.cell_faults import Fault, Faults, size_of
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import TOOL, State
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
+from robocal_ros.tool.config import rows_of
+from robocal_ros.tool.session import ToolSession
 
 HARM_M = 1e-4  # more than this nobody may take for the tool's who has not proven it
 RADIUS_M = 2.5e-3

@@ -6,17 +6,17 @@ from driven_robot import HOUSING, LAG_S, PERIOD_S, AheadMotion, Robot
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robocal_ros.core.codes import Code
+from robocal_ros.cell_sim.joint_motion import JointMotion
+from robocal_ros.ground.codes import Code
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.driving_config import DrivingConfig
 from robocal_ros.motion.limits import MotionLimits
 from robocal_ros.motion.plan import LEAD_S, JointPlan
 from robocal_ros.motion.robot_watch import REST_RAD, MotionReport, RobotWatch
 from robocal_ros.motion.stopping import SHORTEST_STOP_S, stop
 from robocal_ros.motion.watched_stop import PAUSED_S, SEEN_S, STANDS_S, WatchedStop
-from robocal_ros.sessions.events import TOOL_STEP
-from robocal_ros.sessions.tool_driving import Phase
-from robocal_ros.sim.joint_motion import JointMotion
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.session.events import TOOL_STEP
+from robocal_ros.tool.driving import Phase
 
 ARM = load_robot("kr150_r3100")
 HOME = np.array([0.3, -1.2, 1.2, 0.4, 0.9, -0.3])

@@ -9,15 +9,15 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "core"))  # for beam_cell
 
 from beam_cell import make_cell
 
-from robocal_ros.core.tool.beam_edges import InputRule
-from robocal_ros.core.tool.crossed_model import RobotNoise
-from robocal_ros.sessions.events import MEASURE_TOOL, Command, Outcome
-from robocal_ros.sessions.tool import ToolSession
-from robocal_ros.sessions.tool_config import ToolConfig, rows_of
-from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise, bent
-from robocal_ros.sim.robot_program import RobotProgram, Sample
-from robocal_ros.sim.tool_cell import ToolCell
-from robocal_ros.sim.ur10_station import TAUGHT
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise, bent
+from robocal_ros.cell_sim.robot_program import RobotProgram, Sample
+from robocal_ros.cell_sim.tool_cell import ToolCell
+from robocal_ros.cell_sim.ur10_station import TAUGHT
+from robocal_ros.session.events import MEASURE_TOOL, Command, Outcome
+from robocal_ros.tool.beam_edges import InputRule
+from robocal_ros.tool.config import ToolConfig, rows_of
+from robocal_ros.tool.crossed_model import RobotNoise
+from robocal_ros.tool.session import ToolSession
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.001], [0.025, 0.0375, 0.0])  # 80 mm above its tip
 NOISE = TrueNoise(3e-5, 1e-5)

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 from beam_cell import make_cell
 
-from robocal_ros.core.tool.crossed_model import BeamStep, Held, RobotNoise
-from robocal_ros.core.tool.crossed_run import ToolEstimate, estimate_tool
-from robocal_ros.core.tool.flange_path import JointPath
-from robocal_ros.core.tool.laser_frame import LaserFrame
-from robocal_ros.core.tool.measuring_plan import MeasuringPlan
-from robocal_ros.sim.beams import NO_NOISE, PERFECT, RoundTool, TrueInput, TrueNoise, bent
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_outputs import Happened
-from robocal_ros.sim.cell_plan import CellPlan, rigid_robot
-from robocal_ros.sim.ur10_station import TAUGHT
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.beams import NO_NOISE, PERFECT, RoundTool, TrueInput, TrueNoise, bent
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_outputs import Happened
+from robocal_ros.cell_sim.cell_plan import CellPlan, rigid_robot
+from robocal_ros.cell_sim.ur10_station import TAUGHT
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.tool.crossed_model import BeamStep, Held, RobotNoise
+from robocal_ros.tool.crossed_run import ToolEstimate, estimate_tool
+from robocal_ros.tool.flange_path import JointPath
+from robocal_ros.tool.laser_frame import LaserFrame
+from robocal_ros.tool.measuring_plan import MeasuringPlan
 
 TRUTH = bent(TAUGHT, [0.003, -0.002, 0.002], [0.05, -0.04, 0.0])
 ARM = replace(load_robot("ur10"), T_flange_tool=TAUGHT)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.sim.beam_moves import Circle, Plunge, Sweep
-from robocal_ros.sim.beams import (
+from robocal_ros.cell_sim.beam_moves import Circle, Plunge, Sweep
+from robocal_ros.cell_sim.beams import (
     NO_NOISE,
     PERFECT,
     BeamStation,
@@ -17,6 +16,7 @@ from robocal_ros.sim.beams import (
     bent,
     reported,
 )
+from robocal_ros.ground import frames
 
 UPRIGHT = frames.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.15])
 TOOL = frames.transform(np.eye(3), [0.0, 0.0, 0.15])

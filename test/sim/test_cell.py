@@ -7,18 +7,18 @@ import pytest
 from beam_cell import SILENT, make_cell
 from cell_plans import ARM, Q_START, TRUTH, driven, measured, plan_of
 
-from robocal_ros.core.errors import LimitError
-from robocal_ros.core.tool.beam_edges import BeamError, debounced
-from robocal_ros.core.tool.crossed_model import RobotNoise
-from robocal_ros.core.tool.laser_frame import calibrate_laser
-from robocal_ros.core.tool.measuring_plan import MeasuringPlan, PlannedStep
-from robocal_ros.sim.beam_calibration import CYLINDER_M, point_sigma
-from robocal_ros.sim.beams import RoundTool, TrueInput, TrueNoise
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_plan import known_laser
-from robocal_ros.sim.joint_motion import CYCLE_S
-from robocal_ros.sim.standing import TICK_S
-from robocal_ros.sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
+from robocal_ros.cell_sim.beam_calibration import CYLINDER_M, point_sigma
+from robocal_ros.cell_sim.beams import RoundTool, TrueInput, TrueNoise
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_plan import known_laser
+from robocal_ros.cell_sim.joint_motion import CYCLE_S
+from robocal_ros.cell_sim.standing import TICK_S
+from robocal_ros.cell_sim.ur10_station import T_BASE_LASER, TAUGHT, laser_of
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.tool.beam_edges import BeamError, debounced
+from robocal_ros.tool.crossed_model import RobotNoise
+from robocal_ros.tool.laser_frame import calibrate_laser
+from robocal_ros.tool.measuring_plan import MeasuringPlan, PlannedStep
 
 NOISE = TrueNoise(3e-5, 1e-5)
 SAMPLED = TrueInput(latency_s=0.004, sample_period_s=0.002)

@@ -5,15 +5,15 @@ import pytest
 
 from bench.closed_loop.plant import BEAT_S, STEP_S, equipped
 from bench.closed_loop.setting import LIMITS
-from robocal_ros.core.errors import ConflictError
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.joint_motion import LAG_S
+from robocal_ros.cell_sim.kr150_cell import kr150_cell
+from robocal_ros.ground.errors import ConflictError
+from robocal_ros.kinematics.robots import load_robot
 from robocal_ros.motion.plan import JointPlan
-from robocal_ros.sessions import events
-from robocal_ros.sessions.events import Command
-from robocal_ros.sessions.tool_driving import Phase
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.joint_motion import LAG_S
-from robocal_ros.sim.kr150_cell import kr150_cell
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.session import events
+from robocal_ros.session.events import Command
+from robocal_ros.tool.driving import Phase
 
 
 @pytest.fixture

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from cell_plans import Q_START, plan_of
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.trajectory import Trajectory
-from robocal_ros.sim.trajectory_goal import GoalCode, GoalState, Tolerances, TrajectoryGoal
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.trajectory import Trajectory
+from robocal_ros.cell_sim.trajectory_goal import GoalCode, GoalState, Tolerances, TrajectoryGoal
+from robocal_ros.ground.errors import InputError
 
 REST = np.zeros((1, 6))
 FAR = Q_START + 0.5

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import LimitError
-from robocal_ros.sim.cell_plan import rigid_robot
-from robocal_ros.sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Shots
-from robocal_ros.sim.hand_eye_sets import (
+from robocal_ros.cell_sim.cell_plan import rigid_robot
+from robocal_ros.cell_sim.hand_eye_cell import ArmRobot, HandEyeCell, PoseRobot, Shots
+from robocal_ros.cell_sim.hand_eye_sets import (
     TrueStairs,
     edge_shots,
     groove_shots,
@@ -17,8 +15,10 @@ from robocal_ros.sim.hand_eye_sets import (
     step_shots,
     taught,
 )
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.kinematics.robots import load_robot
 
 QUIET = ProfileSensor(noise_m=0.0)
 CENTRE, RADIUS = np.array([0.75, -0.1, 0.15]), 0.02

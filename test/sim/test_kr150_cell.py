@@ -21,14 +21,11 @@ from kr150_shift import (
     worked,
 )
 
-from robocal_ros.core.fitting.sphere import SphereRule, fit_sphere
-from robocal_ros.core.thermal.drift_history import share_within
-from robocal_ros.core.tool.crossed_model import RobotNoise
-from robocal_ros.sim import kr150
-from robocal_ros.sim.cell import SimulatedCell
-from robocal_ros.sim.cell_samples import CellSamples
-from robocal_ros.sim.joint_motion import LAG_S
-from robocal_ros.sim.kr150_cell import (
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.cell import SimulatedCell
+from robocal_ros.cell_sim.cell_samples import CellSamples
+from robocal_ros.cell_sim.joint_motion import LAG_S
+from robocal_ros.cell_sim.kr150_cell import (
     DUTY,
     SPIN_RAD,
     T_FLANGE_LASER,
@@ -38,9 +35,12 @@ from robocal_ros.sim.kr150_cell import (
     kr150_cell,
     poses,
 )
-from robocal_ros.sim.production import programme
-from robocal_ros.sim.robot import Effects
-from robocal_ros.sim.thermal import Warmth
+from robocal_ros.cell_sim.production import programme
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.estimation.sphere import SphereRule, fit_sphere
+from robocal_ros.thermal.drift_history import share_within
+from robocal_ros.tool.crossed_model import RobotNoise
 
 SILENT = replace(Effects(), noise=False, outliers=False)
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from kr150_shift import ABOVE, ARM, CYCLE, HOME, WORK, cell_of, true_laser
 
-from robocal_ros.core.tool.measuring_plan import MeasuringPlan
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.kr150_cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
+from robocal_ros.cell_sim.robot import shift, turn
+from robocal_ros.cell_sim.thermal import Warmth
 from robocal_ros.motion.cell import MotionCell
 from robocal_ros.motion.housing import Housing, ToolBody
-from robocal_ros.motion.measuring import approach, measuring
-from robocal_ros.sim import kr150
-from robocal_ros.sim.kr150_cell import FLOOR, SPIN_RAD, T_BASE_LASER, TARGET, TAUGHT, poses
-from robocal_ros.sim.robot import shift, turn
-from robocal_ros.sim.thermal import Warmth
+from robocal_ros.tool.measuring_motion import approach, measuring
+from robocal_ros.tool.measuring_plan import MeasuringPlan
 
 CROSSING = T_BASE_LASER[:3, 3]
 T_BASE_SENSOR = np.linalg.inv(kr150.T_SENSOR_BASE)

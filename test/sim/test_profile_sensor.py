@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.sim.hand_eye_cell import view
-from robocal_ros.sim.profile_sensor import ProfileSensor
-from robocal_ros.sim.profile_targets import (
+from robocal_ros.cell_sim.hand_eye_cell import view
+from robocal_ros.cell_sim.profile_sensor import ProfileSensor
+from robocal_ros.cell_sim.profile_targets import (
     Scene,
     ball_on_table,
     block,
@@ -16,6 +15,7 @@ from robocal_ros.sim.profile_targets import (
     stairs,
     table,
 )
+from robocal_ros.ground import frames
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 QUIET = ProfileSensor(noise_m=0.0)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.sim import kr150
-from robocal_ros.sim.robot import Effects, TrueRobot
-from robocal_ros.sim.thermal import Warmth
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.robot import Effects, TrueRobot
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import load_robot
 
 ROBOTS = ("kr150_r3100", "ur10", "bx200l", "p1r2p3")
 SHIFT_DUTY = np.array([0.5, 1.0, 1.0, 0.8, 0.6, 0.6])

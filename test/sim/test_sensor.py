@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robocal_ros.sim import kr150
-from robocal_ros.sim.motion import Path, readings
-from robocal_ros.sim.robot import Effects
-from robocal_ros.sim.sensor import SphereSensor
-from robocal_ros.sim.shift import ShiftPlan, simulate
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.cell_sim import kr150
+from robocal_ros.cell_sim.motion import Path, readings
+from robocal_ros.cell_sim.robot import Effects
+from robocal_ros.cell_sim.sensor import SphereSensor
+from robocal_ros.cell_sim.shift import ShiftPlan, simulate
+from robocal_ros.kinematics.robots import load_robot
 
 FLANGE = np.array([[1.0, 0, 0, 1.2], [0, 0, -1.0, 0.1], [0, 1.0, 0, 0.8], [0, 0, 0, 1.0]])
 

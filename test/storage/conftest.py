@@ -8,7 +8,7 @@ sys.path.insert(0, str(Path(__file__).parent))  # for the helper modules beside 
 
 from history_workers import SERIAL
 
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from typing import Any
 
 from history_workers import SERIAL, proposal
 
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
 
 BY = {"by": "Ada", "reason": "tested", "wall_ns": 1_700_000_002_000_000_000}
 

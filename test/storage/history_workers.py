@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.core.proposals import Proposal
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.proposals import Proposal
+from robocal_ros.history.calibrations import CalibrationHistory
 
 SERIAL = "KR-7"
 _BEGUN = b"begun"

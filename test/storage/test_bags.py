@@ -16,11 +16,11 @@ import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import joint_sample, pose_sample
-from robocal_ros.storage import bag_types
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagReader, BagWriter, bag_info, read_bag
+from robocal_ros.bags import bag_types
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagReader, BagWriter, bag_info, read_bag
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import joint_sample, pose_sample
 
 JOINTS = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -206,7 +206,7 @@ def test_a_recorder_that_is_killed_loses_little(tmp_path: Path) -> None:
     path = tmp_path / "killed.mcap"
     script = (
         "import sys\n"
-        "from robocal_ros.storage.bags import BagWriter\n"
+        "from robocal_ros.bags.bags import BagWriter\n"
         "bag = BagWriter(sys.argv[1])\n"
         "for i in range(10**9):\n"
         "    message = {'name': ['a'], 'position': [i], 'header': {'stamp': {'nanosec': i}}}\n"

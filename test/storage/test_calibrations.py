@@ -9,15 +9,10 @@ import pytest
 from histories import BY, reopened
 from history_workers import proposal
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import (
-    ConflictError,
-    InputError,
-    RobocalError,
-    StaleError,
-)
-from robocal_ros.core.proposals import Action, Head, State
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.proposals import Action, Head, State
+from robocal_ros.history.calibrations import CalibrationHistory
 
 
 class TestProposals:

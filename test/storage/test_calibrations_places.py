@@ -11,17 +11,9 @@ import pytest
 from histories import BY, in_process, reopened
 from history_workers import SERIAL, proposal
 
-from robocal_ros.core.errors import (
-    InputError,
-    StorageError,
-    WrongRobotError,
-)
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_paths import (
-    history_path,
-    known_serials,
-    state_folder,
-)
+from robocal_ros.ground.errors import InputError, StorageError, WrongRobotError
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_paths import history_path, known_serials, state_folder
 
 
 class TestWrongRobot:
@@ -181,7 +173,7 @@ class TestManyProcesses:
 _ACCEPT = """
 import sys
 from pathlib import Path
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
 with CalibrationHistory.open("KR-7", state_dir=Path(sys.argv[1])) as history:
     history.accept(int(sys.argv[2]), by="other", reason="", wall_ns=1)
 """

@@ -13,15 +13,10 @@ import pytest
 from histories import BY, filled, in_process, reopened
 from history_workers import SERIAL, proposal
 
-from robocal_ros.core.errors import (
-    StorageError,
-)
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_damage import acknowledge, damage_notice, damaged_files
-from robocal_ros.storage.history_paths import (
-    history_path,
-    known_serials,
-)
+from robocal_ros.ground.errors import StorageError
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_damage import acknowledge, damage_notice, damaged_files
+from robocal_ros.history.history_paths import history_path, known_serials
 
 
 class TestTrouble:

@@ -9,13 +9,11 @@ import pytest
 from histories import filled
 from history_workers import SERIAL, proposal
 
-from robocal_ros.core.errors import (
-    StorageError,
-)
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.files import made_folder_beside
-from robocal_ros.storage.history_paths import history_path, known_serials, unused
-from robocal_ros.storage.history_schema import MIGRATIONS, SCHEMA_VERSION
+from robocal_ros.ground.errors import StorageError
+from robocal_ros.ground.files import made_folder_beside
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.history_paths import history_path, known_serials, unused
+from robocal_ros.history.history_schema import MIGRATIONS, SCHEMA_VERSION
 
 
 class TestFolderBeside:
@@ -53,7 +51,7 @@ class TestVersions:
     def test_a_failing_script_leaves_the_old_version(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        import robocal_ros.storage.history_file as module
+        import robocal_ros.history.history_file as module
 
         path = filled(tmp_path)
         kept = path.read_bytes()

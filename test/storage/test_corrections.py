@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.core.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
-from robocal_ros.storage import history_file, history_schema
-from robocal_ros.storage.calibrations import CalibrationHistory
-from robocal_ros.storage.history_paths import history_path
+from robocal_ros.history import history_file, history_schema
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.history.correction_record import CALIBRATED, NOMINAL, CorrectionRecord
+from robocal_ros.history.history_paths import history_path
 
 SERIAL = "K7"
 RECORD = CorrectionRecord(

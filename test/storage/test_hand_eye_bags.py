@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from robocal_ros.core.errors import InputError, WrongRobotError
-from robocal_ros.core.point_clouds import cloud_points
-from robocal_ros.storage.bags import read_bag
-from robocal_ros.storage.hand_eye_bags import PROFILE, read_data_set, write_data_set
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.bags.bags import read_bag
+from robocal_ros.bags.hand_eye_bags import PROFILE, read_data_set, write_data_set
+from robocal_ros.ground.errors import InputError, WrongRobotError
+from robocal_ros.ground.point_clouds import cloud_points
+from robocal_ros.kinematics.robots import load_robot
 
 ARM = load_robot("ur10")
 STAMP = 1_700_000_000_000_000_000

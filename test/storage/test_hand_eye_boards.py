@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.hand_eye.target_documents import target_document
-from robocal_ros.storage.hand_eye_targets import read_target
+from robocal_ros.ground.errors import InputError
+from robocal_ros.hand_eye.target_documents import target_document
+from robocal_ros.hand_eye.target_files import read_target
 
 BOARD = "kind: board\ncolumns: 9\nrows: 6\nsquare_mm: 25.5\n"
 CAMERA = """\

@@ -9,10 +9,9 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from robocal_ros.core.errors import InputError, TooFewSamplesError
-from robocal_ros.core.hand_eye.profile import Profile
-from robocal_ros.core.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
-from robocal_ros.storage.hand_eye_tables import (
+from robocal_ros.ground.errors import InputError, TooFewSamplesError
+from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.hand_eye.tables import (
     PoseTable,
     read_pose_table,
     read_profile,
@@ -20,8 +19,9 @@ from robocal_ros.storage.hand_eye_tables import (
     write_pose_table,
     write_profile,
 )
-from robocal_ros.storage.hand_eye_targets import read_target, write_target
-from robocal_ros.storage.robots import load_robot
+from robocal_ros.hand_eye.target_files import read_target, write_target
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, Staircase, StepTarget
+from robocal_ros.kinematics.robots import load_robot
 
 UR10 = load_robot("ur10")
 GOOD = (

@@ -9,9 +9,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from robocal_ros.core.codes import Code
-from robocal_ros.core.errors import RobocalError
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.history.calibrations import CalibrationHistory
 
 KINDS = ("thermal", "tool")
 WAYS = st.integers(0, 1)

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.samples import TAUGHT, JointBlock, joint_sample
-from robocal_ros.storage import bag_types, bag_writer
-from robocal_ros.storage.bag_writer import ros_time
-from robocal_ros.storage.bags import BagMessage, BagReader, BagWriter
+from robocal_ros.bags import bag_types, bag_writer
+from robocal_ros.bags.bag_writer import ros_time
+from robocal_ros.bags.bags import BagMessage, BagReader, BagWriter
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import TAUGHT, JointBlock, joint_sample
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POINT = "geometry_msgs/msg/PointStamped"

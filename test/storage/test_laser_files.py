@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import yaml
 
-from robocal_ros.core.errors import InputError, WrongRobotError
-from robocal_ros.core.tool.laser_frame import LaserFrame
-from robocal_ros.storage.laser_files import LaserFile, read_laser, read_laser_for, write_laser
-from robocal_ros.storage.robots import load_robot
-from robocal_ros.storage.tool_files import read_tool
+from robocal_ros.ground.errors import InputError, WrongRobotError
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.tool.files import read_tool
+from robocal_ros.tool.laser_files import LaserFile, read_laser, read_laser_for, write_laser
+from robocal_ros.tool.laser_frame import LaserFrame
 
 POINTS = np.array(
     [[0.79367, -0.12861, 0.2], [0.80558, -0.12896, 0.2], [0.797, -0.1324, 0.2], [0.797, -0.12, 0.2]]

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from robocal_ros.core.errors import StorageError
-from robocal_ros.storage.bag_recording import BagRecording
-from robocal_ros.storage.bag_types import encode
-from robocal_ros.storage.bags import BagReader
-from robocal_ros.storage.recording_folders import (
+from robocal_ros.bags.bag_recording import BagRecording
+from robocal_ros.bags.bag_types import encode
+from robocal_ros.bags.bags import BagReader
+from robocal_ros.bags.recording_folders import (
     MARKER,
     Maker,
     keep,
@@ -24,7 +23,8 @@ from robocal_ros.storage.recording_folders import (
     recordings,
     size_bytes,
 )
-from robocal_ros.storage.recording_locks import is_open
+from robocal_ros.bags.recording_locks import is_open
+from robocal_ros.ground.errors import StorageError
 
 TEXT = "std_msgs/msg/String"
 MINE, OTHER = Maker("/recorder_node", "R1"), Maker("/left/recorder_node", "R1")
@@ -275,7 +275,7 @@ def test_what_is_being_written_is_not_deleted(tmp_path: Path) -> None:
 WRITER = """
 import sys
 from pathlib import Path
-from robocal_ros.storage.bag_recording import BagRecording
+from robocal_ros.bags.bag_recording import BagRecording
 recording = BagRecording(Path(sys.argv[1]), latched=(), file_bytes=1000)
 print(flush=True)
 sys.stdin.read()

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robocal_ros.core import frames
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.storage.robots import (
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.robots import (
     find_robot,
     load_description,
     load_robot,
@@ -267,7 +267,7 @@ def test_an_installed_copy_finds_its_files_from_anywhere(tmp_path: Path) -> None
     share = prefix / "share" / "robocal_ros" / "config"
     share.mkdir(parents=True)
     subprocess.run(["cp", "-r", str(find_robot("ur10").parent), str(share)], check=True)
-    script = "from robocal_ros.storage.robots import find_robot; print(find_robot('ur10'))"
+    script = "from robocal_ros.kinematics.robots import find_robot; print(find_robot('ur10'))"
     environment = {k: v for k, v in os.environ.items() if k != "AMENT_PREFIX_PATH"}
     environment["PYTHONPATH"] = str(packages)
     done = subprocess.run(

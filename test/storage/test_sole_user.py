@@ -6,13 +6,13 @@ import time
 
 import pytest
 
-from robocal_ros.core.errors import ConflictError, StorageError
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.ground.errors import ConflictError, StorageError
+from robocal_ros.history.calibrations import CalibrationHistory
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from robocal_ros.storage.calibrations import CalibrationHistory
+from robocal_ros.history.calibrations import CalibrationHistory
 CalibrationHistory.open("K7", state_dir=Path(sys.argv[1]), sole_user="thermal_node")
 print("held", flush=True)
 time.sleep(60.0)

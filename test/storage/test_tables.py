@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from robocal_ros.core.errors import InputError
-from robocal_ros.core.kinematics import SerialArm
-from robocal_ros.core.samples import Measurements
-from robocal_ros.storage.tables import beyond_limits, read_measurements, write_measurements
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.tables import beyond_limits, read_measurements, write_measurements
 
 
 def make_arm(prismatic: tuple[bool, ...]) -> SerialArm:

@@ -1,0 +1,282 @@
+"""One MCAP file as blocks of messages, found by its index or, without one, by a scan.
+
+A file without an index is what a recorder that was killed leaves behind. Everything up to the
+first incomplete record is read. A damaged chunk is left out. What was found wrong is told.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, Schema, Statistics
+from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from zstandard import ZstdError
+
+from robocal_ros.bags.bag_types import full_name
+from robocal_ros.bags.messages import Messages
+from robocal_ros.ground.errors import InputError
+
+MAGIC = b"\x89MCAP0\r\n"
+OTHER_FORMATS = {
+    b"SQLite format 3\0": "an SQLite bag; convert it with 'ros2 bag convert' (storage_id: mcap)",
+    b"#ROSBAG V2.0": "a bag of ROS 1; convert it with 'rosbags-convert --dst-storage mcap'",
+    b"\x28\xb5\x2f\xfd": "compressed as a whole; unpack it with 'zstd -d'",
+}
+HEAD = struct.Struct("<BQ")  # opcode, length
+TIMES = struct.Struct("<QQ")
+# what the libraries raise when bytes make no sense: MCAP, zstd, lz4, numbers and text
+DAMAGE = (McapError, CRCValidationError, ZstdError, RuntimeError, struct.error, ValueError)
+KNOWN_OPCODES = frozenset(int(code) for code in Opcode)
+LOOSE_BLOCK = 1 << 20  # bytes of messages outside chunks that are read at a time
+
+
+class Block(NamedTuple):
+    """A chunk, or (``chunked`` False) a run of records outside chunks, by its place in the file.
+
+    ``channels`` that have messages in it; empty where the index does not tell.
+    """
+
+    start_ns: int
+    offset: int
+    size: int
+    chunked: bool
+    channels: frozenset[int] = frozenset()
+
+
+class Lost(NamedTuple):
+    """A damaged chunk: what is missing, by log time, and why; None where that is lost too."""
+
+    from_ns: int | None
+    to_ns: int | None
+    why: str
+
+
+@dataclass
+class McapFile:
+    """Content of a file: channels, schemas and blocks; ``notes`` say where it breaks off.
+
+    ``broke_off``: the byte at which it does. ``nameless``: messages whose channel was described in
+    what is damaged. ``lost``: damaged chunks by their place in the file, as far as they were met in
+    reading.
+    """
+
+    path: Path
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    blocks: list[Block] = field(default_factory=list)
+    counts: Counter[int] = field(default_factory=Counter)
+    start_ns: int | None = None
+    end_ns: int | None = None
+    notes: list[str] = field(default_factory=list)
+    broke_off: int | None = None
+    nameless: int = 0
+    lost: dict[int, Lost] = field(default_factory=dict)
+
+    @property
+    def is_barren(self) -> bool:
+        """Whether it broke off before any message, whole or damaged."""
+        return self.broke_off is not None and not (self.counts or self.lost)
+
+    def msgtype(self, channel: int) -> str:
+        """Full name of a channel's type; ``unknown`` where the file does not define it."""
+        schema = self.schemas.get(self.channels[channel].schema_id)
+        return full_name(schema.name) if schema else "unknown"
+
+
+def open_file(path: Path) -> McapFile:
+    """Find out what a file holds.
+
+    Raises
+    ------
+    InputError
+        When it is missing, empty or not an MCAP file.
+    """
+    try:
+        with path.open("rb") as stream:
+            _check_magic(stream, path)
+            return _indexed(stream, path) or _scanned(stream, path)
+    except FileNotFoundError as error:
+        raise InputError("no such bag", file=str(path)) from error
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(f"this bag cannot be read: {reason}", file=str(path)) from error
+
+
+def read_block(
+    stream: IO[bytes], file: McapFile, block: Block, wanted: Collection[int]
+) -> Messages | None:
+    """Messages of a block on the ``wanted`` channels, in order of log time, ties as stored.
+
+    A damaged block has none, and is added to what the file has lost.
+    """
+    data = b""
+    try:
+        stream.seek(block.offset)
+        data = stream.read(block.size)
+        found = Messages.among(_unpacked(data) if block.chunked else memoryview(data))
+    except (*DAMAGE, OSError) as error:
+        _lose(file, block, data, error)
+        return None
+    found = found.take(np.isin(found.channel, list(wanted)))
+    return found.take(np.argsort(found.log_time_ns, kind="stable"))
+
+
+def _lose(file: McapFile, block: Block, data: bytes, error: Exception) -> None:
+    """Note a damaged block with the times that stand before its content."""
+    start_ns = end_ns = None
+    if block.chunked and len(data) >= HEAD.size + TIMES.size:
+        start_ns, end_ns = TIMES.unpack_from(data, HEAD.size)
+        if not start_ns <= end_ns:
+            start_ns = end_ns = None
+    file.lost[block.offset] = Lost(start_ns, end_ns, f"at byte {block.offset}: {error}")
+
+
+def _check_magic(stream: IO[bytes], path: Path) -> None:
+    head = stream.read(16)
+    if not head:
+        raise InputError("this bag is empty: nothing was recorded", file=str(path))
+    if not head.startswith(MAGIC):
+        other = (words for start, words in OTHER_FORMATS.items() if head.startswith(start))
+        raise InputError(
+            f"this is not an MCAP file but {next(other, 'something else')}", file=str(path)
+        )
+
+
+def _indexed(stream: IO[bytes], path: Path) -> McapFile | None:
+    """Content by the index at the file's end; None when there is none, or not a whole one."""
+    try:
+        stream.seek(0)
+        summary = SeekingReader(stream).get_summary()
+    except (*DAMAGE, OSError):
+        return None
+    if summary is None or summary.statistics is None:
+        return None
+    statistics: Statistics = summary.statistics
+    counted = sum(statistics.channel_message_counts.values())
+    whole = (
+        len(summary.chunk_indexes) == statistics.chunk_count
+        and (statistics.chunk_count > 0 or statistics.message_count == 0)
+        and counted == statistics.message_count
+        and set(statistics.channel_message_counts) <= set(summary.channels)
+        and {channel.schema_id for channel in summary.channels.values()} <= {0, *summary.schemas}
+    )
+    if not whole:
+        return None
+    file = McapFile(path, summary.schemas, summary.channels)
+    file.blocks = [
+        Block(
+            chunk.message_start_time,
+            chunk.chunk_start_offset,
+            chunk.chunk_length,
+            True,
+            frozenset(chunk.message_index_offsets),
+        )
+        for chunk in summary.chunk_indexes
+    ]
+    file.counts = Counter(statistics.channel_message_counts)
+    if statistics.message_count:
+        file.start_ns, file.end_ns = statistics.message_start_time, statistics.message_end_time
+    return file
+
+
+def _scanned(stream: IO[bytes], path: Path) -> McapFile:
+    """Content by reading the file from its start to its end or first damage."""
+    file = McapFile(path)
+    loose = len(MAGIC)  # where the records begin that are in no block yet
+    damage = ""
+    for opcode, start, end, words in _records(stream):
+        if words:
+            damage, file.broke_off = words, start
+        if opcode == Opcode.CHUNK or end - loose > LOOSE_BLOCK or opcode is None:
+            _add_block(stream, file, Block(0, loose, start - loose, False))
+            loose = start
+        if opcode == Opcode.CHUNK:
+            _add_block(stream, file, Block(0, start, end - start, True))
+            loose = end
+    if damage:
+        file.notes.append(
+            f"{path}: the recording broke off {damage}; the {file.counts.total()} messages "
+            f"before that are read"
+        )
+    if file.nameless:
+        file.notes.append(
+            f"{path}: {file.nameless} messages are left out: the names of their topics are lost"
+        )
+    return file
+
+
+def _records(stream: IO[bytes]) -> Iterator[tuple[int | None, int, int, str]]:
+    """Opcode, start and end of each record of the data section.
+
+    At the end comes opcode None, with words that say why when it is not the regular end.
+    """
+    size = stream.seek(0, 2)
+    at = len(MAGIC)
+    while at + HEAD.size <= size:
+        stream.seek(at)
+        opcode, length = HEAD.unpack(stream.read(HEAD.size))
+        end = at + HEAD.size + length
+        if end > size or opcode not in KNOWN_OPCODES:
+            break
+        if opcode == Opcode.DATA_END:
+            stream.seek(-len(MAGIC), 2)
+            whole = stream.read() == MAGIC
+            yield None, at, at, "" if whole else "in the index after the last message"
+            return
+        yield opcode, at, end, ""
+        at = end
+    yield None, at, at, f"in the record at byte {at}" if at < size else "without an end mark"
+
+
+def _add_block(stream: IO[bytes], file: McapFile, block: Block) -> None:
+    """Take in a block's schemas, channels and messages; one without, or damaged, is left out."""
+    stream.seek(block.offset)
+    data = stream.read(block.size)
+    try:
+        content = _unpacked(data) if block.chunked else memoryview(data)
+        _definitions(content, file)
+        found = Messages.among(content)
+    except DAMAGE as error:
+        _lose(file, block, data, error)
+        return
+    named = found.take(np.isin(found.channel, list(file.channels)))
+    file.nameless += len(found.channel) - len(named.channel)
+    if not len(named.channel):
+        return
+    first, last = int(named.log_time_ns.min()), int(named.log_time_ns.max())
+    counts = Counter(named.channel.tolist())
+    file.counts.update(counts)
+    file.start_ns = first if file.start_ns is None else min(first, file.start_ns)
+    file.end_ns = last if file.end_ns is None else max(last, file.end_ns)
+    file.blocks.append(block._replace(start_ns=first, channels=frozenset(counts)))
+
+
+def _unpacked(record: bytes) -> memoryview:
+    """Content of a chunk record, decompressed and checked."""
+    stream = ReadDataStream(BytesIO(record[HEAD.size :]))
+    content, length = get_chunk_data_stream(Chunk.read(stream), validate_crc=True)
+    return memoryview(content.read(length))
+
+
+def _definitions(content: memoryview, file: McapFile) -> None:
+    at = 0
+    while at < len(content):
+        opcode, length = HEAD.unpack_from(content, at)
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            body = ReadDataStream(BytesIO(content[at + HEAD.size : at + HEAD.size + length]))
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(body)
+                file.schemas[schema.id] = schema
+            else:
+                channel = Channel.read(body)
+                file.channels[channel.id] = channel
+        at += HEAD.size + length

@@ -1,0 +1,258 @@
+"""Records what a dispute needs, for as long as there is room (docs/recorder_node.md)."""
+
+import socket
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from std_srvs.srv import Trigger
+
+from robocal_ros.bags.bag_recording import BagRecording
+from robocal_ros.bags.recorded_topics import DIAGNOSTICS, TOPICS, Recorded, RecordedTopics
+from robocal_ros.bags.recording_folders import MB, Maker, keep, make_room, new_folder, size_bytes
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, StorageError
+from robocal_ros.history.history_paths import state_folder
+from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.diagnostics import ERROR, WARN, Health
+from robocal_ros.ros.endpoints import trigger_text
+from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.run import run
+
+LOOK_S = 0.5
+ROOM_S = 5.0
+SHARES = 4  # a recording takes so much of the room at the most: three before it are kept
+AGAIN_S = 10.0  # after a recording broke off
+HOUR_S = 3600.0
+
+SETTINGS = (
+    Setting("topics", list(TOPICS), "What is recorded; relative names are in the namespace"),
+    Setting("folder", "", "Where recordings are kept; empty: recordings/ in the state folder"),
+    Setting("file_mb", 50.0, "A file is this large", unit="MB", low=0.1, high=10000.0),
+    Setting("hours", 8.0, "A recording is no longer than this", unit="h", low=1e-3, high=168.0),
+    Setting("keep_mb", 20000.0, "All its recordings together", unit="MB", low=1.0, high=1e7),
+    Setting("free_mb", 500.0, "So much of the disk stays free", unit="MB", low=0.0, high=1e7),
+    Setting("flush_s", 1.0, "A crash loses no more than this", unit="s", low=0.1, high=60.0),
+)
+
+
+def utc() -> str:
+    """The time now."""
+    return time.strftime("%Y-%m-%d %H:%M:%SZ", time.gmtime())
+
+
+class RecorderNode(HouseNode):
+    """Writes one recording after another; the oldest of its own are deleted."""
+
+    NAME = "recorder_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._recording: BagRecording | None = None
+        self._topics: RecordedTopics | None = None
+        self._fault = ""
+        self._no_room = ""  # why nothing may be recorded now
+        self._gone = ""  # a recording that was removed while it was written
+        self._rivals = ""  # who else says to be this recorder
+        self._left: dict[str, str] = {}  # what looks like a recording and is left alone, and why
+
+    def configure(self) -> None:
+        """Find the folder; nothing is recorded before activation."""
+        given = self.settings["folder"]
+        self._folder = Path(given) if given else state_folder() / "recordings"
+        serial, domain = self.settings["serial"], self.context.get_domain_id()
+        place = "" if serial else f"{socket.gethostname()}, domain {domain}"
+        self._maker = Maker(self.get_fully_qualified_name(), serial, place)
+        self.add_service(Trigger, "~/keep", self._keep)
+        self.add_service(Trigger, "~/split", self._split)
+        self.add_timer(LOOK_S, self._look, steady=True)
+        self.add_timer(self.settings["flush_s"], self._flush, steady=True)
+        self.add_timer(ROOM_S, self._make_room, steady=True)
+
+    def activate(self) -> None:
+        """Begin a recording."""
+        self._fault, self._lost, self._lost_since, self._deleted = "", 0, "", 0
+        self._again_s: float | None = None  # when a recording that broke off is begun again
+        self._no_room, self._gone, self._rivals, self._left = "", "", "", {}
+        self._make_room()
+        self._topics = RecordedTopics(self, self.settings["topics"], self._take)
+        self._topics.look()
+
+    def deactivate(self) -> None:
+        """Complete the recording."""
+        if self._topics is not None:
+            self._topics.close()
+        self._topics = None
+        self._complete()
+
+    # ---- what comes in --------------------------------------------------------------------------
+
+    def _take(self, recorded: Recorded, data: bytes) -> None:
+        if not self.is_active:
+            return
+        try:
+            recording = self._recording or self._begin()
+            recording.write(recorded.name, recorded.msgtype, data, self.now_ns())
+        except StorageError as error:
+            self._lost += 1
+            self._lost_since = self._lost_since or utc()
+            self._break_off(error)
+
+    def _begin(self) -> BagRecording:
+        if self._again_s is not None:
+            raise StorageError(self._fault)
+        if self._no_room:
+            raise StorageError(self._no_room)
+        latched = set() if self._topics is None else self._topics.latched
+        self._recording = BagRecording(
+            new_folder(self._folder, self._maker),
+            latched=latched,
+            file_bytes=round(self.settings["file_mb"] * MB),
+        )
+        self._begun_s, self._fault = time.monotonic(), ""
+        return self._recording
+
+    def _break_off(self, error: StorageError) -> None:
+        self._recording = None
+        if not self._fault:
+            self.get_logger().error(str(error))
+        if self._again_s is None:
+            self._fault, self._again_s = str(error), time.monotonic() + AGAIN_S
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        topics = self._topics
+        if topics is None:
+            return
+        topics.look()
+        try:
+            if self._recording is not None:
+                self._recording.look()
+        except StorageError as error:
+            self._gone = str(error)
+            self._break_off(error)
+        over_s = self.settings["hours"] * HOUR_S
+        now = time.monotonic()
+        if self._recording is not None and now - self._begun_s >= over_s:
+            self._next()
+        elif self._again_s is not None and now >= self._again_s:
+            self._again_s = None
+            self._next()
+
+    def _make_room(self) -> None:
+        recording, most = self._recording, round(self.settings["keep_mb"] * MB)
+        least_free = round(self.settings["free_mb"] * MB)
+        with suppress(OSError):  # `_look` tells of it, and room is made all the same
+            if recording is not None and size_bytes(recording.folder) >= most // SHARES:
+                self._next()
+        try:
+            room = make_room(self._folder, self._maker, most, least_free)
+        except OSError as error:
+            self._tell_left(self._left | {str(self._folder): str(error)})
+            return
+        self._deleted += len(room.deleted)
+        self._tell_left(room.left)
+        self._rivals = ", ".join(str(folder) for folder in room.rivals)
+        was, self._no_room = self._no_room, ""
+        if room.short_bytes:
+            free_mb = self.settings["free_mb"] - room.short_bytes / MB
+            self._no_room = (
+                f"{free_mb:.0f} MB are free on the disk of {self._folder}, free_mb is "
+                f"{self.settings['free_mb']:g}, and deleting its recordings would not bring that: "
+                "none is deleted, and nothing recorded until there is room"
+            )
+            self._complete()
+            if not was:
+                self.get_logger().error(self._no_room)
+
+    def _tell_left(self, left: dict[str, str]) -> None:
+        """What is left alone, once in the log."""
+        for name, why in left.items():
+            if self._left.get(name) != why:
+                self.get_logger().warning(f"{name} in {self._folder} is left alone: it {why}")
+        self._left = left
+
+    def _next(self) -> None:
+        """Begin another recording, which opens with all that is in force."""
+        self._complete()
+        if self._topics is not None:
+            self._topics.renew_latched()
+
+    def _flush(self) -> None:
+        try:
+            if self._recording is not None:
+                self._recording.flush()
+        except StorageError as error:
+            self._break_off(error)
+
+    def _complete(self) -> None:
+        recording, self._recording = self._recording, None
+        try:
+            if recording is not None:
+                recording.close()
+        except StorageError as error:
+            self._break_off(error)
+
+    # ---- services -------------------------------------------------------------------------------
+
+    def _keep(self, request: Any, response: Any) -> Any:
+        recording = self._recording
+        if recording is None:
+            raise ConflictError("nothing is being recorded: there is nothing to keep")
+        keep(recording.folder, f"kept at {utc()}")
+        response.success = True
+        response.message = trigger_text(0, Code.ACCEPT, f"{recording.folder} is kept for good")
+        return response
+
+    def _split(self, request: Any, response: Any) -> Any:
+        recording = self._recording
+        if recording is None:
+            raise ConflictError("nothing is being recorded: there is nothing to complete")
+        self._next()
+        response.success = True
+        response.message = trigger_text(0, Code.ACCEPT, f"{recording.folder} is complete")
+        return response
+
+    def health(self) -> Health:
+        """Tell what is recorded, and what is not."""
+        health, topics, recording = Health(), self._topics, self._recording
+        if self._lost:
+            health.worsen(WARN, f"{self._lost} messages since {self._lost_since} are not recorded")
+        for fault in dict.fromkeys((self._fault, self._no_room)):
+            if fault:
+                health.worsen(ERROR, fault)
+        if self._gone and self._gone != self._fault:
+            health.worsen(WARN, self._gone)
+        if self._rivals:
+            health.worsen(
+                WARN,
+                f"another recorder of this name writes {self._rivals}: of what earlier runs made "
+                "nothing is deleted; give each its serial, a name or a folder of its own",
+            )
+        if topics is None:
+            return health
+        if topics.unknown:
+            told = "; ".join(f"{topic}: {why}" for topic, why in topics.unknown.items())
+            health.worsen(WARN, f"not recorded: {told}")
+        if not topics.found.keys() - {DIAGNOSTICS}:  # which is its own, too
+            health.worsen(WARN, "none of the topics is there yet")
+        counts: dict[str, object] = {
+            f"{r.topic} recorded": r.messages for r in topics.found.values()
+        }
+        health.values = counts | {
+            "folder": "" if recording is None else recording.folder,
+            "messages": 0 if recording is None else recording.messages,
+            "not there": ", ".join(topics.missing),
+            "recordings deleted": self._deleted,
+            "left alone": "; ".join(f"{name} {why}" for name, why in self._left.items()),
+            "messages not recorded": self._lost,
+        }
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(RecorderNode, events=True)

@@ -1,0 +1,301 @@
+"""A recorded stream through the thermal session: the live node's results, off line."""
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeVar
+
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.samples import (
+    JOINTS,
+    JUMPS,
+    MEASURING,
+    TEMPERATURES,
+    UNCORRECTED,
+    JointBlock,
+    stamp_ns,
+)
+from robocal_ros.session import events
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.records import digest, read_command
+
+EVENTS = "session_events"
+NOT_BITS = "not to the last bit"
+
+
+class Recorded(Protocol):
+    """A message of a bag: its topic and the message with the attributes of the ROS type.
+
+    In place of messages that follow each other there may be a ``JointBlock``.
+    """
+
+    @property
+    def topic(self) -> str:
+        """Name of the topic."""
+
+    @property
+    def message(self) -> Any:
+        """The message."""
+
+
+class Replayed(Protocol):
+    """What a session does with commands."""
+
+    @property
+    def newest_joints_ns(self) -> int:
+        """Time of the data: what a replay's history has in place of the wall clock."""
+
+    def take_plain(self, block: JointBlock, start: int) -> int:
+        """Take the readings from ``start`` on that decide nothing: how many these are."""
+
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command."""
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command."""
+
+
+S = TypeVar("S", bound=Replayed)
+
+
+@dataclass
+class ReplayReport:
+    """What came of a replay.
+
+    ``differs`` lists recorded commands whose result here is not the recorded one, bit for bit.
+    """
+
+    outcomes: list[Outcome] = field(default_factory=list)
+    differs: list[str] = field(default_factory=list)
+    commands: int = 0
+
+
+def topic_kind(topic: str) -> str:
+    """The input that a topic name stands for: its last part."""
+    return topic.rsplit("/", 1)[-1]
+
+
+def first_configuration(messages: Iterable[Recorded]) -> Command | None:
+    """The first configuration among the events: whose they are, and the names of the inputs.
+
+    Raises
+    ------
+    InputError
+        When it cannot be read.
+    """
+    for recorded in messages:
+        if (event := recorded.message).command == events.CONFIGURE:
+            return read_command(event.command, stamp_ns(event.stamp), event.arguments)
+    return None
+
+
+def read_events(
+    messages: Iterable[Recorded], from_ns: int = 0
+) -> tuple[Command | None, list[tuple[Command, dict[str, Any]]]]:
+    """Read the recorded commands, each with its outcome, and the configuration before them.
+
+    A later configuration with another thermal model is a command too, without an outcome, where
+    the session takes this model from the thermal node.
+
+    ``from_ns`` is the stamp of the first recorded joint reading. What was commanded before it is
+    in the bag only because the topic is latched; its samples are not. It is left out, and the
+    configuration is the one that it led to.
+
+    Raises
+    ------
+    InputError
+        When an event cannot be read.
+    """
+    configured: Command | None = None
+    model: Any = None
+    before = 0  # jumps of the clock
+    found: list[tuple[Command, dict[str, Any]]] = []
+    for recorded in messages:
+        event = recorded.message
+        command = read_command(event.command, stamp_ns(event.stamp), event.arguments)
+        if command.name == events.CONFIGURE:
+            if not found:
+                configured, before = command, _jumps(command)
+            elif _takes_over(command, model):
+                found.append((command, {}))
+            model = command.arguments.get("model")
+        elif (command.stamp_ns or 0) >= from_ns:
+            found.append((command, json.loads(event.outcome)))
+        elif not found:
+            before = _jumps(command)
+    return configured, [
+        (_counted_from(before, from_ns, command), outcome) for command, outcome in found
+    ]
+
+
+def _takes_over(configured: Command, model: Any) -> bool:
+    """Whether another node has brought another thermal model into force than the one before."""
+    own = "reference" in configured.arguments
+    return not own and configured.arguments.get("model") != model
+
+
+def _jumps(command: Command) -> int:
+    return 0 if command.marks is None else command.marks.get(JUMPS, 0)
+
+
+def _counted_from(before: int, from_ns: int, command: Command) -> Command:
+    """The command with what a replay can wait for.
+
+    Jumps of the clock count from those ``before`` the recording; a topic of which nothing came
+    since the recording began, at ``from_ns``, is not awaited.
+    """
+    marks = {topic: mark for topic, mark in (command.marks or {}).items() if mark >= from_ns}
+    return replace(command, marks=marks | {JUMPS: max(_jumps(command) - before, 0)})
+
+
+def input_topics(topics: Iterable[str], configured: Command | None = None) -> dict[str, str]:
+    """Tell which recorded topic is which input of the session: topic name to input.
+
+    The configuration names them; without it the last part of a name decides. Joint states that
+    a correction node has un-corrected are never an input.
+
+    Raises
+    ------
+    InputError
+        When two topics could be the same input.
+    """
+    recorded = {} if configured is None else dict(configured.arguments.get("topics", {}))
+    if recorded:
+        return {str(topic): str(kind) for kind, topic in recorded.items()}
+    found: dict[str, str] = {}
+    for topic in sorted(topics):
+        kind = topic_kind(topic)
+        if kind not in (JOINTS, TEMPERATURES, *MEASURING) or UNCORRECTED in topic:
+            continue
+        if kind in found.values():
+            other = next(name for name, its in found.items() if its == kind)
+            raise InputError(f"both {other} and {topic} could be {kind}: record one of them")
+        found[topic] = kind
+    return found
+
+
+def needed_inputs(
+    configured: Command | None, commands: Iterable[tuple[Command, Mapping[str, Any]]]
+) -> set[str]:
+    """Inputs without whose samples recorded commands cannot come out as they did.
+
+    Those of which the marks tell samples; motor temperatures only where a learned prior uses them.
+    """
+    marks = {mark for command, _ in commands for mark in command.marks or {}}
+    inputs = {mark.split("/")[0] for mark in marks - {JUMPS}}  # of edges each beam has its own
+    config = {} if configured is None else configured.arguments.get("config", {})
+    unused = {TEMPERATURES} if config.get("prior", "default") == "default" else set()
+    return inputs - unused
+
+
+@dataclass(frozen=True)
+class One:
+    """One sample of a recording."""
+
+    topic: str
+    message: Any
+
+
+def one_by_one(session: Replayed, messages: Iterable[Recorded]) -> Iterator[Recorded]:
+    """Samples that may decide something; joint readings that do not, the session takes at once.
+
+    It has the rest of a block of them before the next sample is asked for.
+    """
+    for recorded in messages:
+        block = recorded.message
+        if not isinstance(block, JointBlock):
+            yield recorded
+            continue
+        start = session.take_plain(block, 0)
+        while start < len(block):
+            yield One(recorded.topic, block.sample(start))
+            start += 1
+            start += session.take_plain(block, start)
+
+
+def feed(
+    session: S,
+    recorded: Recorded,
+    topics: Mapping[str, str] | None,
+    take: Callable[[S, str, Any], None],
+) -> None:
+    """Give a recorded sample to the session; one that cannot be used is counted.
+
+    ``topics``: see `input_topics`; without it the last part of the name decides.
+    """
+    topic = recorded.topic
+    kind = topic_kind(topic) if topics is None else topics.get(topic, "")
+    take(session, kind, recorded.message)
+
+
+def replay(
+    session: S,
+    messages: Iterable[Recorded],
+    commands: Sequence[tuple[Command, Mapping[str, Any]]],
+    topics: Mapping[str, str] | None,
+    take: Callable[[S, str, Any], None],
+) -> ReplayReport:
+    """Play samples through a session and carry out commands where they were carried out.
+
+    ``commands``: each with its recorded outcome (empty: none was recorded). Ids of calibrations
+    differ between histories; a recorded id is translated to the one given here.
+    ``topics``: see `input_topics`; ``take`` gives a message of an input to the session.
+    """
+    report = ReplayReport(commands=len(commands))
+    expected = iter(commands)
+    ids: dict[int, int] = {}
+    awaited = _submit_next(session, expected, ids)
+    for recorded in one_by_one(session, messages):
+        feed(session, recorded, topics, take)
+        while awaited is not None and (done := session.step(wall_ns=session.newest_joints_ns)):
+            awaited = _take(session, report, done, awaited, expected, ids)
+    while awaited is not None:
+        done = session.step(wall_ns=session.newest_joints_ns, force=True)
+        awaited = _take(session, report, done, awaited, expected, ids)
+    return report
+
+
+def _submit_next(
+    session: Replayed,
+    expected: Iterator[tuple[Command, Mapping[str, Any]]],
+    ids: Mapping[int, int],
+) -> Mapping[str, Any] | None:
+    following = next(expected, None)
+    if following is None:
+        return None
+    command, outcome = following
+    arguments = dict(command.arguments)
+    if arguments.get("id"):
+        arguments["id"] = ids.get(int(arguments["id"]), int(arguments["id"]))
+    session.submit(Command(command.name, arguments, command.stamp_ns, command.marks))
+    return outcome
+
+
+def _take(
+    session: Replayed,
+    report: ReplayReport,
+    done: list[Outcome],
+    recorded: Mapping[str, Any],
+    expected: Iterator[tuple[Command, Mapping[str, Any]]],
+    ids: dict[int, int],
+) -> Mapping[str, Any] | None:
+    outcome = done[-1]
+    report.outcomes.append(outcome)
+    if recorded:
+        if recorded["id"] and outcome.calibration_id:
+            ids.setdefault(int(recorded["id"]), outcome.calibration_id)
+        report.differs += _difference(outcome, recorded)
+    return _submit_next(session, expected, ids)
+
+
+def _difference(outcome: Outcome, recorded: Mapping[str, Any]) -> list[str]:
+    """In what an outcome is not the recorded one, in words; empty where it is, bit for bit."""
+    counted, bits = (int(outcome.status), outcome.samples), digest(outcome.document)
+    same = counted == (recorded["status"], recorded["samples"])
+    if same and bits == recorded["digest"]:
+        return []
+    which = f"{outcome.command.name} at {outcome.command.stamp_ns} ns"
+    told, found = recorded["message"], outcome.message
+    if same and told == found:
+        return [f"{which}: as recorded in its words, {NOT_BITS}: '{told}'"]
+    return [f"{which}: recorded '{told}', here '{found}'"]

@@ -1,0 +1,279 @@
+"""Plays a bag into the graph with /clock; tells what was not received (docs/replay_node.md)."""
+
+import json
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+
+from robocal_ros.bags.bags import BagMessage, BagReader
+from robocal_ros.bags.replay_topics import CLOCK, ReplayTopics, chosen_topics
+from robocal_ros.ground.errors import ConflictError, InputError, RobocalError
+from robocal_ros.ground.places import share_folders
+from robocal_ros.ros import qos
+from robocal_ros.ros.base import HouseNode
+from robocal_ros.ros.conversions import time_message
+from robocal_ros.ros.diagnostics import ERROR, WARN, Health
+from robocal_ros.ros.endpoints import LOG_EVERY_S
+from robocal_ros.ros.parameters import Setting
+from robocal_ros.ros.run import run
+
+TICK_S = 0.002
+BATCH = 200
+STATUS_S = 1.0
+PATIENCE_S = 0.05  # a tick waits at most so long for acknowledgements
+EXIT_LOSS = 3
+DDS_PROFILE = "replay_dds.xml"
+
+WAITING, PLAYING, PAUSED, DONE, FAILED = "waiting", "playing", "paused", "done", "failed"
+NO_BAG = "no bag"
+GIVE_BAG = "no bag: set the parameter 'bag' to an MCAP file or a recording's folder"
+
+SETTINGS = (
+    Setting("bag", "", "MCAP file, or folder of a recording; empty: nothing to play yet"),
+    Setting(
+        "rate",
+        1.0,
+        "Speed of the recorded time; 0: as fast as it is acknowledged",
+        low=0.0,
+        high=1000.0,
+    ),
+    Setting("topics", [""], "What to play; empty: all that moves nothing"),
+    Setting("remap", [""], "Entries recorded:=played"),
+    Setting("latched", ["/tf_static"], "Played topics whose last messages are kept for latecomers"),
+    Setting("wait_for_subscribers", [""], "Played topics that must have a subscriber first"),
+    Setting("start_delay_s", 0.0, "Pause before the first message", unit="s", low=0.0, high=600.0),
+    Setting("start_paused", False, "Wait for ~/play"),
+    Setting(
+        "acknowledge_timeout_s",
+        5.0,
+        "Longest wait for a subscriber's acknowledgement before it is reported",
+        unit="s",
+        low=0.1,
+        high=600.0,
+    ),
+    Setting("exit_at_end", False, "End the process: status 0, or 3 when anything was lost"),
+)
+
+
+class ReplayNode(HouseNode):
+    """Plays a bag."""
+
+    NAME = "replay_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._reader: BagReader | None = None
+        self._topics: ReplayTopics | None = None
+        self._play_state, self._fault = WAITING, ""
+
+    def configure(self) -> None:
+        """Open the bag and make the publishers."""
+        self._status = self.add_output(String, "~/status", qos.LATCHED)
+        self.add_service(Trigger, "~/play", self._play)
+        self.add_service(Trigger, "~/pause", self._pause)
+        if self.settings["bag"]:
+            self._open(Path(self.settings["bag"]).expanduser())
+        else:
+            self.get_logger().warning(GIVE_BAG)
+
+    def _open(self, bag: Path) -> None:
+        settings = self.settings
+        self._reader = BagReader(bag)
+        self._info = self._reader.info
+        recorded = {name: topic.msgtype for name, topic in self._info.topics.items()}
+        chosen, left = chosen_topics(recorded, settings["topics"], settings["remap"])
+        self._topics = ReplayTopics(self, settings["latched"])
+        for topic, name in chosen.items():
+            self._topics.add(topic, name, recorded[topic])
+        self._topics.skipped |= left
+        self._topics.require(settings["wait_for_subscribers"])
+        # A clock that nothing drives would hold up every node on simulated time.
+        self._clock_out = self.add_output(
+            Clock, CLOCK, QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        )
+        self.add_timer(TICK_S, self._tick, steady=True)
+        self.add_timer(STATUS_S, self._report, steady=True)
+        self.add_timer(LOG_EVERY_S, self._tell_waiting, steady=True)
+
+    def activate(self) -> None:
+        """Begin at the start of the bag."""
+        if self._reader is None or self._topics is None:
+            self._set_state(NO_BAG)
+            return
+        self._messages: Iterator[BagMessage] = self._reader.messages(
+            list(self._topics.played), raw=True
+        )
+        self._next = next(self._messages, None)
+        self._first_ns = self._position_ns = 0 if self._next is None else self._next.log_time_ns
+        self._begin = time.monotonic() + self.settings["start_delay_s"]
+        self._unsettled_since: float | None = None
+        self._set_state(PAUSED if self.settings["start_paused"] else WAITING)
+
+    def deactivate(self) -> None:
+        """Stop where it is."""
+        self._set_state(PAUSED)
+
+    def cleanup(self) -> None:
+        """Close the bag."""
+        if self._topics is not None:
+            self._topics.close()
+        if self._reader is not None:
+            self._reader.__exit__(None, None, None)
+        self._topics = self._reader = None
+
+    # ---- playing --------------------------------------------------------------------------------
+
+    def _tick(self) -> None:
+        topics = self._topics
+        if topics is None or self._play_state not in (WAITING, PLAYING):
+            return
+        now = time.monotonic()
+        if self._play_state == WAITING:
+            if now < self._begin or topics.unheard(self.settings["wait_for_subscribers"]):
+                return
+            self._start(now)
+        if not self._settled(topics, now):
+            return
+        try:
+            self._send(topics, now)
+        except RobocalError as error:
+            self._fault = str(error)
+            self._end(FAILED)
+
+    def _send(self, topics: ReplayTopics, now: float) -> None:
+        rate, sent = self.settings["rate"], 0
+        while self._next is not None and sent < BATCH:
+            if rate and self._next.log_time_ns > self._due_ns(now, rate):
+                break
+            self._position_ns = max(self._position_ns, self._next.log_time_ns)
+            topics.publish(self._next.topic, self._next.message)
+            self._next = next(self._messages, None)
+            sent += 1
+        if sent or rate:
+            self._tell_time(now, rate)
+        self._unsettled_since = now if sent else self._unsettled_since
+        if self._next is None and self._settled(topics, time.monotonic()):
+            self._end(DONE)
+
+    def _due_ns(self, now: float, rate: float) -> int:
+        return self._from_ns + int((now - self._since) * rate * 1e9)
+
+    def _tell_time(self, now: float, rate: float) -> None:
+        """/clock runs on between messages, and never beyond the next one or back."""
+        if rate and self._next is not None:
+            self._position_ns = max(self._position_ns, self._due_ns(now, rate))
+        self._clock_out.publish(Clock(clock=time_message(self._position_ns)))
+
+    def _settled(self, topics: ReplayTopics, now: float) -> bool:
+        """Whether everything sent was acknowledged, or given up and reported."""
+        if self._unsettled_since is None:
+            return True
+        if not topics.settle(PATIENCE_S):
+            if now - self._unsettled_since < self.settings["acknowledge_timeout_s"]:
+                return False
+            topics.give_up()
+            self.get_logger().error(f"{topics.unacknowledged} messages were not acknowledged")
+        self._unsettled_since = None
+        return True
+
+    def _start(self, now: float) -> None:
+        self._since, self._from_ns = now, self._position_ns
+        self._set_state(PLAYING)
+
+    def _tell_waiting(self) -> None:
+        if self._topics is None or self._play_state != WAITING:
+            return
+        missing = self._topics.unheard(self.settings["wait_for_subscribers"])
+        if missing:
+            self.get_logger().info(f"waiting for subscribers of {', '.join(missing)}")
+
+    def _end(self, state: str) -> None:
+        self._set_state(state)
+        doubt = self._topics.doubt() if self._topics is not None else ""
+        if doubt:
+            self.get_logger().error(f"{state}: loss cannot be excluded: {doubt}")
+        else:
+            alone = self._topics.alone() if self._topics is not None else ""
+            self.get_logger().info(f"{state}: nothing was lost{alone}")
+        if self.settings["exit_at_end"]:
+            lost = state == FAILED or bool(doubt)
+            self._status.wait_for_all_acked(Duration(seconds=1))
+            raise SystemExit(EXIT_LOSS if lost else 0)
+
+    # ---- services and status --------------------------------------------------------------------
+
+    def _play(self, request: Any, response: Any) -> Any:
+        if self._topics is None:
+            raise InputError(GIVE_BAG)
+        if self._play_state in (DONE, FAILED):
+            raise ConflictError(f"the bag is {self._play_state}: activate the node anew to repeat")
+        if self._play_state == PAUSED:
+            if self._topics.unheard(self.settings["wait_for_subscribers"]):
+                self._set_state(WAITING)
+            else:
+                self._start(time.monotonic())
+        response.success, response.message = True, self._play_state
+        return response
+
+    def _pause(self, request: Any, response: Any) -> Any:
+        if self._play_state in (WAITING, PLAYING):
+            self._set_state(PAUSED)
+        response.success, response.message = True, self._play_state
+        return response
+
+    def _set_state(self, state: str) -> None:
+        self._play_state = state
+        self._report()
+
+    def _report(self) -> None:
+        if self._topics is None or self._reader is None:
+            self._status.publish(String(data=json.dumps({"state": self._play_state})))
+            return
+        self._topics.look()
+        status = {
+            "state": self._play_state,
+            "bag": self._info.path,
+            "position_s": (self._position_ns - self._first_ns) * 1e-9,
+            "notes": list(self._reader.info.notes),
+            "fault": self._fault,
+            **self._topics.report(),
+        }
+        self._status.publish(String(data=json.dumps(status, sort_keys=True)))
+
+    def health(self) -> Health:
+        """Tell how far it is and what was lost."""
+        health, topics = Health(message=self._play_state), self._topics
+        if topics is None:
+            return health
+        report = topics.report()
+        if self._fault:
+            health.worsen(ERROR, self._fault)
+        if topics.unacknowledged:
+            health.worsen(ERROR, f"{topics.unacknowledged} messages were not acknowledged")
+        for topic, nodes in report["best_effort"].items():
+            health.worsen(WARN, f"{topic}: {', '.join(nodes)} is best-effort, loss is not seen")
+        health.values = {f"{topic} sent": count for topic, count in report["sent"].items()}
+        return health
+
+
+def ask_for_acknowledgements() -> None:
+    """Make Fast DDS ask for them every few ms; by default a batch would take up to 3 s."""
+    for folder in share_folders("robocal_ros", "config", "config"):
+        if (folder / DDS_PROFILE).is_file():
+            os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(folder / DDS_PROFILE))
+            return
+
+
+def main() -> None:
+    """Run the node."""
+    ask_for_acknowledgements()
+    run(ReplayNode)

@@ -1,0 +1,282 @@
+"""True edges: a round tool moved through beams of finite width, each edge found on the geometry.
+
+Seen along a beam the tool is a chain of discs and their common tangents; its distance from the
+beam's middle is that of a point from such outlines. Nothing of the estimators' line geometry is
+used, so that a mistake there cannot hide.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robocal_ros.ground import frames
+from robocal_ros.tool.beam_edges import BEAMS, Beam, BeamEdge
+
+Array = NDArray[np.float64]
+Poses = Callable[[Array], Array]
+
+GRID_S = 2e-3  # no shadow is shorter
+HALVINGS = 40
+FINEST_S = 1e-9  # what a perfect input claims
+
+
+@dataclass(frozen=True, eq=False)
+class RoundTool:
+    """A tool of revolution with a round tip.
+
+    Attributes
+    ----------
+    T_flange_tool : (4, 4) its tip, and its axis from flange to tip along z.
+    height, radius : (k,) of spheres above the tip, m; the tool is the hull of each two in turn.
+        The lowest one touches the tip: its height is its radius.
+    """
+
+    T_flange_tool: Array
+    height: Array
+    radius: Array
+
+    def __post_init__(self) -> None:
+        if self.height[0] != self.radius[0]:
+            raise ValueError("the lowest sphere must touch the tip: height equal to radius")
+
+    @classmethod
+    def cylinder(cls, T_flange_tool: Array, radius: float, length: float = 0.12) -> "RoundTool":
+        """A pin of one radius."""
+        return cls(T_flange_tool, np.array([radius, length]), np.array([radius, radius]))
+
+    @classmethod
+    def cone(
+        cls, T_flange_tool: Array, tip_radius: float, taper: float, length: float = 0.12
+    ) -> "RoundTool":
+        """A cone whose radius grows by ``taper`` per length above the tip."""
+        slope = taper / np.hypot(1.0, taper)  # of the spheres that touch it from within
+        height = np.array([tip_radius, length])
+        return cls(T_flange_tool, height, tip_radius + slope * (height - tip_radius))
+
+    @classmethod
+    def torch(cls, T_flange_tool: Array, wire: float, nozzle: float) -> "RoundTool":
+        """A wire of 15 mm below a cylindrical nozzle."""
+        height = np.array([wire, 0.013, 0.018, 0.12])
+        return cls(T_flange_tool, height, np.array([wire, wire, nozzle, nozzle]))
+
+    def mounted(self, T_flange_tool: Array) -> "RoundTool":
+        """The same tool, bent or shifted."""
+        return RoundTool(T_flange_tool, self.height, self.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class TrueBeam:
+    """A beam, base.
+
+    Attributes
+    ----------
+    start, end : (3,) points on its middle, from emitter to receiver, m.
+    diameter : m.
+    dark_at, light_at : shares of its light still there when the input switches; their difference
+        is the receiver's hysteresis.
+    """
+
+    start: Array
+    end: Array
+    diameter: float = 8e-4
+    dark_at: float = 0.5
+    light_at: float = 0.5
+
+    def clearance(self, tool: RoundTool, T_base_flange: Array) -> Array:
+        """Distance (m,) of the tool's surface from the beam's middle, negative inside."""
+        T = T_base_flange @ tool.T_flange_tool
+        centres = T[:, None, :3, 3] - tool.height[None, :, None] * T[:, None, :3, 2]
+        outline = (centres - self.start) @ self._across.T
+        parts = [
+            _hull_distance(outline[:, i], outline[:, i + 1], tool.radius[i], tool.radius[i + 1])
+            for i in range(len(tool.height) - 1)
+        ]
+        return np.asarray(np.min(parts, axis=0))
+
+    @cached_property
+    def levels(self) -> tuple[float, float]:
+        """Clearances at which the input goes dark, and light again."""
+        return self.threshold(self.dark_at), self.threshold(self.light_at)
+
+    @cached_property
+    def _across(self) -> Array:
+        """Two directions across the beam (2, 3)."""
+        u = (self.end - self.start) / np.linalg.norm(self.end - self.start)
+        return np.asarray(np.linalg.svd(u[None])[2][1:])
+
+    def threshold(self, light: float) -> float:
+        """Clearance at which a straight edge leaves this share of the light."""
+        low, high = -1.0, 1.0
+        for _ in range(HALVINGS):  # share of a disc on one side of a chord
+            x = 0.5 * (low + high)
+            share = 0.5 + (np.arcsin(x) + x * np.sqrt(1.0 - x * x)) / np.pi
+            low, high = (x, high) if share < light else (low, x)
+        return 0.5 * self.diameter * low
+
+
+def _hull_distance(a: Array, b: Array, radius_a: float, radius_b: float) -> Array:
+    """Signed distance (m,) of the origin from the hull of two discs with centres (m, 2)."""
+    along = b - a
+    length = np.linalg.norm(along, axis=1)
+    e = along / length[:, None]
+    slope = np.clip((radius_a - radius_b) / length, -1.0, 1.0)  # one may hold the other
+    cosine = np.sqrt(1.0 - slope**2)
+    y = -np.sum(a * e, axis=1)
+    x = np.abs(-a[:, 0] * e[:, 1] + a[:, 1] * e[:, 0])
+    foot = cosine * y - slope * x  # along the common tangent
+    distance = np.where(
+        foot < 0.0, np.linalg.norm(a, axis=1) - radius_a, slope * y + cosine * x - radius_a
+    )
+    beyond = foot > cosine * length
+    return np.asarray(np.where(beyond, np.linalg.norm(b, axis=1) - radius_b, distance))
+
+
+@dataclass(frozen=True)
+class TrueInput:
+    """What happens between a beam and a stamp.
+
+    Attributes
+    ----------
+    latency_s, jitter_s : constant and random delay.
+    sample_period_s : period of the input; an edge is seen at the next sample. 0: by interrupt.
+    first_sample_s : time of one of its samples; None: another one for each motion.
+    bounce_s : largest time for which a contact bounces; 0: none does.
+    lost_share : chance that an edge is never reported.
+    """
+
+    latency_s: float = 0.0
+    jitter_s: float = 20e-6
+    sample_period_s: float = 0.0
+    first_sample_s: float | None = None
+    bounce_s: float = 0.0
+    lost_share: float = 0.0
+
+
+@dataclass(frozen=True)
+class TrueNoise:
+    """The robot's scatter, m: one shift of each step, and a further one at each edge."""
+
+    step_m: float = 3e-5
+    edge_m: float = 1e-5
+
+
+NO_NOISE = TrueNoise(0.0, 0.0)
+PERFECT = TrueInput(jitter_s=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BeamStation:
+    """Two crossed beams and their input."""
+
+    beams: tuple[TrueBeam, TrueBeam]
+    input: TrueInput = field(default_factory=TrueInput)
+    noise: TrueNoise = field(default_factory=TrueNoise)
+
+    def edges(
+        self,
+        tool: RoundTool,
+        poses: Poses,
+        window: tuple[float, float],
+        rng: np.random.Generator,
+    ) -> list[BeamEdge]:
+        """Edges while the flange moves by ``poses`` (times -> T_base_flange), as reported."""
+        shift = np.zeros((4, 4))
+        shift[:3, 3] = self.noise.step_m * rng.standard_normal(3)
+        found: list[BeamEdge] = []
+        for name, beam in zip(BEAMS, self.beams, strict=True):
+            time, blocked = crossings(
+                beam, tool, lambda t: poses(t) + shift, window, self.noise.edge_m, rng
+            )
+            stamps = reported(time, self.input, rng)
+            for stamp, dark in zip(stamps.tolist(), blocked.tolist(), strict=True):
+                if rng.random() >= self.input.lost_share:
+                    found += _bounced(name, dark, stamp, self.input, rng)
+        return sorted(found, key=lambda e: e.time_s)
+
+
+def crossings(
+    beam: TrueBeam,
+    tool: RoundTool,
+    poses: Poses,
+    window: tuple[float, float],
+    scatter_m: float,
+    rng: np.random.Generator,
+) -> tuple[Array, NDArray[np.bool_]]:
+    """True times (k,) of the edges in a window, and whether each one is a break."""
+    grid = np.arange(window[0], window[1] + 0.5 * GRID_S, GRID_S)
+    clear = beam.clearance(tool, poses(grid))
+    dark, light = beam.levels
+    breaks = np.flatnonzero((clear[:-1] > dark) & (clear[1:] <= dark))
+    restores = np.flatnonzero((clear[:-1] <= light) & (clear[1:] > light))
+    first = np.concatenate([breaks, restores])
+    blocked = np.arange(len(first)) < len(breaks)
+    level = np.where(blocked, dark, light) + scatter_m * rng.standard_normal(len(first))
+    low, high = grid[first] - GRID_S, grid[first + 1] + GRID_S
+    for _ in range(HALVINGS if len(first) else 0):
+        middle = 0.5 * (low + high)
+        past = (beam.clearance(tool, poses(middle)) <= level) == blocked
+        low, high = np.where(past, low, middle), np.where(past, middle, high)
+    order = np.argsort(low)
+    return low[order], blocked[order]
+
+
+def reported(time: ArrayLike, source: TrueInput, rng: np.random.Generator) -> Array:
+    """Stamps (k,) of edges at true times (k,)."""
+    late = np.asarray(time) + source.latency_s
+    late = late + source.jitter_s * rng.standard_normal(late.shape)
+    period = source.sample_period_s
+    if period > 0.0:
+        first = source.first_sample_s
+        phase = period * rng.random() if first is None else first
+        late = np.ceil((late - phase) / period) * period + phase
+    return np.asarray(late)
+
+
+def _bounced(
+    beam: Beam, blocked: bool, stamp: float, source: TrueInput, rng: np.random.Generator
+) -> Sequence[BeamEdge]:
+    spread = np.hypot(source.jitter_s, source.sample_period_s / np.sqrt(12.0))
+    sigma = max(float(spread), FINEST_S)
+    times = [stamp]
+    if source.bounce_s > 0.0:
+        times += sorted((stamp + source.bounce_s * rng.random(2)).tolist())
+    return [
+        BeamEdge(beam, blocked if i % 2 == 0 else not blocked, t, sigma)
+        for i, t in enumerate(times)
+    ]
+
+
+def beams_of(
+    T_base_laser: Array, beam_angle_rad: float, gap_m: float = 0.0, length: float = 0.1
+) -> tuple[TrueBeam, TrueBeam]:
+    """Two beams that cross on z of a frame; the y-beam passes ``gap_m`` above the x-beam."""
+    angles = np.array([0.0, beam_angle_rad])
+    made = []
+    for angle, height in zip(angles, (-0.5 * gap_m, 0.5 * gap_m), strict=True):
+        along = 0.5 * length * np.array([np.cos(angle), np.sin(angle), 0.0])
+        ends = np.array([-along, along]) + np.array([0.0, 0.0, height])
+        ends = ends @ T_base_laser[:3, :3].T + T_base_laser[:3, 3]
+        made.append(TrueBeam(ends[0], ends[1]))
+    return made[0], made[1]
+
+
+def bent(T_flange_tool: Array, shift: ArrayLike, tilt_rad: ArrayLike) -> Array:
+    """A tool pose (4, 4) shifted (3,), m, and tilted by a rotation vector (3,), flange axes."""
+    R = frames.exp_rotation(tilt_rad) @ T_flange_tool[:3, :3]
+    return frames.transform(R, T_flange_tool[:3, 3] + np.asarray(shift))
+
+
+def on_one_clock(station: BeamStation, phase: float) -> BeamStation:
+    """The station whose input is sampled on one clock, ``phase`` of a period late.
+
+    The scatter of its motions is left to the robot.
+    """
+    source = station.input
+    return replace(
+        station,
+        input=replace(source, first_sample_s=source.sample_period_s * phase),
+        noise=TrueNoise(0.0, station.noise.edge_m),
+    )

@@ -1,0 +1,266 @@
+"""What may go wrong in the simulated cell, and what faults of the input make of its edges."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.cell_sim.beams import BeamStation, RoundTool, bent
+from robocal_ros.ground import frames
+from robocal_ros.tool.beam_edges import Beam, BeamEdge
+
+Array = NDArray[np.float64]
+
+Fault = Literal[
+    "none",
+    "collision",
+    "wrong_tool",
+    "sensor_knocked",
+    "sphere_knocked",
+    "beam_dirty",
+    "beam_x_dead",
+    "beam_y_dead",
+    "beams_dead",
+    "chatter",
+    "lost_edge",
+    "double_edge",
+    "swapped_cables",
+    "wrong_station",
+    "input_latency",
+    "lost_messages",
+    "joints_silent",
+    "frozen_clock",
+    "clock_jump",
+    "sensor_clock_jump",
+    "frozen_encoder",
+    "swapped_temperatures",
+    "moved_by_hand",
+    "station_knocked",
+    "station_knocked_shift",
+    "station_knocked_turn",
+]
+ControllerFault = Literal[
+    "commands_lost",
+    "commands_lossy",
+    "commands_late",
+    "commands_rejected",
+    "protective_stop",
+    "speed_scaling",
+    "odd_lengths",
+    "clock_reset",
+]
+FAULTS: tuple[Fault, ...] = get_args(Fault)
+CONTROLLER_FAULTS: tuple[ControllerFault, ...] = get_args(ControllerFault)
+"""Of the way to the controller, of its speed and of what it reports; none of what is measured."""
+AnyFault = Fault | ControllerFault
+
+SIZES: Mapping[AnyFault, tuple[float, float, str]] = {
+    "collision": (2.0, 1e-3, "mm"),
+    "wrong_tool": (10.0, 1e-3, "mm"),
+    "sensor_knocked": (1.0, 1e-3, "mm"),
+    "sphere_knocked": (1.0, 1e-3, "mm"),
+    "beam_dirty": (0.4, 1.0, ""),
+    "input_latency": (20.0, 1e-3, "ms"),
+    "lost_messages": (0.2, 1.0, ""),
+    "clock_jump": (1.0, 1.0, "s"),
+    "sensor_clock_jump": (1.0, 1.0, "s"),
+    "frozen_encoder": (3.0, 1.0, ""),
+    "moved_by_hand": (1.0, 1e-3, "mm"),
+    "commands_lost": (1.0, 1.0, ""),
+    "commands_lossy": (0.01, 1.0, ""),
+    "commands_late": (200.0, 1e-3, "ms"),
+    "protective_stop": (10.0, 1.0, "s"),
+    "speed_scaling": (50.0, 1e-2, "%"),
+    "odd_lengths": (1.0, 1.0, ""),
+    "station_knocked": (2.0, 1e-3, "mm"),
+    "station_knocked_shift": (2.0, 1e-3, "mm"),
+    "station_knocked_turn": (0.5, float(np.radians(1.0)), "deg"),
+}
+"""Faults that have a size: the usual one, the factor of its unit, and this unit."""
+
+NEXT_MOTION: frozenset[AnyFault] = frozenset(
+    {
+        "beam_x_dead",
+        "beam_y_dead",
+        "beams_dead",
+        "chatter",
+        "lost_edge",
+        "double_edge",
+        "wrong_station",
+        "joints_silent",
+        "frozen_clock",
+        "moved_by_hand",
+    }
+)
+"""Faults that begin with the robot's next motion; the others begin at once."""
+
+LASTING: frozenset[AnyFault] = frozenset(
+    {
+        "collision",
+        "wrong_tool",
+        "sensor_knocked",
+        "sphere_knocked",
+        "station_knocked",
+        "station_knocked_shift",
+        "station_knocked_turn",
+    }
+)
+"""What was moved or mounted stays so while other faults come and go."""
+
+FAR = np.array([0.0, 0.0, -1e3])  # m
+BENT = np.array([0.6, -0.7, 0.38])  # of a collision, flange axes; about unit length
+LEVER_M = 0.15  # between the bend and the tip
+THICKER = 0.1  # of a wrong tool: growth of its radius over that of its length
+KNOCK = np.array([0.8, 0.3, -0.5])  # of the sensor, its own axes
+TURN = np.array([0.6, -0.8, 0.0])
+TURN_RAD_PER_M = 1.0
+BALL_KNOCK = np.array([0.6, 0.0, -0.8])  # flange axes
+HAND = np.array([0.7, -0.7, 0.0])  # base
+STATION_TURN_RAD_PER_M = float(np.radians(500.0))  # of a knock that also turns: 0.5 deg for 1 mm
+STATION_KNOCKED = 31  # names the draw of a knock's directions
+CHATTER = 7  # edges that one edge becomes
+CHATTER_S = 3e-4
+AGAIN_S = 5e-3  # a double edge comes so much later
+
+
+def size_of(fault: AnyFault, size: float = 0.0) -> float:
+    """A fault's size in SI from one in its own unit; 0: the usual one."""
+    usual, unit, _ = SIZES.get(fault, (0.0, 1.0, ""))
+    return (size or usual) * unit
+
+
+@dataclass
+class Faults:
+    """What is wrong now.
+
+    Attributes
+    ----------
+    sizes : size, in SI, of each fault in force.
+    seed : of the cell; the directions in which its station is knocked follow from it.
+    """
+
+    sizes: dict[AnyFault, float] = field(default_factory=dict)
+    seed: int = 0
+
+    def __contains__(self, fault: AnyFault) -> bool:
+        return fault in self.sizes
+
+    def size(self, fault: AnyFault) -> float:
+        """Size of a fault, 0 where it is not in force."""
+        return self.sizes.get(fault, 0.0)
+
+    def tool(self, mounted: RoundTool) -> RoundTool:
+        """The tool as it is after a collision, or another one in its place."""
+        if "wrong_tool" in self:
+            longer = self.size("wrong_tool")
+            T = mounted.T_flange_tool @ frames.transform(np.eye(3), [0.0, 0.0, longer])
+            wider, height = THICKER * max(longer, 0.0), mounted.height + longer
+            height[0] = mounted.height[0] + wider
+            mounted = RoundTool(T, height, mounted.radius + wider)
+        if "collision" in self:
+            shift = self.size("collision") * BENT
+            tilt = np.array([-shift[1], shift[0], 0.0]) / LEVER_M
+            mounted = mounted.mounted(bent(mounted.T_flange_tool, shift, tilt))
+        return mounted
+
+    @property
+    def T_sensor_knock(self) -> Array:
+        """Takes points (4, 4) in the sensor's frame to where the knocked sensor sees them."""
+        size = self.size("sensor_knocked")
+        return frames.transform(frames.exp_rotation(size * TURN_RAD_PER_M * TURN), size * KNOCK)
+
+    @property
+    def ball_shift(self) -> Array:
+        """How far (3,) the sphere sits from its place, flange axes, m."""
+        return self.size("sphere_knocked") * BALL_KNOCK
+
+    @property
+    def hand(self) -> Array:
+        """How far (3,) a hand moves the flange, base, m."""
+        return self.size("moved_by_hand") * HAND
+
+    def T_station_knock(self, crossing: Array) -> Array:
+        """Takes points (4, 4) of the station, base, to where they are after a knock.
+
+        The station turns about ``crossing`` (3,) and shifts. Both directions are drawn once for a
+        cell, one evenly in space each.
+        """
+        both = self.size("station_knocked")
+        shift_m = both + self.size("station_knocked_shift")
+        turn_rad = both * STATION_TURN_RAD_PER_M + self.size("station_knocked_turn")
+        ways = np.random.default_rng([self.seed, STATION_KNOCKED]).standard_normal((2, 3))
+        ways /= np.linalg.norm(ways, axis=1)[:, None]
+        R = frames.exp_rotation(turn_rad * ways[1])
+        return frames.transform(R, crossing - R @ crossing + shift_m * ways[0])
+
+    def station(self, clean: BeamStation) -> BeamStation:
+        """The station where a knock has put it, with dirt before the x-beam's receiver.
+
+        With dirt that beam goes dark earlier, or for good.
+        """
+        if any(name.startswith("station_knocked") for name in self.sizes):
+            crossing = np.mean([[beam.start, beam.end] for beam in clean.beams], axis=(0, 1))
+            T = self.T_station_knock(crossing)
+            x, y = (
+                replace(beam, start=(T @ [*beam.start, 1.0])[:3], end=(T @ [*beam.end, 1.0])[:3])
+                for beam in clean.beams
+            )
+            clean = replace(clean, beams=(x, y))
+        left = 1.0 - self.size("beam_dirty")
+        if left == 1.0:
+            return clean
+        x, y = clean.beams
+        if max(x.dark_at, x.light_at) >= left:  # dark for good: no tool ever meets it
+            return replace(clean, beams=(replace(x, start=x.start + FAR, end=x.end + FAR), y))
+        x = replace(x, dark_at=x.dark_at / left, light_at=x.light_at / left)
+        return replace(clean, beams=(x, y))
+
+
+class FaultyInput:
+    """An input with a fault, step by step.
+
+    ``lost_edge`` and ``double_edge`` befall the second edge of a step's y-beam.
+    """
+
+    def __init__(self, faults: Faults) -> None:
+        self._faults, self._seen = faults, 0
+
+    def begin(self) -> None:
+        """A step begins."""
+        self._seen = 0
+
+    def passed(self, edges: Sequence[BeamEdge]) -> list[BeamEdge]:
+        """What comes through of edges, in order of time."""
+        out: list[BeamEdge] = []
+        for edge in edges:
+            out += self._passed(edge)
+        return out
+
+    def _passed(self, edge: BeamEdge) -> list[BeamEdge]:
+        faults = self._faults
+        if "beams_dead" in faults or f"beam_{edge.beam}_dead" in faults.sizes:
+            return []
+        self._seen += edge.beam == "y"
+        second = edge.beam == "y" and self._seen == 2
+        if second and "lost_edge" in faults:
+            return []
+        edge = replace(edge, time_s=edge.time_s + faults.size("input_latency"))
+        if "swapped_cables" in faults:
+            other: Beam = "y" if edge.beam == "x" else "x"
+            edge = replace(edge, beam=other)
+        if "chatter" in faults:
+            return _chattered(edge)
+        if second and "double_edge" in faults:
+            return [edge, replace(edge, time_s=edge.time_s + AGAIN_S)]
+        return [edge]
+
+
+def _chattered(edge: BeamEdge) -> list[BeamEdge]:
+    """A burst that does not settle within any debounce time."""
+    times = edge.time_s + np.linspace(0.0, CHATTER_S, CHATTER)
+    return [
+        replace(edge, blocked=edge.blocked ^ bool(i % 2), time_s=t)
+        for i, t in enumerate(times.tolist())
+    ]

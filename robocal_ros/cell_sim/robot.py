@@ -1,0 +1,178 @@
+"""The true robot: what really happens to the flange when the encoders show some joint values.
+
+Forward kinematics here are plain products of 4 x 4 matrices, one per elementary motion, so that a
+mistake in the estimators' compiled kernels cannot hide.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robocal_ros.cell_sim.thermal import Warmth
+from robocal_ros.kinematics import SerialArm
+
+Array = NDArray[np.float64]
+
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Which parts of the truth are switched on.
+
+    The estimators model ``static`` and ``drift``, and know the size of ``noise``. They know
+    nothing of ``compliance``, ``eccentricity``, ``stem`` and ``sensor_warm_up``, and are to
+    recognise ``outliers``.
+    """
+
+    static: bool = True
+    drift: bool = True
+    noise: bool = True
+    compliance: bool = True
+    eccentricity: bool = True
+    stem: bool = True
+    sensor_warm_up: bool = True
+    outliers: bool = True
+
+    @classmethod
+    def none(cls) -> "Effects":
+        """The nominal robot and a perfect sensor."""
+        return cls(*[False] * 8)
+
+    @classmethod
+    def modelled(cls) -> "Effects":
+        """Only what the estimators model."""
+        return replace(cls.none(), static=True, drift=True, noise=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Masses and joint stiffness.
+
+    Attributes
+    ----------
+    mass : (n,) of each link with its drives, the last one with the payload, kg.
+    centre : (n, 3) centre of mass in the link's own frame (the one after its joint), m.
+    stiffness : (n,) of each joint, N m / rad (prismatic: N / m).
+    softening : relative loss of stiffness per kelvin of the joint's motor.
+    """
+
+    mass: Array
+    centre: Array
+    stiffness: Array
+    softening: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrueRobot:
+    """A robot as it is.
+
+    Attributes
+    ----------
+    nominal : the numbers it was designed to; only those are taken from it, never its functions.
+    static_error : (n, 5) true minus nominal d, theta, a, alpha, beta of the cold robot, m and rad.
+    motor_gain, link_gain : (n, 5, n) change of each parameter per kelvin of each motor and link.
+    body : masses and stiffness.
+    eccentricity, phase : (n,) amplitude and phase of each encoder's once-per-turn error, rad.
+    repeatability : standard deviation of the joint values at rest, rad.
+    """
+
+    nominal: SerialArm
+    static_error: Array
+    motor_gain: Array
+    link_gain: Array
+    body: Body
+    eccentricity: Array
+    phase: Array
+    repeatability: float
+    effects: Effects = field(default_factory=Effects)
+
+    def mdh(self, warmth: Warmth) -> Array:
+        """True parameters (n, 5) at these temperatures, without the joints' elastic deflection."""
+        mdh = np.array(self.nominal.mdh)
+        if self.effects.static:
+            mdh += self.static_error
+        if self.effects.drift:
+            mdh += self.motor_gain @ warmth.motor + self.link_gain @ warmth.link
+        return mdh
+
+    def flange(
+        self, reading: ArrayLike, warmth: Warmth, rng: np.random.Generator | None = None
+    ) -> Array:
+        """True T_base_flange (m, 4, 4) while the encoders show ``reading`` (m, n).
+
+        ``rng`` adds the repeatability of one visit; None gives the mean over visits.
+        """
+        q = np.atleast_2d(np.asarray(reading, dtype=np.float64))
+        joint = q.copy()
+        if self.effects.eccentricity:
+            joint += self.eccentricity * np.sin(q + self.phase)
+        if rng is not None and self.effects.noise:
+            joint += self.repeatability * rng.standard_normal(q.shape)
+        mdh = self.mdh(warmth)
+        if not self.effects.compliance:
+            return self._frames(joint, mdh)[-1]
+        stiffness = self.body.stiffness * (1.0 - self.body.softening * warmth.motor)
+        sag = np.zeros_like(joint)
+        for _ in range(2):  # the sag changes the load by a thousandth
+            sag = self._load(self._frames(joint, mdh, sag)) / stiffness
+        return self._frames(joint, mdh, sag)[-1]
+
+    def point(
+        self,
+        reading: ArrayLike,
+        warmth: Warmth,
+        p_flange: ArrayLike,
+        rng: np.random.Generator | None = None,
+    ) -> Array:
+        """True position (m, 3) in base, m, of a point (3,) fixed to the flange."""
+        p = np.append(np.asarray(p_flange, dtype=np.float64), 1.0)
+        return np.asarray((self.flange(reading, warmth, rng) @ p)[:, :3])
+
+    def _frames(self, joint: Array, mdh: Array, sag: Array | None = None) -> list[Array]:
+        """Poses (m, 4, 4) in base of the root and of the frame after each joint."""
+        nominal, slides = self.nominal, self.nominal.prismatic
+        moved = nominal.sign * joint if sag is None else nominal.sign * joint + sag
+        along = np.where(slides, mdh[:, 0] + moved, mdh[:, 0])
+        about = np.where(slides, mdh[:, 1], mdh[:, 1] + moved)
+        drive = shift(2, along.ravel()) @ turn(2, about.ravel())
+        fixed = shift(0, mdh[:, 2]) @ turn(0, mdh[:, 3]) @ turn(1, mdh[:, 4])
+        steps = drive.reshape(*joint.shape, 4, 4) @ fixed
+        frames = [np.broadcast_to(np.array(nominal.T_base_root), (len(joint), 4, 4))]
+        for i in range(nominal.n):
+            frames.append(frames[-1] @ steps[:, i])
+        return frames
+
+    def _load(self, frames: list[Array]) -> Array:
+        """Torque (m, n) of gravity about each joint's axis, N m (prismatic: force along it, N)."""
+        centres = [
+            (T @ np.append(centre, 1.0))[:, :3]
+            for T, centre in zip(frames[1:], self.body.centre, strict=True)
+        ]
+        driven = np.array(frames[:-1])
+        axes, origins = driven[:, :, :3, 2], driven[:, :, :3, 3]
+        pull = np.empty_like(axes)
+        mass, moment = 0.0, np.zeros((len(frames[0]), 3))  # of all that the joint carries
+        for i in reversed(range(self.nominal.n)):
+            mass, moment = mass + self.body.mass[i], moment + self.body.mass[i] * centres[i]
+            pull[i] = mass * GRAVITY if self.nominal.prismatic[i] else moment - mass * origins[i]
+        turns = ~self.nominal.prismatic
+        pull[turns] = np.cross(pull[turns], GRAVITY)
+        return np.asarray(np.sum(axes * pull, axis=2).T)
+
+
+def shift(axis: int, length: Array) -> Array:
+    """Translations (m, 4, 4) along a coordinate axis, m."""
+    T = np.tile(np.eye(4), (len(length), 1, 1))
+    T[:, axis, 3] = length
+    return T
+
+
+def turn(axis: int, angle: Array) -> Array:
+    """Rotations (m, 4, 4) about a coordinate axis, rad."""
+    T = np.tile(np.eye(4), (len(angle), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    T[:, i, i] = T[:, j, j] = np.cos(angle)
+    T[:, i, j], T[:, j, i] = -np.sin(angle), np.sin(angle)
+    return T

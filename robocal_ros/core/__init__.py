@@ -1,1 +1,0 @@
-"""Algorithms: numpy, scipy and numba only, importable without ROS."""

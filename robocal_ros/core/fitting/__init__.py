@@ -1,1 +1,0 @@
-"""Shapes fitted to measured points."""

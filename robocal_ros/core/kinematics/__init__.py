@@ -1,6 +1,0 @@
-"""Kinematic model of serial arms: forward kinematics, Jacobians, free parameters."""
-
-from robocal_ros.core.kinematics.arm import SerialArm
-from robocal_ros.core.kinematics.parameters import ParameterSet
-
-__all__ = ["ParameterSet", "SerialArm"]

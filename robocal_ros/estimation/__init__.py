@@ -1,0 +1,1 @@
+"""Least squares, observability, significance, and fits of shapes: once for all rooms."""

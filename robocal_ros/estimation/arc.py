@@ -1,0 +1,249 @@
+"""The circle in which a laser plane cuts a reference sphere, from one profile.
+
+The profile may hold the table, the stem, gaps, spikes and double reflections. The start is the
+circle nearest to most points (`arc_search`); the answer is the maximum likelihood over the points
+whose residual fits its own predicted variance. How the noise depends on the slope of the surface
+is estimated with it: sensors err along the beam, along the surface's normal, or in between.
+Source of the use: methods of the fixed sphere, where y = +-sqrt(R^2 - r^2).
+"""
+
+from dataclasses import dataclass, replace
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation.arc_search import find_circle, linearised, step
+from robocal_ros.estimation.descent import FALSE_REJECTION, chi2_quantile
+from robocal_ros.estimation.neighbours import on_curve
+from robocal_ros.estimation.profile_noise import FEWEST_POINTS, MAD, SMALLEST_M, local_noise
+from robocal_ros.ground.errors import InputError, ResidualError, RobocalError, TooFewSamplesError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_NEAR = 3.5  # standard deviations of a point near a start
+_NEAR_M = 2e-5
+_FREE_ROUNDS = 25  # in which a point that was left out may come back
+_GRANTED = 1.5  # of the largest noise allowed, lest the table becomes part of a noisy arc
+_ISOTROPIC = 5.0  # points' worth of belief that noise does not depend on the slope
+_STEEPEST = 0.05  # smallest share of variances of both directions
+_SURE = 4.0  # standard deviations
+_FORM_DEGREE = 6
+_FORM_M = 2e-5
+
+
+@dataclass(frozen=True)
+class ArcRule:
+    """What the arc of a sphere in a profile must be like.
+
+    Attributes
+    ----------
+    radius_m : R, of the sphere.
+    radius_tolerance_m : how far the arc's radius may exceed the sphere's.
+    radius_sigma_m : largest standard deviation of the arc's radius; a short arc has a larger one.
+    noise_m : largest standard deviation of a point along its normal.
+    """
+
+    radius_m: float
+    radius_tolerance_m: float = 1e-4
+    radius_sigma_m: float = 4e-4
+    noise_m: float = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class ArcFit:
+    """A fitted arc.
+
+    Attributes
+    ----------
+    centre : (2,) x0, z0 of the circle, sensor frame, m.
+    radius_m : r, of the circle.
+    covariance : (3, 3) of (x0, z0, r) from the points' scatter, m^2.
+    noise_m : standard deviation of a point along its normal, root mean square over the arc.
+    used : (n,) which points were taken for the arc's.
+    """
+
+    centre: Array
+    radius_m: float
+    covariance: Array
+    noise_m: float
+    used: Mask
+
+
+def fit_arc(points: Array, rule: ArcRule) -> ArcFit:
+    """Fit the near side of a circle to points (n, 2) of a profile: x, z in the sensor frame, m.
+
+    Points are in the order of the sensor's columns; the sensor looks along +z. The circle's
+    radius is 0.2 R to R of the sphere.
+
+    Raises
+    ------
+    TooFewSamplesError
+        Fewer than 20 points on a circle.
+    ResidualError
+        No arc, an arc larger than the sphere, too much noise, a surface that is not round, or an
+        arc too short to know its radius: the message holds the figure that failed.
+    InputError
+        The radius as given is a thousand times too small or too large for the arc that is there.
+    """
+    finite = np.all(np.isfinite(points), axis=1)
+    rows = np.ascontiguousarray(points[finite], dtype=np.float64)
+    if len(rows) < FEWEST_POINTS:
+        raise TooFewSamplesError(
+            f"{len(rows)} points give no arc: at least {FEWEST_POINTS} are needed; check the "
+            "exposure and that the sphere is in range"
+        )
+    try:
+        fit = _fitted(rows, rule)
+        _require(fit, rows, rule)
+    except RobocalError:
+        _blame_radius(rows, rule)
+        raise
+    used = np.zeros(len(finite), dtype=np.bool_)
+    used[np.flatnonzero(finite)[fit.used]] = True
+    return ArcFit(fit.centre, fit.radius_m, fit.covariance, fit.noise_m, used)
+
+
+def _fitted(points: Array, rule: ArcRule) -> ArcFit:
+    """The arc of a sphere of about this radius, whatever its quality."""
+    limit = max(_NEAR * local_noise(points[:, 1]), _NEAR_M)
+    circle = find_circle(points, rule.radius_m, limit)
+    if circle is None:
+        raise ResidualError(
+            f"no arc of a sphere of radius {rule.radius_m * 1e3:.6g} mm is in the profile: check "
+            "the radius, and that the laser line crosses the sphere"
+        )
+    residual = linearised(circle, points)[1]
+    used = on_curve((residual / limit) ** 2) & (points[:, 1] < circle[1])
+    ab = np.full(2, (limit / _NEAR) ** 2)
+    for attempt in count():
+        _require_points(used, len(points))
+        circle, covariance = _improved(circle, points[used], ab)
+        J, residual = linearised(circle, points)
+        pull = np.einsum("ij,jk,ik->i", J, covariance, J)
+        parts = _parts(circle, points)
+        ab = _variances(parts[used], residual[used], pull[used] / (parts[used] @ ab))
+        excess = _excess(residual, parts @ ab, np.where(used, -pull, pull), rule.noise_m)
+        update = on_curve(excess) & (points[:, 1] < circle[1])
+        if attempt >= _FREE_ROUNDS:  # a point at the limit must not come and go for ever
+            update = update & used
+        if np.array_equal(update, used):
+            break
+        used = update
+    circle, covariance = _improved(circle, points[used], ab)
+    noise = float(np.sqrt(np.mean(_parts(circle, points[used]) @ ab)))
+    return ArcFit(circle[:2], float(circle[2]), covariance, noise, used)
+
+
+def _require_points(used: Mask, count: int) -> None:
+    if np.sum(used) < FEWEST_POINTS:
+        raise TooFewSamplesError(
+            f"{np.sum(used)} of {count} points lie on an arc: at least {FEWEST_POINTS} are "
+            "needed; clean the sphere, or bring it into the laser line"
+        )
+
+
+def _parts(circle: Array, points: Array) -> Array:
+    """Shares (n, 2) of the variances along and across the beam in that along the normal.
+
+    The slope is taken from x: where the noise is along the beam, it then does not depend on it.
+    """
+    sine = np.clip((points[:, 0] - circle[0]) / circle[2], -1.0, 1.0) ** 2
+    return np.column_stack([1.0 - sine, sine])
+
+
+def _variances(parts: Array, residual: Array, leverage: Array) -> Array:
+    """Variances (2,) of a point along and across the beam, by regression of squared residuals."""
+    robust = (MAD * float(np.median(np.abs(residual)))) ** 2 + SMALLEST_M**2
+    square = residual**2 / np.maximum(1.0 - leverage, 0.5)
+    ab = np.full(2, robust)
+    for _ in range(3):
+        weight = robust**2 / (parts @ ab) ** 2
+        normal = (parts.T * weight) @ parts + _ISOTROPIC * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        ab = np.linalg.solve(normal, parts.T @ (weight * square))
+        ab = np.maximum(ab, _STEEPEST * float(np.max(ab))) + SMALLEST_M**2
+    return np.asarray(ab)
+
+
+def _improved(circle: Array, points: Array, ab: Array) -> tuple[Array, Array]:
+    """Circle after a step of the maximum likelihood, and its covariance (3, 3).
+
+    The normal is that of the likeliest true point, which the residual does not depend on: that of
+    the measured point would bias the circle where the noise is not along the normal.
+    """
+    J, residual = linearised(circle, points)
+    variance = _parts(circle, points) @ ab
+    # J holds the normal with a minus sign: the true point is this far from the measured one.
+    moved = points + (residual / variance)[:, None] * J[:, :2] * ab[::-1]
+    J, _ = linearised(circle, moved)
+    residual = -np.einsum("ij,ij->i", J[:, :2], points - circle[:2]) - circle[2]
+    increment, information = step(J, residual, 1.0 / variance)
+    return circle + increment, np.asarray(np.linalg.pinv(information, hermitian=True))
+
+
+def _excess(residual: Array, variance: Array, pull: Array, noise: float) -> Array:
+    """Squared residual (n,) of points over the largest one that their variance explains.
+
+    ``pull`` is the variance of the circle at a point: less than zero where the point, in use,
+    pulled the circle to itself. No more than the largest noise allowed is granted.
+    """
+    expected = np.minimum(variance + np.maximum(pull, -0.5 * variance), (_GRANTED * noise) ** 2)
+    limit = chi2_quantile(1.0 - FALSE_REJECTION / len(residual), 1.0)
+    return np.asarray(residual**2 / (limit * expected))
+
+
+def _require(fit: ArcFit, points: Array, rule: ArcRule) -> None:
+    r, R = fit.radius_m, rule.radius_m
+    sigma = float(np.sqrt(fit.covariance[2, 2]))
+    if fit.noise_m > rule.noise_m:
+        raise ResidualError(
+            f"the points scatter by {fit.noise_m * 1e3:.3f} mm about the arc (allowed "
+            f"{rule.noise_m * 1e3:.3f} mm): clean the sphere and check the exposure"
+        )
+    if sigma > rule.radius_sigma_m or r < _SURE * sigma:
+        raise ResidualError(
+            f"the arc is too short: its radius of {r * 1e3:.3f} mm is known to {sigma * 1e3:.3f} "
+            f"mm (allowed {rule.radius_sigma_m * 1e3:.3f} mm); show the sensor more of the sphere"
+        )
+    if r - R > max(rule.radius_tolerance_m, _SURE * sigma):
+        raise ResidualError(_larger(r, R))
+    form = _form(fit, points[fit.used])
+    if form > max(_FORM_M, np.sqrt(0.5) * fit.noise_m):
+        raise ResidualError(
+            f"the surface differs from an arc of radius {r * 1e3:.3f} mm by {form * 1e3:.3f} mm, "
+            "which is no noise: it is not round; show the sphere to the sensor"
+        )
+
+
+def _larger(r: float, R: float) -> str:
+    return (
+        f"the profile shows an arc of radius {r * 1e3:.3f} mm, but a plane cuts a sphere of radius "
+        f"{R * 1e3:.3f} mm in no larger circle than that: check which sphere is mounted, and the "
+        "sensor's scale"
+    )
+
+
+def _form(fit: ArcFit, points: Array) -> float:
+    """Root mean square of the smooth part of the residuals, m."""
+    _, residual = linearised(np.append(fit.centre, fit.radius_m), points)
+    x = points[:, 0] - points[:, 0].mean()
+    basis = np.polynomial.legendre.legvander(x / np.max(np.abs(x)), _FORM_DEGREE)
+    smooth = basis @ np.linalg.lstsq(basis, residual, rcond=None)[0]
+    return float(np.sqrt(np.mean(smooth**2)))
+
+
+def _blame_radius(points: Array, rule: ArcRule) -> None:
+    """Raise when a sphere of a radius a thousand times smaller or larger is there instead."""
+    for factor, word in ((1e-3, "large"), (1e3, "small")):
+        other = replace(rule, radius_m=rule.radius_m * factor)
+        try:
+            fit = _fitted(points, other)
+            _require(fit, points, other)
+        except RobocalError:
+            continue
+        raise InputError(
+            f"the profile shows an arc of radius {fit.radius_m * 1e3:.3f} mm, the sphere's radius "
+            f"is given as {rule.radius_m * 1e3:.6g} mm, 1000 times too {word} for this arc: check "
+            "its unit"
+        )

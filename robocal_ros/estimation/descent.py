@@ -1,0 +1,225 @@
+"""Damped Gauss-Newton on a manifold, robust or plain, and the test of each sample."""
+
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation.freedom import Freedom, require_told
+from robocal_ros.estimation.loss import Loss, Problem, Run, information_of
+
+Array = NDArray[np.float64]
+S = TypeVar("S")
+
+FALSE_REJECTION = 0.01  # chance that a clean data set loses any sample
+MOST_ITERATIONS = 50
+OVERSHOT = 0.5  # slope behind a step, of that before it: then whole steps take too many to settle
+DAMPINGS = (0.0, *(10.0**power for power in range(-4, 7)))
+SOUND_FIT = 0.999  # residuals beyond this quantile say that given sigmas are too small
+CLEAR_STRETCH = 1.6  # beyond the scatter of a median of six samples
+STEP_TOLERANCE = 1e-4  # of a standard deviation
+FIRST_TOLERANCE = 1e-2  # the same for the pass that only looks for outliers
+SMALLEST_SCALE = 1e-9  # whitened residual; keeps noise-free data solvable
+
+
+def chi2_quantile(probability: float, dof: float) -> float:
+    """Quantile of the chi-square distribution."""
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(0.5 * dof, probability))
+
+
+@dataclass(frozen=True)
+class Descent(Generic[S]):
+    """Gauss-Newton on one problem; ``scale_components`` is 0 where the noise is known.
+
+    Attributes
+    ----------
+    sizes : (m,) how many of its c components each sample has; the others are zero.
+    freedom : how many numbers the noise was found from, where it was found from these data.
+    """
+
+    problem: Problem[S]
+    prior: Array
+    scale_components: int
+    sizes: NDArray[np.int64]
+    freedom: float = np.inf
+
+    def run(
+        self,
+        run: Run[S],
+        keep: NDArray[np.bool_],
+        huber: Array | None = None,
+        tolerance: float = STEP_TOLERANCE,
+    ) -> Run[S]:
+        """Minimise the cost until a step is far below a standard deviation.
+
+        ``huber`` (m,): length of each sample's residual from which it counts linearly.
+        """
+        k = run.jacobian.shape[2]
+        left = self._left(run.jacobian, keep)  # hardly changes on the way
+        for _ in range(MOST_ITERATIONS):
+            scale = self._scale(run.residual, keep, left, huber)
+            loss = Loss(self.problem, self.prior, keep, scale, huber)
+            information, gradient = loss.information(run), loss.gradient(run)
+            here = loss.at(run.state, run.residual)
+            step = _damped_step(information, gradient, 0.0)
+            to_go = float(step @ information @ step)
+            if to_go < tolerance**2 * k:
+                near = run.residual + run.jacobian @ step  # exact enough so near
+                state = self.problem.retract(run.state, step)
+                return Run(state, near, run.jacobian, run.iterations + 1, True)
+            for damping in DAMPINGS:
+                if damping:
+                    step = _damped_step(information, gradient, damping)
+                trial = self._moved(run, step)
+                if loss.at(trial.state, trial.residual) <= here:
+                    break
+            else:  # no step of any length helps: trusted only where all of it is far below a sigma
+                return replace(run, converged=to_go < FIRST_TOLERANCE**2 * k)
+            run = self._shortened(loss, run, trial, step, gradient)
+        return run
+
+    def _moved(self, run: Run[S], step: Array) -> Run[S]:
+        state = self.problem.retract(run.state, step)
+        return Run(state, *self.problem.linearise(state), run.iterations + 1, False)
+
+    def _shortened(
+        self, loss: Loss[S], run: Run[S], trial: Run[S], step: Array, gradient: Array
+    ) -> Run[S]:
+        """Where the step ends; short of that if the way down has long been passed there.
+
+        Residuals that curve, as those of a path through noisy readings, let Gauss-Newton's steps
+        go nearly twice as far as they should, for ever. The slope's zero along a step is nearer.
+        """
+        ahead = -float(step @ gradient)
+        passed = float(step @ loss.gradient(trial))
+        if passed <= OVERSHOT * ahead:
+            return trial
+        shorter = self._moved(run, ahead / (ahead + passed) * step)
+        better = loss.at(shorter.state, shorter.residual) < loss.at(trial.state, trial.residual)
+        return shorter if better else trial
+
+    def _scale(
+        self, residual: Array, keep: NDArray[np.bool_], left: Freedom | None, huber: Array | None
+    ) -> float:
+        used = residual[keep]
+        return self._plain_scale(used, left) if huber is None else self._robust_scale(used, left)
+
+    def _left(
+        self, jacobian: Array, keep: NDArray[np.bool_], information: Array | None = None
+    ) -> Freedom | None:
+        """What the unknowns leave of the numbers that tell the noise; None where it is known.
+
+        ``information`` (k, k): of the samples in use, where it is known already.
+        """
+        c, k = jacobian.shape[1:]
+        count = int(np.sum(keep)) * self.scale_components
+        if not count:
+            return None
+        all_tell = c == self.scale_components
+        if all_tell and not np.any(self.prior):
+            return Freedom.flat(count, k)
+        data = information_of(jacobian, keep) if information is None else information
+        told = data if all_tell else information_of(jacobian[:, : self.scale_components], keep)
+        return Freedom.of(count, told, data, self.prior)
+
+    def _plain_scale(self, used: Array, left: Freedom | None) -> float:
+        """Standard deviation of residuals in use, unknowns counted; 1 where it is known."""
+        if left is None:
+            return 1.0
+        total = float(np.sum(used[:, : self.scale_components] ** 2))
+        return _found(left, total)
+
+    def _robust_scale(self, used: Array, left: Freedom | None) -> float:
+        """The same from the median, which outliers cannot inflate."""
+        if left is None:
+            return 1.0
+        squared = np.sum(used[:, : self.scale_components] ** 2, axis=1)
+        middle = float(np.median(squared)) / chi2_quantile(0.5, self.scale_components)
+        return _found(left, middle * left.count)
+
+    def final_scale(
+        self, run: Run[S], keep: NDArray[np.bool_], information: Array
+    ) -> tuple[float, float]:
+        """The estimated scale; with given sigmas 1, or the misfit where chi-square rejects 1.
+
+        And how many numbers tell it.
+        """
+        used, left = run.residual[keep], self._left(run.jacobian, keep, information)
+        if left is not None:
+            scale = self._plain_scale(used, left)
+            return scale, left.at(scale**2)
+        explained = float(np.trace(information @ self.posterior(information, 1.0)))
+        freedom = float(np.sum(self.sizes[keep])) - explained
+        misfit = float(np.sum(used**2))
+        if freedom < 1.0 or misfit <= chi2_quantile(SOUND_FIT, freedom):
+            return 1.0, freedom
+        return float(np.sqrt(misfit / freedom)), freedom
+
+    def _stretch(self, squared: Array, keep: NDArray[np.bool_]) -> float:
+        """Factor by which studentised distances (m,) are larger than given sigmas explain.
+
+        From their median, which outliers cannot inflate; 1 unless it is clearly larger.
+        """
+        if self.scale_components:
+            return 1.0
+        share = squared[keep] / self.quantiles(0.5)[keep]
+        stretch = float(np.sqrt(max(float(np.median(share)), 0.0)))
+        return stretch if stretch > CLEAR_STRETCH else 1.0
+
+    def quantiles(self, probability: float) -> Array:
+        """Quantile (m,) of each sample's chi-square distribution."""
+        values = {int(n): chi2_quantile(probability, int(n)) for n in np.unique(self.sizes)}
+        return np.array([values[int(n)] for n in self.sizes])
+
+    def _largest(self, probability: float) -> Array:
+        """Quantile (m,) of each sample's squared distance, with noise that may be uncertain."""
+        from scipy.special import fdtri
+
+        if self.freedom == np.inf:
+            return self.quantiles(probability)
+        return np.asarray(self.sizes * fdtri(self.sizes, self.freedom, probability))
+
+    def posterior(self, normal: Array, scale: float) -> Array:
+        """Covariance (k, k) of the unknowns from the data's normal matrix."""
+        information = normal / scale**2 + self.prior
+        unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        inverse = np.linalg.inv(information * np.outer(unit, unit))
+        return np.asarray(0.5 * (inverse + inverse.T) * np.outer(unit, unit))
+
+    def inliers(self, run: Run[S], keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Samples whose residual fits its own predicted covariance (studentised, chi-square)."""
+        m, c, _ = run.jacobian.shape
+        J, information = run.jacobian, information_of(run.jacobian, keep)
+        scale = self._robust_scale(run.residual[keep], self._left(J, keep, information))
+        JC = (J.reshape(m * c, -1) @ self.posterior(information, scale)).reshape(J.shape)
+        spread = JC @ np.swapaxes(J, 1, 2)
+        sign = np.where(keep, -1.0, 1.0)[:, None, None]  # a rejected sample did not pull the fit
+        expected = (1.0 + 1e-6) * scale**2 * np.eye(c) + sign * spread
+        whitened = np.linalg.solve(expected, run.residual[..., None])[..., 0]
+        squared = np.sum(run.residual * whitened, axis=1)
+        limit = self._largest(1.0 - FALSE_REJECTION / m) * self._stretch(squared, keep) ** 2
+        inlier = squared < limit
+        enough = 2 * np.sum(inlier) > m
+        return np.asarray(inlier) if enough else keep
+
+
+def _found(left: Freedom, total: float) -> float:
+    """Scale of residuals with this sum of squares.
+
+    Under a prior that is wider than the noise, unknowns without end explain few data ever better:
+    refused before the scale goes to zero.
+    """
+    scale = max(left.scale(total), SMALLEST_SCALE)
+    if left.by_prior:
+        require_told(left.at(scale**2))
+    return scale
+
+
+def _damped_step(normal: Array, gradient: Array, damping: float) -> Array:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+    scaled = normal * np.outer(scale, scale)
+    scaled[np.diag_indices_from(scaled)] += damping
+    return np.asarray(np.linalg.solve(scaled, -gradient * scale) * scale)

@@ -1,0 +1,191 @@
+"""Robust maximum likelihood and maximum a posteriori estimation on manifolds.
+
+Gauss-Newton with Levenberg damping over a problem that linearises itself. A first pass with
+Huber's loss finds a scale that outliers cannot inflate; samples beyond it are rejected by name
+and the rest is solved by plain (efficient) least squares.
+"""
+
+from dataclasses import dataclass
+from itertools import count
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation.descent import FIRST_TOLERANCE, Descent
+from robocal_ros.estimation.loss import Problem, Run, information_of, rows_of
+from robocal_ros.estimation.observability import Observability, describe, observability
+from robocal_ros.ground.errors import RankDeficientError, TooFewSamplesError
+
+Array = NDArray[np.float64]
+S = TypeVar("S")
+
+FREE_ATTEMPTS = 5  # in which a rejected sample may come back
+
+
+@dataclass(frozen=True)
+class Estimate(Generic[S]):
+    """Outcome of ``solve``.
+
+    Attributes
+    ----------
+    state : the estimate.
+    covariance : (k, k) of the increments at the estimate, in the problem's units.
+    scale : standard deviation of the whitened residual: 1 where sigmas were given, unless the
+        residuals are clearly larger; then covariances are widened by it.
+    freedom : how many numbers tell the scale: those of the residuals less those that the unknowns
+        take up. What the prior holds takes up none.
+    residual : (m, c) whitened; ``rejected`` (m,) marks samples not used.
+    """
+
+    state: S
+    names: tuple[str, ...]
+    covariance: Array
+    scale: float
+    freedom: float
+    residual: Array
+    rejected: NDArray[np.bool_]
+    observability: Observability
+    iterations: int
+    converged: bool
+
+    @property
+    def creeping(self) -> str:
+        """Say why the state is no solution; empty when it is one."""
+        if self.converged:
+            return ""
+        return (
+            f"the solution still crept after {self.iterations} iterations along directions that "
+            "the poses hardly show"
+        )
+
+    def settled(self) -> S:
+        """The state.
+
+        Raises
+        ------
+        RankDeficientError
+            Where it still crept.
+        """
+        if self.creeping:
+            raise RankDeficientError(self.creeping)
+        return self.state
+
+
+def solve(
+    problem: Problem[S],
+    start: S,
+    *,
+    prior_information: Array | None = None,
+    noise_known: bool = True,
+    robust: bool = True,
+    sizes: NDArray[np.int64] | None = None,
+    freedom: float = np.inf,
+) -> Estimate[S]:
+    """Find the most likely state.
+
+    Parameters
+    ----------
+    prior_information : (k, k) inverse covariance of the prior, or None (zeros) for a flat one.
+    noise_known : whether residuals are in units of their true sigma; otherwise a common scale
+        is estimated with them.
+    robust : whether to look for outliers.
+    sizes : (m,) how many of its c components each sample has, where they differ; the residuals
+        and Jacobians of the others are zero.
+    freedom : how many numbers the sigmas were found from, where they come from these data: then
+        a sample must be farther off to be an outlier (F distribution).
+
+    Raises
+    ------
+    TooFewSamplesError
+        Without a prior, fewer equations than unknowns.
+    RankDeficientError
+        When the data, and the prior where there is one, leave a direction undetermined.
+    ValueError
+        When the residuals at the start are not finite.
+    """
+    residual, jacobian = _linearised(problem, start)
+    m, c, k = jacobian.shape
+    counts = np.full(m, c, dtype=np.int64) if sizes is None else sizes
+    prior = np.zeros((k, k)) if prior_information is None else prior_information
+    flat = not np.any(prior)
+    if flat:
+        _require_enough(jacobian, int(np.sum(counts)), problem.names)
+    unscaled = 0 if noise_known else problem.scale_components
+    descent = Descent(problem, prior, unscaled, counts, freedom)
+    run, keep = _settle(descent, Run(start, residual, jacobian, 0, False), robust, flat)
+    information = information_of(run.jacobian, keep)
+    seen = observability(rows_of(run.jacobian, keep), information)
+    if flat:
+        _require_full_rank(seen, problem.names)
+    scale, left = descent.final_scale(run, keep, information)
+    covariance = descent.posterior(information, scale)
+    if not np.all(np.diag(covariance) > 0.0):
+        raise _not_determined(seen, problem.names)
+    return Estimate(
+        state=run.state,
+        names=problem.names,
+        covariance=covariance,
+        scale=scale,
+        freedom=left,
+        residual=run.residual,
+        rejected=~keep,
+        observability=seen,
+        iterations=run.iterations,
+        converged=run.converged,
+    )
+
+
+def _linearised(problem: Problem[S], start: S) -> tuple[Array, Array]:
+    residual, jacobian = problem.linearise(start)
+    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
+        raise ValueError("the residuals at the start are not finite")
+    return residual, jacobian
+
+
+def _settle(
+    descent: Descent[S], run: Run[S], robust: bool, flat: bool
+) -> tuple[Run[S], NDArray[np.bool_]]:
+    """Descend and reject in turn until the samples in use no longer change."""
+    keep = np.ones(len(run.jacobian), dtype=np.bool_)
+    if robust:
+        limit = np.sqrt(descent.quantiles(0.95))
+        run = descent.run(run, keep, huber=limit, tolerance=FIRST_TOLERANCE)
+        keep = descent.inliers(run, keep)
+    for attempt in count():
+        if flat and not np.all(keep):
+            seen = observability(rows_of(run.jacobian, keep))
+            _require_full_rank(seen, descent.problem.names)
+        run = descent.run(run, keep)
+        update = descent.inliers(run, keep) if robust else keep
+        if attempt >= FREE_ATTEMPTS:  # a sample at the limit must not come and go for ever
+            update = update & keep
+        if np.array_equal(update, keep):
+            break
+        keep = update
+    return run, keep
+
+
+def _require_enough(jacobian: Array, equations: int, names: tuple[str, ...]) -> None:
+    m, _, k = jacobian.shape
+    if equations < k:
+        raise TooFewSamplesError(f"{m} samples give {equations} equations for {k} unknowns")
+    _require_full_rank(observability(jacobian.reshape(-1, k)), names)
+
+
+def _not_determined(seen: Observability, names: tuple[str, ...]) -> RankDeficientError:
+    return RankDeficientError(
+        f"the data determine {seen.rank} of {len(names)} unknowns, and the prior not the rest: "
+        "measure at more and different poses",
+        [describe(column, names) for column in seen.null.T],
+    )
+
+
+def _require_full_rank(seen: Observability, names: tuple[str, ...]) -> None:
+    if seen.null.shape[1]:
+        words = [describe(column, names) for column in seen.null.T]
+        raise RankDeficientError(
+            f"the data determine {seen.rank} of {len(names)} unknowns; not determined: "
+            + "; ".join(words),
+            words,
+        )

@@ -1,0 +1,1 @@
+"""What all rooms stand on: errors and codes, frames, samples, streams, files."""

@@ -1,0 +1,95 @@
+"""Errors that a user can act on; every message names the thing, the value and what to do."""
+
+from collections.abc import Sequence
+
+from robocal_ros.ground.codes import Code
+
+
+class RobocalError(Exception):
+    """The data or the state cannot give what was asked. A caller's bug is a ``ValueError``."""
+
+    code: Code = Code.BAD_INPUT
+
+
+class InputError(RobocalError):
+    """Input that cannot be read or makes no sense.
+
+    Parameters
+    ----------
+    message : str
+        What is wrong, with the value, and what to do.
+    file, row, column : optional
+        Where: file name, row number (the header is row 1) and column name.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        file: str | None = None,
+        row: int | None = None,
+        column: str | None = None,
+    ) -> None:
+        place = [str(file)] if file is not None else []
+        place += [f"row {row}"] if row is not None else []
+        place += [f"column {column}"] if column is not None else []
+        super().__init__(f"{', '.join(place)}: {message}" if place else message)
+        self.file = None if file is None else str(file)
+        self.row = row
+        self.column = column
+
+
+class TooFewSamplesError(RobocalError):
+    """Fewer usable samples than the unknowns need."""
+
+    code = Code.TOO_FEW_SAMPLES
+
+
+class RankDeficientError(RobocalError):
+    """The data leave a direction undetermined; ``directions`` names each in words."""
+
+    code = Code.RANK_DEFICIENT
+
+    def __init__(self, message: str, directions: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.directions = tuple(directions)
+
+
+class StaleError(RobocalError):
+    """A result that was solved against a state no longer in force."""
+
+    code = Code.STALE
+
+
+class WrongRobotError(RobocalError):
+    """A result made for another robot or another nominal model."""
+
+    code = Code.WRONG_ROBOT
+
+
+class LimitError(RobocalError):
+    """A value beyond a configured bound."""
+
+    code = Code.LIMIT_EXCEEDED
+
+
+class ResidualError(RobocalError):
+    """Measurements that miss the model by more than any calibration error."""
+
+    code = Code.RESIDUAL_TOO_LARGE
+
+
+class ConflictError(RobocalError):
+    """Another change came first."""
+
+    code = Code.CONFLICT
+
+
+class StorageError(RobocalError):
+    """The history could not be read or written; nothing was half-written."""
+
+    code = Code.STORAGE_FAILED
+
+
+class StateLostError(StorageError):
+    """What was kept is gone, and what it told is forgotten."""

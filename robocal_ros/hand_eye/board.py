@@ -1,0 +1,294 @@
+"""A chessboard in images: its corners, the camera's intrinsics, and where the board is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError, RankDeficientError, TooFewSamplesError
+from robocal_ros.hand_eye.pose_pairs import Shared
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+FEWEST_CORNERS = 3  # along each side
+FEWEST_IMAGES = 5  # that give the intrinsics
+SMALLEST_IMAGE_PX = 32  # of a side; OpenCV fails on less
+FIRST_WINDOW_PX = 5  # half of the window in which a corner is refined
+LARGEST_FOCAL_SIGMA = 0.03  # of the focal length; more, and the images do not show it
+GROSS_RATIO = 4.0  # medians of the usual misfit, beyond which an image is left out
+
+
+@dataclass(frozen=True)
+class Chessboard:
+    """Inner corners along both sides, and the side of a square, m.
+
+    Board frame: origin in the first inner corner, x along ``columns``, y along ``rows``, z into
+    the board as the camera sees it (OpenCV's order of corners).
+    """
+
+    columns: int
+    rows: int
+    square_m: float
+
+    def __post_init__(self) -> None:
+        if min(self.columns, self.rows) < FEWEST_CORNERS:
+            raise InputError(
+                f"a board of {self.columns}x{self.rows} inner corners shows no pose (at least "
+                f"{FEWEST_CORNERS} each way)"
+            )
+
+    @property
+    def points(self) -> Array:
+        """(n, 3), m, board frame."""
+        y, x = np.mgrid[: self.rows, : self.columns]
+        return self.square_m * np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """A pinhole camera with OpenCV's distortion.
+
+    Attributes
+    ----------
+    matrix : (3, 3), px. ``distortion`` (k,): k1, k2, p1, p2, k3 …
+    size : width and height of the images, px.
+    covariance : (4 + k, 4 + k) of fx, fy, cx, cy and the distortion; None where they are given
+        and taken as exact.
+    """
+
+    matrix: Array
+    distortion: Array
+    size: tuple[int, int]
+    covariance: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBoards:
+    """Where the board was in each image that shows it.
+
+    Attributes
+    ----------
+    names : (m,). ``T_camera_board`` (m, 4, 4).
+    covariance : (m, 6, 6) of position and turn along the camera's axes, with exact intrinsics.
+    shared : what errors of the intrinsics do to all poses; None where they are exact.
+    noise_px : standard deviation of a corner's coordinate. ``rms_px`` (m,) misfit of each image.
+    rejected : name of each image left out, with the reason.
+    """
+
+    names: tuple[str, ...]
+    T_camera_board: Array
+    covariance: Array
+    shared: Shared | None
+    intrinsics: Intrinsics
+    noise_px: float
+    rms_px: Array
+    rejected: dict[str, str]
+
+
+def decode_image(data: bytes, name: str) -> Image:
+    """Grey image (h, w) from the bytes of a file of any usual format.
+
+    Raises
+    ------
+    InputError
+        When it is no image.
+    """
+    import cv2
+
+    image = None
+    if data:
+        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InputError(f"{name} is no image that can be read")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def find_corners(image: Image, board: Chessboard) -> Array | None:
+    """Inner corners (n, 2), px, in the order of the board's points; None where no board shows."""
+    import cv2
+
+    if min(image.shape) < SMALLEST_IMAGE_PX:
+        return None
+    size = (board.columns, board.rows)
+    found, corners = cv2.findChessboardCorners(image, size)
+    if not found:  # slower, and sees blurred and glaring boards too
+        found, corners = cv2.findChessboardCornersSB(image, size, flags=cv2.CALIB_CB_ACCURACY)
+        if not found:
+            return None
+    half = _window(np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2))
+    end = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 50, 1e-4)
+    refined = cv2.cornerSubPix(image, corners, (half, half), (-1, -1), end)
+    return np.asarray(refined, dtype=np.float64).reshape(-1, 2)
+
+
+def _window(grid: Array) -> int:
+    """Half a window that holds no neighbouring corner."""
+    across = np.linalg.norm(np.diff(grid, axis=1), axis=2).min()
+    along = np.linalg.norm(np.diff(grid, axis=0), axis=2).min()
+    return int(np.clip(0.4 * min(across, along), 1, FIRST_WINDOW_PX))
+
+
+def see_boards(
+    images: Sequence[tuple[str, Image]], board: Chessboard, intrinsics: Intrinsics | None = None
+) -> SeenBoards:
+    """Find the board in named images, and the intrinsics from the same images if none are given.
+
+    Raises
+    ------
+    TooFewSamplesError
+        When no image, or too few for the intrinsics, shows the board.
+    InputError
+        When images have another size than the intrinsics say.
+    RankDeficientError
+        When the images do not show the intrinsics.
+    """
+    rejected: dict[str, str] = {}
+    size = intrinsics.size if intrinsics else _usual_size(images)
+    names, corners = [], []
+    for name, image in images:
+        if image.shape[::-1] != size:
+            rejected[name] = (
+                f"{image.shape[1]}x{image.shape[0]} px where {size[0]}x{size[1]} are expected"
+            )
+            continue
+        found = find_corners(image, board)
+        if found is None:
+            rejected[name] = f"no board of {board.columns}x{board.rows} inner corners in it"
+        else:
+            names.append(name)
+            corners.append(found)
+    return boards_of_corners(names, np.array(corners), board, size, intrinsics, rejected)
+
+
+def _usual_size(images: Sequence[tuple[str, Image]]) -> tuple[int, int]:
+    sizes = [(image.shape[1], image.shape[0]) for _, image in images]
+    return max(sizes, key=sizes.count, default=(0, 0))
+
+
+def boards_of_corners(
+    names: Sequence[str], corners: Array, board: Chessboard, size: tuple[int, int],
+    intrinsics: Intrinsics | None = None, rejected: dict[str, str] | None = None,
+) -> SeenBoards:  # fmt: skip
+    """The same from corners (m, n, 2), px.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        As `see_boards`.
+    InputError
+        When no camera sees a board as the corners lie.
+    """
+    out = dict(rejected or {})
+    _require(len(names), intrinsics, out)
+    seen = _solve(tuple(names), corners, board, size, intrinsics)
+    gross = seen.rms_px > GROSS_RATIO * np.median(seen.rms_px)
+    if np.any(gross):
+        for i in np.flatnonzero(gross).tolist():
+            out[names[i]] = f"its corners miss a flat board by {seen.rms_px[i]:.2f} px rms"
+        kept = np.flatnonzero(~gross).tolist()
+        _require(len(kept), intrinsics, out)
+        seen = _solve(tuple(names[i] for i in kept), corners[kept], board, size, intrinsics)
+    return replace(seen, rejected=out)
+
+
+def _require(count: int, intrinsics: Intrinsics | None, rejected: dict[str, str]) -> None:
+    fewest = 1 if intrinsics else FEWEST_IMAGES
+    if count >= fewest:
+        return
+    first = next(iter(rejected.items()), None)
+    why = f"; {first[0]}: {first[1]}" if first else ""
+    remedy = "" if intrinsics else ", or give the intrinsics"
+    raise TooFewSamplesError(
+        f"{count} images show the board (at least {fewest} are needed{remedy}){why}"
+    )
+
+
+def _solve(
+    names: tuple[str, ...], corners: Array, board: Chessboard, size: tuple[int, int],
+    intrinsics: Intrinsics | None,
+) -> SeenBoards:  # fmt: skip
+    camera = intrinsics or _calibrate(corners, board, size)
+    poses = [_pose(points, board, camera) for points in corners]
+    T = np.array([pose for pose, _, _ in poses])
+    J_pose = np.array([J[:, :6] for _, _, J in poses])
+    J_camera = np.array([J[:, 6:] for _, _, J in poses])
+    miss = np.array([residual for _, residual, _ in poses])
+    unknowns = 6 * len(names) + (0 if intrinsics else J_camera.shape[2])
+    noise = float(np.sqrt(np.sum(miss**2) / (miss.size - unknowns)))
+    alone = np.linalg.inv(J_pose.swapaxes(1, 2) @ J_pose)
+    sensitivity = -alone @ J_pose.swapaxes(1, 2) @ J_camera
+    if intrinsics is None:
+        rest = J_camera + J_pose @ sensitivity
+        camera = _with_covariance(camera, rest.reshape(-1, rest.shape[2]), noise)
+    return SeenBoards(
+        names=names,
+        T_camera_board=T,
+        covariance=noise**2 * alone,
+        shared=None if camera.covariance is None else Shared(sensitivity, camera.covariance),
+        intrinsics=camera,
+        noise_px=noise,
+        rms_px=np.sqrt(np.mean(miss**2, axis=1) * 2.0),
+        rejected={},
+    )
+
+
+def _calibrate(corners: Array, board: Chessboard, size: tuple[int, int]) -> Intrinsics:
+    import cv2
+
+    points = [board.points.astype(np.float32)] * len(corners)
+    seen = list(corners.astype(np.float32))
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # several add up in any order: the last bits would not come again
+    try:
+        _, matrix, distortion, _, _ = cv2.calibrateCamera(points, seen, size, None, None)
+    except cv2.error as error:
+        raise InputError(f"no camera sees a board as these corners lie: {error.err}") from error
+    finally:
+        cv2.setNumThreads(threads)
+    return Intrinsics(
+        np.asarray(matrix, dtype=np.float64),
+        np.asarray(distortion, dtype=np.float64).ravel(),
+        size,
+    )
+
+
+def _with_covariance(camera: Intrinsics, rows: Array, noise_px: float) -> Intrinsics:
+    """Covariance of the intrinsics once the poses have taken their part."""
+    information = rows.T @ rows
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    scaled = information * np.outer(scale, scale)
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+    covariance = np.asarray(noise_px**2 * inverse * np.outer(scale, scale))
+    focal = float(np.sqrt(covariance[0, 0])) / float(camera.matrix[0, 0])
+    if not focal < LARGEST_FOCAL_SIGMA:
+        raise RankDeficientError(
+            f"the images give the focal length to {100.0 * focal:.1f} % only: tilt the board by "
+            "30 deg to 45 deg both ways in some of them, or give the intrinsics",
+            ("focal length",),
+        )
+    return Intrinsics(camera.matrix, camera.distortion, camera.size, covariance)
+
+
+def _pose(corners: Array, board: Chessboard, camera: Intrinsics) -> tuple[Array, Array, Array]:
+    """T_camera_board, misfit (2 n,), px, and its Jacobian (2 n, 6 + 4 + k).
+
+    By the pose (position and turn along the camera's axes), then fx, fy, cx, cy, distortion.
+    """
+    import cv2
+
+    points, K, d = board.points, camera.matrix, camera.distortion
+    # the better of the two poses in which a flat board looks alike (Collins and Bartoli 2014)
+    _, turns, places, _ = cv2.solvePnPGeneric(points, corners, K, d, flags=cv2.SOLVEPNP_IPPE)
+    if not turns:
+        raise InputError("no pose of a board explains the corners: they nearly coincide")
+    turn, place = cv2.solvePnPRefineLM(points, corners, K, d, turns[0], places[0])
+    seen, J = cv2.projectPoints(points, turn, place, K, d)
+    J = np.asarray(J, dtype=np.float64)
+    w = np.asarray(turn, dtype=np.float64).ravel()
+    T = frames.transform(frames.exp_rotation(w), np.asarray(place, dtype=np.float64).ravel())
+    by_turn = J[:, :3] @ frames.left_jacobian_inverse(w)
+    rows = np.concatenate([J[:, 3:6], by_turn, J[:, 6:]], axis=1)
+    return T, np.asarray(seen, dtype=np.float64).reshape(-1) - corners.ravel(), rows

@@ -1,0 +1,275 @@
+"""The hand-eye node: joints and what a sensor sees in, the sensor's place out.
+
+docs/hand_eye_node.md.
+"""
+
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import Image, JointState, PointCloud2
+
+from robocal_ros import __version__
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, RobocalError
+from robocal_ros.ground.proposals import Head, hand_eye_kind
+from robocal_ros.ground.samples import JOINTS
+from robocal_ros.hand_eye.data_files import HandEyeFiles
+from robocal_ros.hand_eye.inputs import take_hand_eye_message
+from robocal_ros.hand_eye.outputs import HandEyeOutputs
+from robocal_ros.hand_eye.recorded import configuration
+from robocal_ros.hand_eye.services import HandEyeServices
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.settings import SETTINGS, session_config
+from robocal_ros.hand_eye.shots import IMAGE, PROFILE, TARGET_POSE
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.robots import load_robot
+from robocal_ros.motion.silence import Silence
+from robocal_ros.motion.source_guard import SourceGuard
+from robocal_ros.ros import qos
+from robocal_ros.ros.base import POLL_S, HouseNode
+from robocal_ros.ros.command_desk import CommandDesk
+from robocal_ros.ros.decision_services import DecisionServices
+from robocal_ros.ros.diagnostics import ERROR, WARN, Health
+from robocal_ros.ros.endpoints import NotActiveError
+from robocal_ros.ros.frame_watch import FrameWatch
+from robocal_ros.ros.history_settings import open_history, warn_of_history
+from robocal_ros.ros.run import run
+from robocal_ros.ros.stamp_watch import StampWatch
+from robocal_ros.session.decisions import named
+from robocal_ros.session.events import ACCEPT, CALIBRATE, Command, Outcome
+
+COMMAND_S = 1.0
+WATCH_S = 0.1
+INPUTS = {
+    JOINTS: (JointState, qos.STREAM),
+    PROFILE: (PointCloud2, qos.SENSOR),
+    TARGET_POSE: (PoseStamped, qos.SENSOR),
+    IMAGE: (Image, qos.SENSOR),
+}
+
+
+class HandEyeNode(HouseNode):
+    """Drives a `HandEyeSession` with live messages and calls."""
+
+    NAME = "hand_eye_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._session: HandEyeSession | None = None
+        self._history: CalibrationHistory | None = None
+
+    def configure(self) -> None:
+        """Read the robot, open the history, then the topics and services."""
+        settings = self.settings
+        self._nominal = load_robot(settings["robot"])
+        self._config = session_config(settings)
+        self._serial_in_use, self._history = open_history(settings, self._nominal)
+        self._kind = hand_eye_kind(self._config.sensor_frame)
+        self._outputs = HandEyeOutputs(self.add_output, self._nominal.name, self._serial_in_use)
+        self._guard = SourceGuard(self, JOINTS)
+        self._stamps = StampWatch(self, JOINTS)
+        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
+        for kind, (message_type, profile) in INPUTS.items():
+            self.add_input(message_type, kind, self._taker(kind), profile)
+        self._desk = CommandDesk(self, COMMAND_S, self._show)
+        ask, session = self._desk.ask, self._running
+        self._files = HandEyeFiles(self, ask, session, self._history)
+        HandEyeServices(self, settings, ask, self._files, session, self._history)
+        DecisionServices(self.add_service, self._ask_decision, self._history, self._kind)
+        self.add_timer(POLL_S, self._poll, steady=True)
+        self.add_timer(WATCH_S, self._watch, steady=True)
+
+    def activate(self) -> None:
+        """Begin a session; it knows nothing of what was captured before."""
+        if self._history is None:
+            raise ValueError("activated before it was configured")
+        self._session = HandEyeSession(self._nominal, self._history, self._config, __version__)
+        self._desk.session = self._session
+        self._frames = FrameWatch(self, self._config.sensor_frame, self._outputs.transforms)
+        self._last: Outcome | None = None
+        self._shown: tuple[int, int] | None = None
+        self._on_tf: int | None = None  # the revision
+        self._silence = Silence()
+        self._show_in_force()
+        self._outputs.status(self._session, None)
+
+    def deactivate(self) -> None:
+        """End the session; the capture that waits fails, and calls that wait are answered."""
+        session = self._session
+        if session is not None:
+            words = "the node was deactivated: capture again"
+            if (command := session.broken_off(Code.CONFLICT, words)) is not None:
+                self._desk.ask(command)
+            self._publish("the end", lambda: self._outputs.status(session, self._last, ended=True))
+        self._session = None
+        self._frames.close()
+        self._desk.close()
+
+    def cleanup(self) -> None:
+        """Close the history."""
+        self._session = None
+        if self._history is not None:
+            self._history.close()
+        self._history = None
+
+    def _running(self) -> HandEyeSession:
+        if self._session is None:
+            raise NotActiveError("no session: activate the node")
+        return self._session
+
+    # ---- samples and commands -------------------------------------------------------------------
+
+    def _taker(self, kind: str) -> Any:
+        def take(message: Any) -> None:
+            session = self._session
+            if session is None:
+                return
+            self._stamps.note(kind, message)
+            if kind == JOINTS and (fault := self._guard.fault_at(session.received[JOINTS])):
+                session.refuse(JOINTS, InputError(fault))
+                return
+            take_hand_eye_message(session, kind, message)
+            self._silence.heard_if_new(session.newest_joints_ns, time.monotonic())
+            if (command := session.recognised()) is not None:
+                self._desk.ask(command)
+
+        return take
+
+    async def _ask_decision(self, command: Command) -> Outcome:
+        if command.name == ACCEPT and self._chosen(command) is not None:
+            await self._frames.heard()
+            if fault := self._frame_fault(command):
+                raise InputError(fault)
+        outcome: Outcome = await self._desk.ask(command)
+        return outcome
+
+    def _chosen(self, command: Command) -> Mapping[str, Any] | None:
+        """The sensor's place that a command would bring into force; None: it will be refused."""
+        history = self._history
+        if history is None or self._session is None:
+            return None
+        number = int(named(history, command, self._kind).arguments.get("id", 0))
+        model = history.model(number) if number else {}
+        return model if "parent" in model else None
+
+    def _frame_fault(self, command: Command) -> str:
+        """Why what a command would bring into force cannot stand on tf; empty when it can."""
+        model = self._chosen(command)
+        return "" if model is None else self._conflict(model)
+
+    def _watch(self) -> None:
+        """A capture ends too when the joint states do; what is heard of tf is looked at in time."""
+        session = self._session
+        if session is None:
+            return
+        self._frames.tick()
+        silent_s = self._silence.look(time.monotonic())
+        if (command := session.silent(silent_s)) is not None:
+            self._desk.ask(command)
+
+    def _poll(self) -> None:
+        self._guard.look()
+        if self._session is None:
+            return
+        self._frames.look()
+        for outcome in self._session.poll():
+            self._show(outcome)
+        self._publish("a decision", self._show_in_force)
+
+    # ---- outputs --------------------------------------------------------------------------------
+
+    def _show(self, outcome: Outcome) -> None:
+        name, session = outcome.command.name, self._session
+        words = f"{name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
+        if session is None:
+            return
+        self._last = outcome
+        self._publish(name, lambda: self._outputs.events.tell(outcome.command, outcome))
+        if name == CALIBRATE:
+            self._publish(name, lambda: self._files.keep(outcome))
+            self._publish(name, lambda: self._show_quality(outcome))
+        self._publish(name, self._show_in_force)
+        self._publish(name, lambda: self._outputs.status(session, outcome))
+
+    def _publish(self, name: str, publish: Callable[[], None]) -> None:
+        """What is done stays done, and is shown as far as it can be."""
+        try:
+            publish()
+        except Exception as error:
+            told = str(error) if isinstance(error, RobocalError) else traceback.format_exc()
+            self.get_logger().error(f"{name} was done but not published: {told}")
+
+    def _show_quality(self, outcome: Outcome) -> None:
+        history, number = self._history, outcome.calibration_id
+        if history is None:
+            return
+        frame = str(history.model(number)["parent"]) if number else self._config.flange_frame
+        self._outputs.quality(outcome, frame)
+
+    def _show_in_force(self) -> None:
+        """Put the sensor in force onto tf and record the new state, when either changed."""
+        session = self._session
+        if session is None:
+            return
+        shown = session.in_force.revision, session.current.thermal.revision
+        if self._shown != shown or self._outputs.events.need_configuration:
+            self._shown = shown
+            self._outputs.events.tell(configuration(session, self._topics), None)
+            self._outputs.status(session, self._last)
+        self._show_transform(session.in_force)
+
+    def _show_transform(self, head: Head) -> None:
+        """Put what is in force onto tf, once it is known that nobody else puts the frame there."""
+        history, model = self._history, head.model
+        if history is None or self._on_tf == head.revision:
+            return
+        self._frames.listen()
+        if not self._frames.settled:
+            return
+        if model is not None and self._conflict(model):
+            return
+        stamp_ns = 0 if head.calibration_id is None else history.get(head.calibration_id).stamp_ns
+        self._outputs.transform(head, stamp_ns)
+        self._on_tf = head.revision
+
+    def _conflict(self, model: Mapping[str, Any]) -> str:
+        return self._frames.conflict(model["parent"], np.array(model["T_parent_sensor"]))
+
+    def health(self) -> Health:
+        """Tell what is in force, what is captured, what was lost or ignored, what is wrong."""
+        session, health = self._session, Health()
+        if session is None:
+            return health
+        values: dict[str, object] = {"revision in force": session.in_force.revision}
+        data = session.data
+        values["data set"] = (
+            "none"
+            if data is None
+            else f"{data.kind}, {len(data.samples)} samples of {len(data.captures)} captures"
+        )
+        values |= session.ignored.listed() | self._stamps.judge(health)
+        model = session.in_force.model
+        taken = "" if model is None else self._conflict(model)
+        for fault in (self._guard.fault, session.current.fault, taken):
+            if fault:
+                health.worsen(ERROR, fault)
+        if self._outputs.missing:
+            health.worsen(WARN, self._outputs.missing)
+        if self._history is not None:
+            warn_of_history(health, self._history)
+        health.values = values
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(HandEyeNode)

@@ -1,0 +1,297 @@
+"""The hand-eye session: samples and commands in, the sensor's place out. No clock, no ROS."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.ground.proposals import hand_eye_kind
+from robocal_ros.ground.samples import JOINTS, JointSample
+from robocal_ros.ground.streams import CLOCK_JUMP_NS, NotStillError
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.data import (
+    MOST_CAPTURES,
+    MOST_HANDLE,
+    Capture,
+    DataSet,
+    HandEyeSample,
+    data_set_begun,
+    data_set_of,
+)
+from robocal_ros.hand_eye.images import seen_corners
+from robocal_ros.hand_eye.in_force import HandEyeInForce
+from robocal_ros.hand_eye.results import HandEyeResults
+from robocal_ros.hand_eye.shots import IMAGE, Shot, ShotLog
+from robocal_ros.hand_eye.solving import require_known
+from robocal_ros.hand_eye.thermal import PoseModels
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.session import events
+from robocal_ros.session.commanded import Commanded, Handler
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.history import History
+
+_NO_SET = "no data set is open: call start, or load one"
+
+
+class HandEyeSession(Commanded):
+    """Calibrates one sensor of one robot.
+
+    ``capture`` answers at once; that the robot stood still and what the sensor saw then becomes a
+    command of its own, so that a recording holds which shot each sample was made of.
+
+    Attributes
+    ----------
+    data : the open data set; None without.
+    """
+
+    def __init__(
+        self, nominal: SerialArm, history: History, config: HandEyeConfig, software: str
+    ) -> None:
+        self.config = config
+        self.current = HandEyeInForce(history, nominal, config.sensor_frame)
+        super().__init__(nominal, history, hand_eye_kind(config.sensor_frame), self.current)
+        self._results = HandEyeResults(nominal, history, config, software)
+        self._shots = ShotLog()
+        self._handle = 0
+        self._why: RobocalError | None = None  # why the latest shot was of no use
+        self._seen_ns = 0  # shots before it were looked at
+        self._leap_ns = 0  # longest step of the joints' stamps since the capture
+        self._found: Command | None = None
+        self._models = PoseModels(self.current.thermal)
+        self.data: DataSet | None = None
+
+    # ---- samples --------------------------------------------------------------------------------
+
+    def add(self, sample: JointSample | Shot) -> None:
+        """Take a sample.
+
+        Raises
+        ------
+        InputError
+            When it cannot be used; the message says why.
+        """
+        if isinstance(sample, Shot):
+            if sample.stamp_ns <= 0:
+                raise InputError(f"{sample.topic} has no time stamp")
+            self._shots.add(sample, self.config.sensor_frame, self.newest_joints_ns)
+            self._tell_early(sample)
+            self.received[sample.topic] += 1
+            newest = self.newest_ns.get(sample.topic, 0)
+            self.newest_ns[sample.topic] = max(sample.stamp_ns, newest)
+        else:
+            self._add_joints(sample)
+        self._look()
+
+    def _tell_early(self, shot: Shot) -> None:
+        """A shot that comes after a capture was asked for, and is stamped before, tells why."""
+        waiting = self.data is not None and self.data.topic == shot.topic and self.data.waiting
+        if waiting and shot.stamp_ns < waiting.from_ns:
+            early_s = (waiting.from_ns - shot.stamp_ns) * 1e-9
+            words = f"{shot.topic} is stamped {early_s:.3f} s before the call"
+            self._why = InputError(f"{words}: is the sensor's clock behind?")
+
+    def _add_joints(self, sample: JointSample) -> None:
+        before_ns = self.newest_joints_ns or sample.stamp_ns
+        if self._take_joints(sample):
+            self._shots.clear()
+            self._found = self.broken_off(Code.CONFLICT, "the clock jumped back: capture again")
+        self._leap_ns = max(self._leap_ns, self.newest_joints_ns - before_ns)
+
+    def _watches_joints(self) -> bool:
+        return self.data is not None and self.data.waiting is not None and self._found is None
+
+    def refuse(self, kind: str, error: RobocalError) -> None:
+        """Count a message that cannot be used; a capture that waits for it tells why."""
+        self.ignored.add(kind, str(error))
+        if self.data is not None and kind == self.data.topic:
+            self._why = error
+
+    def _look(self) -> None:
+        """Find the first shot at standstill for the capture that waits."""
+        capture = None if self.data is None else self.data.waiting
+        if self.data is None or capture is None or self._found is not None:
+            return
+        for shot in self._shots.since(self.data.topic, max(capture.from_ns, self._seen_ns)):
+            try:
+                shot.read()
+                reading = self.stream.standstill(shot.stamp_ns, self.config.standstill)
+            except NotStillError as error:
+                self._why, self._seen_ns = error, shot.stamp_ns + 1
+                continue
+            except RobocalError as error:
+                self.refuse(shot.topic, error)
+                self._seen_ns = shot.stamp_ns + 1
+                continue
+            if reading is None:
+                break
+            arguments = {"handle": capture.handle, "shot_ns": shot.stamp_ns}
+            self._found = Command(events.SAMPLE, arguments, self.newest_joints_ns)
+            return
+        self._found = self._timed_out(capture, self.data.topic)
+
+    def _timed_out(self, capture: Capture, topic: str) -> Command | None:
+        limit_s = self.config.capture_timeout_s
+        waited_ns, limit_ns = self.newest_joints_ns - capture.from_ns, limit_s * 1e9
+        if waited_ns <= limit_ns:
+            return None
+        if waited_ns - self._leap_ns <= limit_ns and self._leap_ns > CLOCK_JUMP_NS:
+            leap_s = self._leap_ns * 1e-9
+            words = f"the joint states' clock jumped by {leap_s:.1f} s, or they paused for so long"
+            return self.broken_off(Code.CONFLICT, f"{words}: capture again")
+        words = f"no {topic} with the robot at standstill within {limit_s:g} s"
+        hint = "does the sensor publish it, is it triggered?"
+        code = Code.TOO_FEW_SAMPLES if self._why is None else self._why.code
+        return self.broken_off(code, f"{words}: {self._why or hint}")
+
+    def silent(self, seconds: float) -> Command | None:
+        """The command by which a capture fails when no usable joint reading comes any more."""
+        if seconds <= self.config.capture_timeout_s:
+            return None
+        told = self.ignored.words() or "check the robot's driver"
+        words = f"joint states are silent for {seconds:.1f} s: {told}"
+        return self.broken_off(Code.TOO_FEW_SAMPLES, words)
+
+    def broken_off(self, code: Code, reason: str) -> Command | None:
+        """The command by which the capture that waits fails; None when none waits."""
+        capture = None if self.data is None else self.data.waiting
+        if capture is None:
+            return None
+        arguments = {"handle": capture.handle, "code": int(code), "reason": reason}
+        return Command(events.BREAK_OFF, arguments, self.newest_joints_ns)
+
+    # ---- commands -------------------------------------------------------------------------------
+
+    def recognised(self) -> Command | None:
+        """The command that follows from the samples: a capture is complete, or has failed."""
+        found, self._found = self._found, None
+        return found
+
+    def _handlers(self) -> Mapping[str, Handler]:
+        return {
+            events.START: self._start,
+            events.CAPTURE: self._capture,
+            events.SAMPLE: self._sample,
+            events.BREAK_OFF: self._break_off,
+            events.REMOVE: self._remove,
+            events.CALIBRATE: self._calibrate,
+            events.LOAD: self._load,
+        }
+
+    def _require_set(self) -> DataSet:
+        if self.data is None:
+            raise ConflictError(_NO_SET)
+        return self.data
+
+    def _start(self, command: Command, wall_ns: int) -> Outcome:
+        data = data_set_begun(command.arguments)
+        require_known(data, data.method)
+        self.data = data
+        return Outcome(command, Code.ACCEPT, f"data set of a {data.kind} ({data.method}) begun")
+
+    def _capture(self, command: Command, wall_ns: int) -> Outcome:
+        data = self._require_set()
+        if (waits := data.waiting) is not None:
+            raise ConflictError(f"capture {waits.handle} still waits: {waits.reason}")
+        if not self.newest_joints_ns:
+            told = self.ignored.words() or f"does the robot's driver publish {JOINTS}?"
+            raise ConflictError(f"no joint states yet: {told}")
+        if len(data.captures) >= MOST_CAPTURES:
+            raise LimitError(f"{MOST_CAPTURES} captures: remove some, or start a new data set")
+        if self._handle >= MOST_HANDLE:
+            raise LimitError(f"handle {self._handle} was the last: begin a new session")
+        mark = str(command.arguments.get("mark", ""))
+        data.require_mark(mark)
+        handle = int(command.arguments.get("handle", self._handle + 1))
+        from_ns = int(command.arguments.get("from_ns", self._after_all_ns(data.topic)))
+        self._handle, self._why, self._seen_ns, self._leap_ns = handle, None, 0, 0
+        words = f"waits for {data.topic} with the robot at standstill"
+        data.captures[handle] = Capture(handle, mark, from_ns, words)
+        bound = {"handle": handle, "from_ns": from_ns}
+        command = replace(command, arguments={**command.arguments, **bound})
+        return Outcome(command, Code.ACCEPT, f"capture {handle} {words}")
+
+    def _after_all_ns(self, topic: str) -> int:
+        """The earliest stamp of a shot that is newer than all that was received.
+
+        No clock of ours is asked: those of robot and sensor need not be set to it. Who gives a
+        command for a call gives the messages first that came before it.
+        """
+        newest = self.newest_ns.get(topic)
+        return max(self.newest_joints_ns, 0 if newest is None else newest + 1)
+
+    def _sample(self, command: Command, wall_ns: int) -> Outcome:
+        data, at_ns = self._require_set(), int(command.arguments["shot_ns"])
+        capture = self._require_waiting(data, command)
+        shot = self._shots.at(data.topic, at_ns)
+        mean = self.stream.resting(at_ns, self.config.standstill)
+        if mean is None:
+            raise InputError(f"the joint readings about {at_ns} ns are not complete")
+        handle, mark = capture.handle, capture.mark
+        command = self._models.bound(command, self.current.thermal)
+        thermal = self._models.of(command, self.current.thermal)
+        try:
+            values = seen_corners(data.target, shot) if data.topic == IMAGE else shot.read()
+            words = data.put(HandEyeSample(handle, mark, at_ns, mean, values, thermal))
+        except InputError as error:
+            capture.code, capture.reason = error.code, str(error)
+            return Outcome(command, error.code, f"capture {handle}: {error}")
+        return Outcome(command, Code.ACCEPT, f"capture {handle}: {words}", samples=1)
+
+    def _break_off(self, command: Command, wall_ns: int) -> Outcome:
+        capture = self._require_waiting(self._require_set(), command)
+        arguments = command.arguments
+        capture.code, capture.reason = Code(int(arguments["code"])), str(arguments["reason"])
+        return Outcome(command, capture.code, f"capture {capture.handle}: {capture.reason}")
+
+    def _require_waiting(self, data: DataSet, command: Command) -> Capture:
+        handle, capture = int(command.arguments["handle"]), data.waiting
+        if capture is None or capture.handle != handle:
+            raise ConflictError(f"capture {handle} does not wait")
+        return capture
+
+    def _remove(self, command: Command, wall_ns: int) -> Outcome:
+        """Drop a capture; handle 0: the newest."""
+        data = self._require_set()
+        handle = int(command.arguments["handle"]) or max(data.captures, default=0)
+        if handle not in data.captures:
+            there = ", ".join(map(str, data.captures)) or "none"
+            raise InputError(f"no capture {handle}; there are {there}")
+        del data.captures[handle]
+        data.samples.pop(handle, None)
+        command = replace(command, arguments={**command.arguments, "handle": handle})
+        words = f"capture {handle} removed, {len(data.samples)} samples are left"
+        return Outcome(command, Code.ACCEPT, words, samples=len(data.samples))
+
+    def _calibrate(self, command: Command, wall_ns: int) -> Outcome:
+        data = self._require_set()
+        data.candidate = 0
+        outcome = self._results.calibrate(data, command, wall_ns)
+        data.candidate = outcome.calibration_id
+        return outcome
+
+    def document(self) -> dict[str, Any]:
+        """The open data set for a file, with the models that its flange poses come from.
+
+        Raises
+        ------
+        ConflictError
+            When nothing was captured.
+        """
+        if self.data is None or not self.data.samples:
+            raise ConflictError("nothing was captured yet: there is nothing to save")
+        return self.data.document()
+
+    def _load(self, command: Command, wall_ns: int) -> Outcome:
+        arguments = command.arguments
+        data = data_set_of(arguments["set"], self.current.arm)
+        require_known(data, data.method)
+        self.data = data
+        self._handle = max(self._handle, *data.samples, 0)
+        count = len(data.samples)
+        words = f"{count} samples of a {data.kind} loaded from {arguments.get('path', 'a file')}"
+        taken = data.thermal_revisions()
+        if taken != [self.current.thermal.revision]:
+            told = ", ".join(map(str, taken))
+            words += f"; their flange poses are those of thermal revision {told}"
+        return Outcome(command, Code.ACCEPT, words, samples=count)

@@ -1,0 +1,256 @@
+"""What planned poses would say about a sensor's place, before the robot is moved."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import ConflictError, InputError, LimitError, RobocalError
+from robocal_ros.ground.proposals import State
+from robocal_ros.ground.samples import JointSample
+from robocal_ros.hand_eye.config import HandEyeConfig
+from robocal_ros.hand_eye.data import DataSet
+from robocal_ros.hand_eye.profile import Profile
+from robocal_ros.hand_eye.session import HandEyeSession
+from robocal_ros.hand_eye.target_documents import target_of
+from robocal_ros.hand_eye.targets import LineTarget, SphereTarget, StepTarget
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.flange_units import FARTHEST_M, flange_unit_fault, joint_unit_fault
+from robocal_ros.session.history import History
+
+if TYPE_CHECKING:
+    from robocal_ros.hand_eye.planning import PlannedTarget, PlanReport, SensorRange
+
+Array = NDArray[np.float64]
+
+ROBOT_SIGMA_M = 5e-5  # of a reported pose in each axis, where it is not given
+MOST_POSES = 200
+FEWEST_SEEN = 3  # samples that tell on which side of the laser plane a sphere lies
+TO_GO_BY = (State.PENDING, State.STALE)  # what was refused or taken back tells nothing
+
+
+# ---- what a request holds -----------------------------------------------------------------------
+
+
+def require_count(joints: int, flange: int) -> None:
+    """Refuse poses that were given in both ways or in none, and too many.
+
+    Raises
+    ------
+    InputError, LimitError
+        Naming the numbers.
+    """
+    if bool(joints) == bool(flange):
+        raise InputError(
+            f"{joints} joint states and {flange} flange poses: give the planned poses in one of "
+            "the two ways"
+        )
+    if joints + flange > MOST_POSES:
+        raise LimitError(f"{joints + flange} poses: at most {MOST_POSES} are judged at a time")
+
+
+def poses_of_joints(arm: SerialArm, samples: Sequence[JointSample]) -> Array:
+    """Flange poses (m, 4, 4) at joint positions.
+
+    Raises
+    ------
+    InputError
+        When a joint is missing, or a value is in another unit.
+    """
+    q = np.array([sample.position[sample.order(arm.joint_names)] for sample in samples])
+    _require(joint_unit_fault(arm, q))
+    return arm.fk(q)
+
+
+def poses_of_flange(position: Array, quat_xyzw: Array) -> Array:
+    """Flange poses (m, 4, 4) of positions (m, 3), m, and quaternions (m, 4).
+
+    Raises
+    ------
+    InputError
+        When one is no pose, or is in another unit.
+    """
+    pairs = zip(position, quat_xyzw, strict=True)
+    poses = [pose_of(*pair, f"flange pose {i}") for i, pair in enumerate(pairs, 1)]
+    _require(flange_unit_fault(position))
+    return np.array(poses)
+
+
+def _require(fault: tuple[int, str] | None) -> None:
+    if fault is not None:
+        raise InputError(f"planned pose {fault[0] + 1}: {fault[1]}")
+
+
+def pose_of(position: ArrayLike, quat_xyzw: ArrayLike, name: str) -> Array:
+    """A pose (4, 4) of a position (3,), m, and a quaternion (4,).
+
+    Raises
+    ------
+    InputError
+        When it is none; ``name`` says which.
+    """
+    quat, place = np.asarray(quat_xyzw, np.float64), np.asarray(position, np.float64)
+    norm = float(np.linalg.norm(quat))
+    if not (abs(norm - 1.0) <= 1e-3):
+        raise InputError(f"{name} is none: its quaternion has length {norm:.6g}")
+    return frames.transform_from_quat(require_near(place, name), quat / norm)
+
+
+def require_near(place: ArrayLike, name: str) -> Array:
+    """A place (3,), m.
+
+    Raises
+    ------
+    InputError
+        When it is none within reach of an arm; ``name`` says which.
+    """
+    point = np.asarray(place, np.float64)
+    if not np.all(np.isfinite(point)):
+        raise InputError(f"{name} is none: its position is {point}")
+    if (away := float(np.linalg.norm(point))) > FARTHEST_M:
+        raise InputError(
+            f"{name} is {away:.4g} m away: is it a thousand times too far: mm where m are expected?"
+        )
+    return point
+
+
+# ---- what is known already ----------------------------------------------------------------------
+
+
+def rough_mount(
+    session: HandEyeSession, history: History, given: Array | None, configured: Array | None
+) -> tuple[Array, str]:
+    """About where the sensor sits on the flange (4, 4), and who says so.
+
+    What the request has given; else what is in force; else the open data set's last candidate,
+    unless it was refused; else what is configured.
+
+    Raises
+    ------
+    InputError
+        When nothing says it.
+    """
+    if given is not None:
+        return given, "the request"
+    head, data = session.in_force, session.data
+    if (T := _on_flange(head.model, session.config)) is not None:
+        return T, f"calibration {head.calibration_id} in force"
+    number = _candidate(data, history)
+    if number and (T := _on_flange(history.model(number), session.config)) is not None:
+        return T, f"candidate {number}"
+    if configured is not None:
+        return configured, "rough_xyz_mm and rough_quat_xyzw"
+    raise InputError(
+        "nothing says where the sensor sits: set rough_xyz_mm and rough_quat_xyzw to a few "
+        "millimetres and degrees, or give sensor in the request"
+    )
+
+
+def _on_flange(model: dict[str, Any] | None, config: HandEyeConfig) -> Array | None:
+    if model is None or model["parent"] != config.flange_frame:
+        return None
+    return np.array(model["T_parent_sensor"])
+
+
+def _candidate(data: DataSet | None, history: History) -> int:
+    """The last calibration of a data set that can be gone by; 0 without."""
+    number = 0 if data is None else data.candidate
+    return number if number and history.get(number).state in TO_GO_BY else 0
+
+
+def sphere_centre(
+    data: DataSet, history: History, arm: SerialArm, T_flange_sensor: Array
+) -> Array | None:
+    """Where the sphere was last found (3,), base; None where neither result nor samples tell."""
+    from robocal_ros.hand_eye.tasks import HandEyeData, SphereTask
+
+    target = target_of(data.target)
+    if not isinstance(target, SphereTarget):
+        return None
+    if number := _candidate(data, history):
+        return 1e-3 * np.array(history.document(number)["target"]["center_mm"])
+    samples = list(data.samples.values())
+    if len(samples) < FEWEST_SEEN:
+        return None
+    names = tuple(str(sample.handle) for sample in samples)
+    profiles = [Profile(sample.values, str(sample.handle)) for sample in samples]
+    poses = arm.fk(np.array([sample.q for sample in samples]))
+    task = SphereTask(target)
+    try:
+        view = task.read(HandEyeData(names, poses, profiles), T_flange_sensor).view
+    except RobocalError:  # they show no sphere: calibrate says so
+        return None
+    return task.placed(view, T_flange_sensor) if len(view.sightings.names) >= FEWEST_SEEN else None
+
+
+# ---- the judgement ------------------------------------------------------------------------------
+
+
+def require_target(session: HandEyeSession) -> DataSet:
+    """The open data set.
+
+    Raises
+    ------
+    ConflictError
+        Without one.
+    """
+    if session.data is None:
+        raise ConflictError("no data set is open: call start, so that the target is known")
+    return session.data
+
+
+def judged_plan(
+    data: DataSet,
+    T_base_flange: Array,
+    marks: Sequence[str],
+    T_flange_sensor: Array,
+    sensor: "SensorRange",
+    config: HandEyeConfig,
+    centre: Array | None = None,
+) -> "PlanReport":
+    """Judge planned flange poses (m, 4, 4) with a rough T_flange_sensor (4, 4).
+
+    ``marks``: of a step target the mark (m) of each pose; without any its first one. ``centre``:
+    of a sphere (3,), base; None: where most of the poses see it.
+
+    Raises
+    ------
+    InputError
+        For a target whose plans cannot be judged, and for marks that it does not have.
+    """
+    from robocal_ros.hand_eye.mount_problem import PoseNoise
+    from robocal_ros.hand_eye.planning import check_plan
+    from robocal_ros.hand_eye.quality import HandEyeSettings
+
+    given = HandEyeSettings(config.robot_sigma_m, config.robot_sigma_rad).noise()
+    noise = given or PoseNoise(ROBOT_SIGMA_M, 0.0)
+    if marks and len(marks) != len(T_base_flange):
+        raise InputError(f"{len(marks)} marks for {len(T_base_flange)} poses: give each its own")
+    for mark in marks:
+        data.require_mark(mark)
+    if centre is not None and data.kind != "sphere":
+        raise InputError(f"center is a sphere's, not a {data.kind}'s: leave it out")
+    target = _planned(data, marks, sensor, centre)
+    return check_plan(target, T_base_flange, T_flange_sensor, sensor, noise, config.limit_m)
+
+
+def _planned(
+    data: DataSet, marks: Sequence[str], sensor: "SensorRange", centre: Array | None
+) -> "PlannedTarget":
+    from robocal_ros.hand_eye.planned_targets import PlannedLine, PlannedSphere, PlannedStep
+
+    target = target_of(data.target)
+    if isinstance(target, SphereTarget):
+        if centre is None:
+            return PlannedSphere(target.radius_m, sensor)
+        x, y, z = centre.tolist()
+        return PlannedSphere(target.radius_m, sensor, (x, y, z))
+    if isinstance(target, StepTarget):
+        return PlannedStep(target, sensor, tuple(marks) or None)
+    if isinstance(target, LineTarget):
+        return PlannedLine(sensor, np.stack([target.point_base, target.direction_base]))
+    if data.kind == "line":
+        return PlannedLine(sensor)
+    raise InputError(f"plans are judged for a line laser's targets, not for a {data.kind}")

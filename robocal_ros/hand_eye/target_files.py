@@ -1,0 +1,231 @@
+"""Target files of a hand-eye calibration: YAML, in millimetres and degrees.
+
+The contract is written in docs/hand_eye_sphere.md, hand_eye_step.md, hand_eye_line.md and, of a
+board, hand_eye_node.md.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from robocal_ros.ground import frames
+from robocal_ros.ground.files import write_text
+from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.hand_eye.board import FEWEST_CORNERS
+from robocal_ros.hand_eye.targets import (
+    MACHINING_M,
+    BoardTarget,
+    CornerKind,
+    FirstStep,
+    LineTarget,
+    SphereTarget,
+    Staircase,
+    StepTarget,
+)
+from robocal_ros.kinematics.made_files import read_fields
+from robocal_ros.kinematics.pose_fields import read_pose
+from robocal_ros.kinematics.robot_fields import Fields
+
+Array = NDArray[np.float64]
+Target = SphereTarget | StepTarget | LineTarget
+
+KINDS = ("sphere", "step", "line", "board")
+CORNERS: dict[str, CornerKind] = {"convex": "convex", "concave": "concave", "both": "both"}
+FIRST: dict[str, FirstStep] = {"lowest": "lowest", "highest": "highest"}
+SMALLEST_MM, LARGEST_MM = 1.0, 1000.0  # of a sphere's radius
+FARTHEST_MM = 20e3  # of a target from the base
+ROUNDING = 1e-3  # of the axes of a frame, from unit vectors at right angles
+MOST_STEPS = 100
+MOST_CORNERS = 100  # along a side of a board
+
+
+def read_target(path: Path) -> Target | BoardTarget:
+    """Read a target file.
+
+    Raises
+    ------
+    InputError
+        Naming file and key, when it is not as its contract says.
+    """
+    top = read_fields(path, "target file")
+    kind = top.choice("kind", KINDS)
+    if kind == "sphere":
+        return _sphere(top)
+    if kind == "board":
+        return _board(top, path.parent)
+    return _step(top) if kind == "step" else _line(top)
+
+
+def _sphere(top: Fields) -> SphereTarget:
+    top.only("kind", "radius_mm")
+    radius_mm = top.number("radius_mm")
+    if not SMALLEST_MM <= radius_mm <= LARGEST_MM:
+        top.fail(
+            f"is {radius_mm:g}; it must be {SMALLEST_MM:g} to {LARGEST_MM:g}: is it off by a "
+            "thousand?",
+            "radius_mm",
+        )
+    return SphereTarget(radius_mm * 1e-3)
+
+
+def _board(top: Fields, folder: Path) -> BoardTarget:
+    from robocal_ros.hand_eye.camera_files import read_intrinsics
+
+    top.only("kind", "columns", "rows", "square_mm", "intrinsics")
+    columns, rows = (top.whole(key, FEWEST_CORNERS, MOST_CORNERS) for key in ("columns", "rows"))
+    square_m = top.positive("square_mm") * 1e-3
+    if "intrinsics" not in top.values:
+        return BoardTarget(columns, rows, square_m)
+    camera = read_intrinsics(folder / top.text("intrinsics"))
+    size = np.array(camera.size, dtype=np.float64)
+    return BoardTarget(columns, rows, square_m, camera.matrix, camera.distortion, size)
+
+
+def _line(top: Fields) -> LineTarget:
+    top.only("kind", "point_mm", "direction")
+    point_mm = np.array(top.numbers("point_mm", 3))
+    _check_near(top, "point_mm", point_mm)
+    return LineTarget(point_mm * 1e-3, _direction(top, "direction"))
+
+
+def _step(top: Fields) -> StepTarget:
+    top.only(
+        "kind", "T_base_user", "staircase", "corners_mm", "edge_user",
+        "sigma_mm", "user_sigma_mm", "user_sigma_deg",
+    )  # fmt: skip
+    if ("staircase" in top.values) == ("corners_mm" in top.values):
+        top.fail("must give either staircase, or corners_mm with edge_user")
+    if "staircase" in top.values:
+        if "edge_user" in top.values:
+            top.fail("is x for a staircase: leave it out", "edge_user")
+        staircase = _staircase(top.below("staircase"))
+        corners, edge = staircase.marked_corners(), staircase.edge_user
+    else:
+        corners, edge = _corners(top.below("corners_mm")), _direction(top, "edge_user")
+    return StepTarget(
+        T_base_user=_frame(top.below("T_base_user")),
+        corners=corners,
+        edge_user=edge,
+        sigma_m=top.positive("sigma_mm", MACHINING_M * 1e3) * 1e-3,
+        user_sigma_m=_sigma(top, "user_sigma_mm") * 1e-3,
+        user_sigma_rad=float(np.radians(_sigma(top, "user_sigma_deg"))),
+    )
+
+
+def _staircase(fields: Fields) -> Staircase:
+    lengths = ("length_mm", "height_mm", "depth_mm")
+    fields.only("steps", *lengths, "corners", "first")
+    steps = fields.whole("steps", 1, MOST_STEPS)
+    length, height, depth = (fields.positive(key) * 1e-3 for key in lengths)
+    corners = CORNERS[fields.choice("corners", tuple(CORNERS), "convex")]
+    if corners == "concave" and steps < 2:
+        fields.fail("is 1; only between two steps there is a concave corner", "steps")
+    first = FIRST[fields.choice("first", tuple(FIRST), "lowest")]
+    return Staircase(steps, length, height, depth, corners, first)
+
+
+def _corners(fields: Fields) -> dict[str, Array]:
+    if not fields.values:
+        fields.fail("must name at least one mark")
+    corners = {}
+    for mark, rows in fields.values.items():
+        if not isinstance(mark, str) or not mark.strip():
+            fields.fail("is no name of a mark: give a word", str(mark))
+        if not isinstance(rows, list) or not rows:
+            fields.fail("must be a list of corners [x, y, z]", mark)
+        corners[mark] = 1e-3 * _points(rows, "corner", fields, mark)
+    return corners
+
+
+def _frame(fields: Fields) -> Array:
+    """Transform (4, 4), m, of ``{xyz_mm, quat_xyzw or rpy_deg or rotation}``."""
+    if "rotation" in fields.values:
+        fields.only("xyz_mm", "rotation")
+        T = frames.transform(_rotation(fields), np.array(fields.numbers("xyz_mm", 3)) * 1e-3)
+    else:
+        if not {"quat_xyzw", "rpy_deg"} & set(fields.values):
+            fields.fail("needs an orientation: quat_xyzw, rpy_deg or rotation")
+        T = read_pose(fields)
+    _check_near(fields, "xyz_mm", T[:3, 3] * 1e3)
+    return T
+
+
+def _rotation(fields: Fields) -> Array:
+    rows = fields.values["rotation"]
+    if not isinstance(rows, list) or len(rows) != 3:
+        fields.fail("must be a list of 3 rows of a matrix", "rotation")
+    R = _points(rows, "row", fields, "rotation")
+    error = float(np.abs(R.T @ R - np.eye(3)).max())
+    if error > ROUNDING:
+        fields.fail(
+            f"has columns that are not unit vectors at right angles (off by {error:.3g})",
+            "rotation",
+        )
+    if np.linalg.det(R) < 0.0:
+        fields.fail("is left-handed: its third column must be first x second", "rotation")
+    return frames.nearest_rotation(R)
+
+
+def _points(rows: list[Any], name: str, fields: Fields, key: str) -> Array:
+    """A list of points (n, 3); ``name`` is what one of them is called."""
+    values = {f"{name} {i}": row for i, row in enumerate(rows, start=1)}
+    numbered = Fields(values, fields.file, f"{fields.place}, {key}")
+    return np.array([numbered.numbers(key, 3) for key in values])
+
+
+def _direction(fields: Fields, key: str) -> Array:
+    vector = np.array(fields.numbers(key, 3))
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        fields.fail("has no length", key)
+    return vector / length
+
+
+def _sigma(fields: Fields, key: str) -> float:
+    value = fields.number(key)
+    if value < 0.0:
+        fields.fail(f"is {value:g}; it must not be below 0", key)
+    return value
+
+
+def _check_near(fields: Fields, key: str, point_mm: Array) -> None:
+    distance = float(np.linalg.norm(point_mm))
+    if distance > FARTHEST_MM:
+        fields.fail(
+            f"is {distance:.4g} mm from the base: is it a thousand times too far, in µm?", key
+        )
+
+
+def write_target(path: Path, target: Target) -> None:
+    """Write a target file, corners in full; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    text = yaml.safe_dump(_document(target), sort_keys=False, default_flow_style=None, width=2**16)
+    write_text(path, text)
+
+
+def _document(target: Target) -> dict[str, Any]:
+    if isinstance(target, SphereTarget):
+        return {"kind": "sphere", "radius_mm": target.radius_m * 1e3}
+    if isinstance(target, LineTarget):
+        return {
+            "kind": "line",
+            "point_mm": (target.point_base * 1e3).tolist(),
+            "direction": target.direction_base.tolist(),
+        }
+    return {
+        "kind": "step",
+        "T_base_user": transform_document(target.T_base_user),
+        "corners_mm": {mark: (rows * 1e3).tolist() for mark, rows in target.corners.items()},
+        "edge_user": target.edge_user.tolist(),
+        "sigma_mm": target.sigma_m * 1e3,
+        "user_sigma_mm": target.user_sigma_m * 1e3,
+        "user_sigma_deg": float(np.degrees(target.user_sigma_rad)),
+    }

@@ -1,0 +1,1 @@
+"""The calibration history of a robot: proposed, decided, rolled back, never lost."""

@@ -1,0 +1,153 @@
+"""Rows and contents of the history file: records in, records out, every content with a digest.
+
+SQLite has no page checksums: a flipped bit in a stored model would pass its integrity check and
+move a robot. So each document, model and set of inputs is compared with its SHA-256 when read.
+"""
+
+import hashlib
+import io
+import json
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import astuple, fields
+from typing import TYPE_CHECKING, Any
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError, StorageError
+from robocal_ros.ground.proposals import Action, Candidate, Decision, Proposal
+from robocal_ros.history.history_schema import DamagedError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_COLUMNS = tuple(column.name for column in fields(Candidate))
+_SELECT = f"SELECT id, {', '.join(_COLUMNS)} FROM calibrations "
+_LARGEST_ID = 2**63 - 1
+
+
+def packed(proposal: Proposal) -> dict[str, bytes]:
+    """Document, model and inputs as bytes; equal contents give equal bytes.
+
+    Raises
+    ------
+    ValueError
+        A number in the document or the model is not finite, or an input array holds objects.
+    """
+    import numpy as np
+
+    payloads = {}
+    for name in ("document", "model"):
+        try:
+            text = json.dumps(getattr(proposal, name), allow_nan=False, separators=(",", ":"))
+        except ValueError as error:
+            raise ValueError(f"{name} of a proposal: {error}") from error
+        payloads[name] = text.encode()
+    arrays = {name: np.asarray(array) for name, array in proposal.inputs.items()}
+    for name, array in arrays.items():
+        if array.dtype.hasobject:
+            raise ValueError(f"input {name!r} of a proposal is not an array of numbers or text")
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]  # names are free
+    payloads["inputs"] = buffer.getvalue()
+    return payloads
+
+
+def insert_proposal(
+    connection: sqlite3.Connection, proposal: Proposal, payloads: dict[str, bytes]
+) -> int:
+    """Add a calibration with its contents; returns its id."""
+    row = [getattr(proposal, name) for name in _COLUMNS]
+    marks = ", ".join("?" * len(row))
+    cursor = connection.execute(
+        f"INSERT INTO calibrations ({', '.join(_COLUMNS)}) VALUES ({marks})", row
+    )
+    assigned = cursor.lastrowid
+    if assigned is None:
+        raise RuntimeError("an insert without a row")
+    for name, data in payloads.items():
+        digest = hashlib.sha256(data).digest()
+        connection.execute(
+            "INSERT INTO payloads VALUES (?, ?, ?, ?)", (assigned, name, data, digest)
+        )
+    return assigned
+
+
+def insert_decision(connection: sqlite3.Connection, decision: Decision) -> None:
+    """Add a decision; its ``seq`` is assigned."""
+    connection.execute(
+        "INSERT INTO decisions VALUES (NULL, ?, ?, ?, ?, ?, ?, ?, ?)", astuple(decision)[1:]
+    )
+
+
+def read_decisions(
+    connection: sqlite3.Connection, after_seq: int, newest: int = -1
+) -> tuple[Decision, ...]:
+    """Decisions after a sequence number, oldest first; the latest ``newest``, -1: all."""
+    latest_first = "SELECT * FROM decisions WHERE seq > ? ORDER BY seq DESC LIMIT ?"
+    rows = connection.execute(latest_first, (after_seq, newest)).fetchall()
+    return tuple(
+        Decision(seq, kind, Action(action), *rest) for seq, kind, action, *rest in reversed(rows)
+    )
+
+
+def read_candidates(
+    connection: sqlite3.Connection, clause: str, *values: str | int
+) -> Iterator[tuple[int, Candidate]]:
+    """Ids and calibrations that an SQL clause selects."""
+    for assigned, *row in connection.execute(_SELECT + clause, values):
+        columns = dict(zip(_COLUMNS, row, strict=True))
+        try:
+            columns["code"] = Code(columns["code"])
+        except ValueError as error:
+            raise StorageError(
+                f"calibration {assigned} has the code {columns['code']}, unknown here: it was "
+                "made by a newer robocal, update this one"
+            ) from error
+        yield assigned, Candidate(**columns)
+
+
+def read_candidate(connection: sqlite3.Connection, calibration_id: int) -> Candidate:
+    """One calibration.
+
+    Raises
+    ------
+    InputError
+        Unknown id.
+    """
+    if 0 < calibration_id <= _LARGEST_ID:
+        for _, candidate in read_candidates(connection, "WHERE id = ?", calibration_id):
+            return candidate
+    raise InputError(f"no calibration has the id {calibration_id}; look at the list")
+
+
+def read_json(connection: sqlite3.Connection, calibration_id: int, name: str) -> dict[str, Any]:
+    """Document or model of a calibration.
+
+    Raises
+    ------
+    InputError
+        Unknown id.
+    DamagedError
+        Its bytes are not those that were stored.
+    """
+    found: dict[str, Any] = json.loads(_read(connection, calibration_id, name))
+    return found
+
+
+def read_arrays(connection: sqlite3.Connection, calibration_id: int) -> "dict[str, NDArray[Any]]":
+    """Arrays that a calibration was solved from. Raises as `read_json`."""
+    import numpy as np
+
+    with np.load(io.BytesIO(_read(connection, calibration_id, "inputs"))) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def _read(connection: sqlite3.Connection, calibration_id: int, name: str) -> bytes:
+    read_candidate(connection, calibration_id)
+    row = connection.execute(
+        "SELECT data, sha256 FROM payloads WHERE calibration_id = ? AND name = ?",
+        (calibration_id, name),
+    ).fetchone()
+    if row is None or hashlib.sha256(row[0]).digest() != row[1]:
+        raise DamagedError(f"the {name} of calibration {calibration_id} is damaged")
+    return bytes(row[0])

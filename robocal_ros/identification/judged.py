@@ -1,0 +1,171 @@
+"""Identify on one part of the data, judge on another."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation.assessment import (
+    SPREAD_POSES,
+    Judgement,
+    Verdict,
+    gross,
+    hold_out,
+    judge,
+    pose_groups,
+    summarise,
+    too_narrow,
+)
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.frames import log_rotation
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell import CellModel
+from robocal_ros.identification.mismatch import require_match
+from robocal_ros.identification.solve import Identification, Method, Part, identify, still_joints
+from robocal_ros.identification.start import linear_start
+from robocal_ros.kinematics import SerialArm
+
+Array = NDArray[np.float64]
+
+LARGEST_TURN_RAD = float(np.radians(5.0))  # no robot's wrist is off by this much
+
+
+@dataclass(frozen=True)
+class JudgedIdentification(Judgement):
+    """An identification with its judgement."""
+
+    identification: Identification
+
+
+def identify_and_judge(
+    arm: SerialArm,
+    train: Measurements,
+    check: Measurements,
+    *,
+    fit: Collection[Part] = ("base", "tool", "geometry"),
+    method: Method = "map",
+    check_refit: Collection[Part] = (),
+    in_force: SerialArm | None = None,
+) -> JudgedIdentification:
+    """Identify from ``train`` and compare with the model in force on ``check``.
+
+    Parameters
+    ----------
+    check_refit : ``base``, ``tool``: parts that are solved anew from the check data, for both
+        models, because those come from another set-up; the geometry is held.
+    in_force : arm with the parameters in force, default the nominal ``arm``; base and targets
+        are fitted to it from the same training data.
+    """
+    if "geometry" in check_refit:
+        raise InputError("the geometry is what is checked: refit only base and tool")
+    result = identify(arm, train, fit=fit, method=method)
+    _require_orientations(result, train)
+    set_up = frozenset(fit) - {"geometry"}
+    plain = _check_error(_set_up(arm, train, set_up), check, check_refit)
+    before = plain
+    if in_force is not None:
+        before = _check_error(_set_up(in_force, train, set_up), check, check_refit)
+    after = _check_error(result.cell, check, check_refit)
+    predicted, total = _predicted(result, check, check_refit)
+    doubt = still_joints(arm, train) and still_joints(arm, check)
+    sound = ~gross(before, after)
+    doubt = doubt or _doubt(result, summarise(before[sound]).rms_m, in_force or arm)
+    verdict = judge(before[sound], after[sound], pose_groups(check.q)[sound], doubt)
+    if "geometry" not in fit:
+        verdict = _of_placement(verdict)
+    return JudgedIdentification(
+        identification=result,
+        nominal=summarise(plain[sound]),
+        current=summarise(before[sound]),
+        candidate=summarise(after[sound]),
+        predicted_rms_m=predicted,
+        predicted_total_rms_m=total,
+        workspace_rms_m=result.workspace_rms(result.estimate.covariance),
+        held_out_rejected=tuple(check.sample[i] for i in np.flatnonzero(~sound)),
+        verdict=verdict,
+    )
+
+
+def _require_orientations(result: Identification, data: Measurements) -> None:
+    """Refuse orientations that do not belong to the joints; positions alone would hide it."""
+    if data.rotation is None:
+        return
+    T = result.cell.predict(data.q, data.target_index(result.cell.targets))
+    turn = log_rotation(T[:, :3, :3] @ np.swapaxes(data.rotation, 1, 2))
+    off = float(np.median(np.linalg.norm(turn, axis=1)))
+    if off > LARGEST_TURN_RAD:
+        raise InputError(
+            f"measured orientations miss the model by {np.degrees(off):.3g} deg (median) while "
+            "positions fit: check the order of the quaternion (x, y, z, w), the convention of the "
+            "angles, and that the rows belong together; or leave the orientations out"
+        )
+
+
+def identify_and_hold_out(
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    share: float,
+    seed: int,
+    method: Method = "map",
+    in_force: SerialArm | None = None,
+) -> JudgedIdentification:
+    """Identify base, targets and model from a part of the poses, judge on the ``share`` left out.
+
+    Raises
+    ------
+    InputError
+        When the data miss the arm by a mistake that can be named.
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer.
+    """
+    held = hold_out(pose_groups(data.q), share, seed)
+    require_match(arm, data, base=True, tool=True)
+    train, check = data.take(~held), data.take(held)
+    return identify_and_judge(arm, train, check, method=method, in_force=in_force)
+
+
+def _doubt(result: Identification, current_rms_m: float, in_force: SerialArm) -> str:
+    """Say why the poses do not carry over to the workspace; empty when they do."""
+    error = result.workspace_rms(result.estimate.covariance)
+    change = result.workspace_change(in_force)
+    return result.estimate.creeping or too_narrow(error, change, current_rms_m, SPREAD_POSES)
+
+
+def _set_up(arm: SerialArm, train: Measurements, fit: Collection[Part]) -> CellModel:
+    """Base and targets for a given geometry."""
+    return identify(arm, train, fit=fit).cell if fit else linear_start(arm, train)
+
+
+def _of_placement(verdict: Verdict) -> Verdict:
+    """The verdict where base and targets alone were fitted: the model cannot have changed."""
+    if verdict.code not in (Code.WORSE_THAN_CURRENT, Code.NO_SIGNIFICANT_GAIN):
+        return verdict
+    why = f"no model parameter was fitted, the geometry stays; {verdict.reason}"
+    return Verdict(Code.NO_SIGNIFICANT_GAIN, why)
+
+
+def _check_error(cell: CellModel, check: Measurements, refit: Collection[Part]) -> Array:
+    if refit:
+        cell = identify(cell.arm, check, fit=refit, method="map", start=_start(cell, refit)).cell
+    return np.asarray(np.linalg.norm(cell.residual(check), axis=1))
+
+
+def _start(cell: CellModel, refit: Collection[Part]) -> CellModel | None:
+    """Keep what is not refitted; with both refitted nothing of the old set-up counts."""
+    return None if frozenset(refit) >= {"base", "tool"} else cell
+
+
+def _predicted(
+    result: Identification, check: Measurements, refit: Collection[Part]
+) -> tuple[float, float]:
+    """Rms error expected at the check poses: of the model, and with measurement noise."""
+    known = {name: i for i, name in enumerate(result.cell.targets)}
+    target = np.array([known.get(name, 0) for name in check.target], dtype=np.int64)
+    variance = result.predicted_variance(check.q, target, without=refit)
+    model = float(np.mean(np.trace(variance, axis1=1, axis2=2)))
+    sigma = check.sigma
+    noise = result.noise_m if sigma is None else float(np.sqrt(np.mean(sigma**2)))
+    return float(np.sqrt(model)), float(np.sqrt(model + 3.0 * noise**2))

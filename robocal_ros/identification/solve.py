@@ -1,0 +1,298 @@
+"""Base, targets and model parameters from measurements: least squares or maximum a posteriori."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation import estimation
+from robocal_ros.estimation.freedom import require_told
+from robocal_ros.estimation.observability import describe, observability
+from robocal_ros.ground.errors import RankDeficientError
+from robocal_ros.ground.samples import Measurements
+from robocal_ros.identification.cell import CellModel, CellProblem, Layout, make_layout
+from robocal_ros.identification.priors import default_prior, fitted_prior
+from robocal_ros.identification.start import linear_start
+from robocal_ros.kinematics import SerialArm
+
+Array = NDArray[np.float64]
+Part = Literal["base", "tool", "geometry"]
+Method = Literal["map", "lsq"]
+
+_STILL_RAD = float(np.radians(5.0))
+_STILL_M = 0.01
+_ORIENTATION_SHARE = 0.25
+_SHORTEST_LEVER_M = 0.02
+_LEVER_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified cell model with its uncertainty.
+
+    Attributes
+    ----------
+    nominal : the arm that was started from.
+    cell : the identified model, base and targets.
+    held : model parameters kept at their start because base or targets (or other parameters)
+        have the same effect on every measurement.
+    unobservable : directions, in words, that the data leave to the prior or to ``held``.
+    prior_covariance : (g, g), SI, of the model parameters before the data, or None.
+    noise_m : standard deviation of a measured coordinate, as given or as found.
+    """
+
+    nominal: SerialArm
+    cell: CellModel
+    layout: Layout
+    method: Method
+    estimate: estimation.Estimate[CellModel]
+    held: tuple[str, ...]
+    prior_covariance: Array | None
+    unobservable: tuple[str, ...]
+    rejected: tuple[str, ...]
+    noise_m: float
+
+    def sigma(self) -> dict[str, float]:
+        """Standard deviation, SI, of each unknown by name."""
+        spread = np.sqrt(np.diag(self.estimate.covariance))
+        return dict(zip(self.layout.names, spread.tolist(), strict=True))
+
+    def predicted_variance(
+        self, q: Array, target: NDArray[np.int64], without: Collection[Part] = ()
+    ) -> Array:
+        """Covariance (m, 3, 3), m^2, of the predicted target positions.
+
+        ``without``: parts whose share is projected out because they are solved anew elsewhere.
+        """
+        J = self._jacobian(q, target, without)
+        return np.asarray(J @ self.estimate.covariance @ np.swapaxes(J, 1, 2))
+
+    def workspace_rms(self, covariance: Array) -> float:
+        """Rms target position error, m, over postures throughout the joint limits.
+
+        ``covariance`` is of the unknowns, or of the leading ones (the model parameters). What
+        another base or target would explain does not count: it belongs to the set-up.
+        """
+        rows = self._workspace_rows()[..., : len(covariance)]
+        return float(np.sqrt(np.mean(np.einsum("mik,kl,mil->m", rows, covariance, rows))))
+
+    def workspace_change(self, arm: SerialArm) -> float:
+        """Rms target displacement, m, over the same postures from ``arm``'s model to this one."""
+        joint, column, place = self.layout.geometry
+        change = (self.cell.arm.mdh - arm.mdh)[joint, column]
+        moved = self._workspace_rows()[..., place] @ change
+        return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+
+    def _workspace_rows(self) -> Array:
+        """Position rows (t * 60, 3, k) of each target at the same random postures."""
+        q = random_postures(self.nominal)
+        targets = np.repeat(np.arange(len(self.cell.targets))[:, None], len(q), axis=1)
+        return np.vstack([self._jacobian(q, target, ("base", "tool")) for target in targets])
+
+    def _jacobian(self, q: Array, target: NDArray[np.int64], without: Collection[Part]) -> Array:
+        """Position rows (m, 3, k); what ``without`` could explain over all of them is removed."""
+        _, J = self.layout.jacobian(self.cell, np.ascontiguousarray(q), target)
+        rows = J[:, :3].reshape(-1, J.shape[2])
+        own = rows[:, self._columns(without)]
+        if own.shape[1]:
+            rows = rows - own @ np.linalg.lstsq(own, rows, rcond=None)[0]
+        return np.asarray(rows.reshape(len(q), 3, -1))
+
+    def _columns(self, parts: Collection[Part]) -> NDArray[np.bool_]:
+        """Mask (k,) of the unknowns that belong to base or tool."""
+        mask = np.zeros(len(self.layout.names), dtype=np.bool_)
+        if "base" in parts and self.layout.base >= 0:
+            mask[self.layout.base : self.layout.base + 6] = True
+        if "tool" in parts and self.layout.tool[0] >= 0:
+            mask[self.layout.tool[0] :] = True
+        return mask
+
+
+def identify(
+    arm: SerialArm,
+    data: Measurements,
+    *,
+    fit: Collection[Part] = ("base", "tool", "geometry"),
+    method: Method = "map",
+    prior_covariance: Array | None = None,
+    start: CellModel | None = None,
+    robust: bool = True,
+) -> Identification:
+    """Identify the parts named in ``fit``.
+
+    Parameters
+    ----------
+    arm : nominal arm; the mean of the prior.
+    data : m samples of one or several targets; poses when ``data.rotation`` is given.
+    method : ``map`` keeps every free parameter, with a Gaussian prior about the nominal one;
+        ``lsq`` has no prior and holds parameters whose effect base or targets have too.
+    prior_covariance : (k, k) of the arm's free parameters, SI; default: building tolerances,
+        scaled to what the data show (``priors.fitted_prior``).
+    start : known base and targets; where a part of them is not in ``fit`` it is held there.
+
+    Raises
+    ------
+    TooFewSamplesError, RankDeficientError
+        When the data cannot answer; the message names the missing motion.
+    """
+    parts = frozenset(fit)
+    base, tool = "base" in parts, "tool" in parts
+    initial = linear_start(arm, data, base=base, tool=tool) if start is None else start
+    names = arm.parameters.names if "geometry" in parts else ()
+    orientation = data.rotation is not None
+
+    def layout_of(geometry: tuple[str, ...]) -> Layout:
+        return make_layout(
+            arm, initial.targets, geometry=geometry, base=base, tool=tool, orientation=orientation
+        )
+
+    complete = layout_of(names)
+    held = _redundant(complete, initial, arm, len(names)) if method == "lsq" else ()
+    layout = layout_of(tuple(n for n in names if n not in held)) if held else complete
+    by_prior = method == "map" and bool(names)
+    covariance = prior_covariance if by_prior else None
+    if by_prior and covariance is None:
+        covariance = np.diag(default_prior(arm))
+    try:
+        estimate, lever = _solve(arm, data, layout, initial, covariance, robust)
+        if by_prior and prior_covariance is None:
+            covariance = _learned_prior(arm, estimate)
+            estimate, lever = _solve(arm, data, layout, estimate.state, covariance, robust)
+    except RankDeficientError as error:
+        still = still_joints(arm, data)
+        raise RankDeficientError(
+            f"{error}; {still}" if still else f"{error}", error.directions
+        ) from error
+    result = _report(arm, data, estimate, layout, complete, method, held, lever)
+    return replace(result, prior_covariance=covariance)
+
+
+def _solve(
+    arm: SerialArm,
+    data: Measurements,
+    layout: Layout,
+    initial: CellModel,
+    prior_covariance: Array | None,
+    robust: bool,
+) -> tuple[estimation.Estimate[CellModel], float]:
+    """Solve; orientations settle what positions leave open and weigh little beside them.
+
+    Unmodelled bending and eccentricity shift and tilt the flange together, so orientations add
+    less than their fine noise suggests: a turn counts as a quarter of what it moves over the
+    target's own distance, and less where orientations scatter more than that.
+    """
+    sigma = np.ones(len(data)) if data.sigma is None else data.sigma
+    reach = float(np.linalg.norm(initial.T_flange_target[:, :3, 3], axis=1).mean())
+    most = max(_ORIENTATION_SHARE * reach, _SHORTEST_LEVER_M)
+    prior = None
+    if prior_covariance is not None:
+        count = len(prior_covariance)
+        prior = np.zeros((len(layout.names), len(layout.names)))
+        prior[:count, :count] = np.linalg.inv(prior_covariance)
+    lever = most
+    if data.rotation is not None:
+        unit = CellProblem(layout, data, initial.targets, sigma, 1.0, arm.mdh)
+        lever = _lever(unit.linearise(initial)[0] * sigma[:, None], 1.0, most)
+    state = initial
+    for _ in range(_LEVER_ROUNDS):
+        problem = CellProblem(layout, data, initial.targets, sigma, lever, arm.mdh)
+        estimate = estimation.solve(
+            problem,
+            state,
+            prior_information=prior,
+            noise_known=data.sigma is not None,
+            robust=robust,
+        )
+        if data.rotation is None:
+            break
+        used = (estimate.residual * sigma[:, None])[~estimate.rejected]
+        state, settled = estimate.state, _lever(used, lever, most)
+        if abs(settled / lever - 1.0) < 0.1:
+            break
+        lever = settled
+    return estimate, lever
+
+
+def _lever(residual: Array, lever: float, most: float) -> float:
+    """Length, m, by which a turn counts: ``most``, or the scatters' ratio where that is less."""
+    position = np.median(np.linalg.norm(residual[:, :3], axis=1))
+    turn = np.median(np.linalg.norm(residual[:, 3:], axis=1)) / lever
+    return float(min(most, max(position, 1e-9) / max(turn, 1e-9)))
+
+
+def random_postures(arm: SerialArm, count: int = 60) -> Array:
+    """The same postures (count, n) at every call, throughout the joint limits."""
+    rng = np.random.default_rng(0)
+    span = np.where(arm.prismatic, 0.5, np.pi)
+    lower = np.where(np.isfinite(arm.lower), arm.lower, -span)
+    upper = np.where(np.isfinite(arm.upper), arm.upper, span)
+    return np.asarray(rng.uniform(lower, upper, (count, arm.n)))
+
+
+def _learned_prior(arm: SerialArm, estimate: estimation.Estimate[CellModel]) -> Array:
+    """Covariance of a prior whose widths are what this robot's deviations show."""
+    count = len(arm.parameters.names)
+    found = arm.parameters.read(estimate.state.arm.mdh - arm.mdh)
+    return np.diag(fitted_prior(arm, found, estimate.covariance[:count, :count]))
+
+
+def _redundant(layout: Layout, cell: CellModel, arm: SerialArm, count: int) -> tuple[str, ...]:
+    """Model parameters whose effect base, targets or earlier parameters have at every posture."""
+    q = random_postures(arm)
+    target = np.repeat(np.arange(len(cell.targets)), len(q))
+    J = layout.jacobian(cell, np.tile(q, (len(cell.targets), 1)), target)[1]
+    J = J.reshape(-1, len(layout.names))
+    order = [*range(count, J.shape[1]), *range(count)]
+    length = np.linalg.norm(J[:, order], axis=0)
+    J = J[:, order] / np.where(length > 0.0, length, 1.0)
+    dependent = np.abs(np.diag(np.linalg.qr(J, mode="r"))) < 1e-9
+    return tuple(layout.names[i] for i, d in zip(order, dependent, strict=True) if d)
+
+
+def still_joints(arm: SerialArm, data: Measurements) -> str:
+    """Name the joints that the data do not turn by 5 deg (or move by 1 cm); empty if none."""
+    span = np.ptp(data.q, axis=0)
+    still = [
+        f"{name} moves only {s * 1e3:.2g} mm"
+        if slides
+        else f"{name} moves only {np.degrees(s):.2g} deg"
+        for name, s, slides in zip(arm.joint_names, span, arm.prismatic, strict=True)
+        if s < (_STILL_M if slides else _STILL_RAD)
+    ]
+    return f"in these data {', '.join(still)}: move it" if still else ""
+
+
+def _report(
+    arm: SerialArm,
+    data: Measurements,
+    estimate: estimation.Estimate[CellModel],
+    layout: Layout,
+    complete: Layout,
+    method: Method,
+    held: tuple[str, ...],
+    lever: float,
+) -> Identification:
+    if data.sigma is None:
+        require_told(estimate.freedom)
+    seen = estimate.observability
+    if held:
+        sigma = np.ones(len(data)) if data.sigma is None else data.sigma
+        problem = CellProblem(complete, data, estimate.state.targets, sigma, lever, arm.mdh)
+        _, J = problem.linearise(estimate.state)
+        seen = observability(J[~estimate.rejected].reshape(-1, J.shape[2]))
+    words = tuple(describe(column, complete.names, complete.to_display) for column in seen.null.T)
+    known = data.sigma
+    return Identification(
+        nominal=arm,
+        cell=estimate.state,
+        layout=layout,
+        method=method,
+        estimate=estimate,
+        held=held,
+        prior_covariance=None,
+        unobservable=words,
+        rejected=tuple(data.sample[i] for i in np.flatnonzero(estimate.rejected)),
+        noise_m=estimate.scale * (1.0 if known is None else float(np.sqrt(np.mean(known**2)))),
+    )

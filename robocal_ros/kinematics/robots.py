@@ -1,0 +1,265 @@
+"""Robot files (YAML), described in docs/robot_file.md, and where the shipped ones are."""
+
+import hashlib
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.files import nearest, quoted, read_text, write_text
+from robocal_ros.ground.places import share_folders
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.pose_fields import read_pose
+from robocal_ros.kinematics.robot_fields import Fields, load_yaml
+
+Array = NDArray[np.float64]
+
+CONVENTIONS = ("dh", "mdh")
+TYPES = ("revolute", "prismatic")
+RAD = float(np.pi / 180.0)
+MM = 1e-3
+GEOMETRY = {"d_mm": MM, "theta_deg": RAD, "a_mm": MM, "alpha_deg": RAD, "beta_deg": RAD}
+COMMON_KEYS = ("name", "type", "sign", *GEOMETRY)
+UNITS = {False: ("deg", RAD), True: ("mm", MM)}
+# Makers publish joint speeds and hardly ever accelerations: where the file gives none, the joint is
+# taken to reach its full speed in this time.
+FULL_SPEED_IN_S = 0.5
+
+
+@dataclass(frozen=True)
+class RobotDescription:
+    """Content of a robot file.
+
+    Attributes
+    ----------
+    max_velocity : (n,) rad/s (prismatic: m/s), NaN where the file gives none.
+    max_acceleration : (n,) rad/s² (prismatic: m/s²), NaN where neither it nor a speed is given.
+    acceleration_assumed : (n,) bool, where the file gives none: it is max_velocity / 0.5 s.
+    notes : what the file leaves open, in words.
+    """
+
+    arm: SerialArm
+    path: Path
+    max_velocity: Array
+    max_acceleration: Array
+    acceleration_assumed: NDArray[np.bool_]
+    notes: tuple[str, ...]
+
+
+def load_robot(name: str | Path) -> SerialArm:
+    """Arm of a robot file; warns of joint limits that the file does not give.
+
+    Parameters
+    ----------
+    name : path of a file, or name of one in the folders of ``robot_folders``.
+
+    Raises
+    ------
+    InputError
+        Naming file, joint and key, when the file is not as docs/robot_file.md says.
+    """
+    description = load_description(name)
+    for note in description.notes:
+        warnings.warn(f"{description.path}: {note}", stacklevel=2)
+    return description.arm
+
+
+def load_description(name: str | Path) -> RobotDescription:
+    """Everything that a robot file says; see ``load_robot``."""
+    path = find_robot(name)
+    top = Fields(load_yaml(read_text(path, "robot file"), str(path)), str(path), "")
+    top.only("robot", "convention", "joints", "base", "tool")
+    robot = top.text("robot")
+    convention = top.choice("convention", CONVENTIONS)
+    joints = [_Joint(fields, convention) for fields in top.items("joints", "joint")]
+    names = [joint.name for joint in joints]
+    doubled = next((name for name in names if names.count(name) > 1), None)
+    if doubled is not None:
+        top.fail(f"two joints have the name {quoted(doubled)}", "joints")
+    arm = SerialArm(
+        name=robot,
+        joint_names=tuple(names),
+        mdh=np.array([joint.mdh for joint in joints]),
+        sign=np.array([joint.sign for joint in joints]),
+        prismatic=np.array([joint.prismatic for joint in joints]),
+        lower=np.array([joint.lower for joint in joints]),
+        upper=np.array([joint.upper for joint in joints]),
+        T_base_root=_pose(top, "base"),
+        T_flange_tool=_pose(top, "tool"),
+    )
+    velocity = np.array([joint.max_velocity for joint in joints])
+    given = np.array([joint.max_acceleration for joint in joints])
+    return RobotDescription(
+        arm=arm,
+        path=path,
+        max_velocity=velocity,
+        max_acceleration=np.where(np.isnan(given), velocity / FULL_SPEED_IN_S, given),
+        acceleration_assumed=np.isnan(given),
+        notes=_open_limits(arm),
+    )
+
+
+def robot_file_hash(name: str | Path) -> str:
+    """SHA-256 of a robot file's bytes, its first 16 hexadecimal digits.
+
+    Unlike `SerialArm.model_hash` it tells robots of one type apart that have their own files.
+
+    Raises
+    ------
+    InputError
+        When there is no such robot.
+    """
+    text = read_text(find_robot(name), "robot file")
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def robot_folders() -> list[Path]:
+    """Folders of robot files, in the order in which a name is looked up.
+
+    ``$ROBOCAL_CONFIG/robots``, the source tree's ``config/robots``, then
+    ``share/robocal_ros/config/robots`` of ROS' prefixes and of the one that this runs from.
+    """
+    own = os.environ.get("ROBOCAL_CONFIG")
+    shipped = share_folders("robocal_ros", "config/robots", "config/robots")
+    return [*([Path(own) / "robots"] if own else []), *shipped]
+
+
+def find_robot(name: str | Path) -> Path:
+    """File of a robot's name or path.
+
+    Raises
+    ------
+    InputError
+        When there is none; the message lists the known names.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    if path.suffix in (".yaml", ".yml") or len(path.parts) != 1:
+        raise InputError("no such robot file", file=str(name))
+    known: dict[str, Path] = {}
+    for folder in robot_folders():
+        for file in sorted(folder.glob("*.yaml")):
+            known.setdefault(file.stem, file)
+    if str(name) not in known:
+        raise InputError(
+            f"no robot {quoted(name)}{nearest(str(name), known)}: give the path of a robot file, "
+            f"or one of {', '.join(sorted(known)) or '(no robot files are installed)'}"
+        )
+    return known[str(name)]
+
+
+def save_robot(
+    arm: SerialArm, path: str | Path, like: RobotDescription | None = None, comment: str = ""
+) -> None:
+    """Write an arm as a robot file; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    like : robot file that the arm was made from; the joint speeds that it gives are kept.
+    comment : lines to begin the file with.
+
+    Raises
+    ------
+    InputError
+        When it cannot be written.
+    """
+    convention = "mdh" if np.any(arm.mdh[:, 4]) else "dh"
+    document: dict[str, Any] = {"robot": arm.name, "convention": convention}
+    document["joints"] = [_joint_document(arm, i, convention) for i in range(arm.n)]
+    if like is not None:
+        _add_speeds(document["joints"], like)
+    for key, T in (("base", arm.T_base_root), ("tool", arm.T_flange_tool)):
+        if not np.array_equal(T, np.eye(4)):
+            xyz = [_shown(value, MM) for value in T[:3, 3].tolist()]
+            document[key] = {"xyz_mm": xyz, "quat_xyzw": frames.quat_xyzw(T).tolist()}
+    text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=1000)
+    remarks = "".join(f"# {line}\n" for line in comment.splitlines())
+    write_text(Path(path), remarks + text)
+
+
+class _Joint:
+    """One entry of ``joints``, in SI."""
+
+    def __init__(self, fields: Fields, convention: str) -> None:
+        self.name = fields.text("name")
+        fields.place += f" {quoted(self.name)}"
+        self.prismatic = fields.choice("type", TYPES, "revolute") == "prismatic"
+        unit, factor = UNITS[self.prismatic]
+        limits = (f"lower_{unit}", f"upper_{unit}")
+        rates = (f"max_velocity_{unit}_s", f"max_acceleration_{unit}_s2")
+        fields.only(*COMMON_KEYS, *limits, *rates)
+        if convention == "dh" and "beta_deg" in fields.values:
+            fields.fail("is not part of convention dh; use convention mdh", "beta_deg")
+        self.sign = fields.number("sign", 1.0)
+        if self.sign not in (1.0, -1.0):
+            fields.fail(f"is {self.sign:g}; it must be 1 or -1", "sign")
+        self.mdh = [
+            fields.number(key, 0.0 if key == "beta_deg" else None) * to_si
+            for key, to_si in GEOMETRY.items()
+        ]
+        self.lower = fields.number(limits[0], -np.inf) * factor
+        self.upper = fields.number(limits[1], np.inf) * factor
+        if self.lower >= self.upper:
+            fields.fail(f"is not below {limits[1]}", limits[0])
+        self.max_velocity, self.max_acceleration = (
+            fields.positive(key, np.nan) * factor for key in rates
+        )
+
+
+def _pose(top: Fields, key: str) -> Array:
+    """Transform (4, 4) of an optional pose."""
+    return read_pose(top.below(key)) if key in top.values else np.eye(4)
+
+
+def _open_limits(arm: SerialArm) -> tuple[str, ...]:
+    both = np.isinf(arm.lower) & np.isinf(arm.upper)
+    notes = []
+    for missing, which in (
+        (both, "joint limits"),
+        (np.isinf(arm.lower) & ~both, "a lower limit"),
+        (np.isinf(arm.upper) & ~both, "an upper limit"),
+    ):
+        if np.any(missing):
+            names = ", ".join(np.array(arm.joint_names)[missing])
+            notes.append(f"{which} not given, nothing is assumed: {names}")
+    return tuple(notes)
+
+
+def _shown(value: float, factor: float) -> float:
+    """The shortest number that reads back as ``value``, where there is one."""
+    neat = float(f"{value / factor:.12g}")
+    return neat if neat * factor == value else value / factor
+
+
+def _joint_document(arm: SerialArm, joint: int, convention: str) -> dict[str, Any]:
+    prismatic = bool(arm.prismatic[joint])
+    document: dict[str, Any] = {"name": arm.joint_names[joint]}
+    if prismatic:
+        document["type"] = "prismatic"
+    document["sign"] = int(arm.sign[joint])
+    for (key, factor), value in zip(GEOMETRY.items(), arm.mdh[joint].tolist(), strict=True):
+        if convention == "mdh" or key != "beta_deg":
+            document[key] = _shown(value, factor)
+    unit, factor = UNITS[prismatic]
+    for side, limit in (("lower", arm.lower[joint]), ("upper", arm.upper[joint])):
+        if np.isfinite(limit):
+            document[f"{side}_{unit}"] = _shown(float(limit), factor)
+    return document
+
+
+def _add_speeds(documents: list[dict[str, Any]], like: RobotDescription) -> None:
+    for joint, document in enumerate(documents):
+        unit, factor = UNITS[bool(like.arm.prismatic[joint])]
+        if np.isfinite(speed := float(like.max_velocity[joint])):
+            document[f"max_velocity_{unit}_s"] = _shown(speed, factor)
+        if not like.acceleration_assumed[joint]:
+            acceleration = float(like.max_acceleration[joint])
+            document[f"max_acceleration_{unit}_s2"] = _shown(acceleration, factor)

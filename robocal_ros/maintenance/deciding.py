@@ -1,0 +1,289 @@
+"""Decisions about thermal models and tools, and what may be accepted without a person."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, InputError, RobocalError, StaleError
+from robocal_ros.ground.proposals import (
+    THERMAL,
+    TOOL,
+    Action,
+    Decision,
+    Entry,
+    Head,
+    State,
+    require_measured_with,
+)
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import arm_of
+from robocal_ros.maintenance.config import MaintenanceConfig
+from robocal_ros.session.decisions import decide, measured_with
+from robocal_ros.session.events import ACCEPT, REJECT, ROLLBACK, WITHHOLD, Command, Outcome
+from robocal_ros.session.history import History
+from robocal_ros.thermal.in_force import REFERENCE
+from robocal_ros.thermal.reference import commissioned_of
+from robocal_ros.tool.judging import KnownTool, change_between
+from robocal_ros.tool.laser_frame import LaserFrame
+
+KINDS = (THERMAL, TOOL)
+BY = "maintenance"
+SAME = 1e-6  # m, and of unit vectors: two nodes that read the same taught tool and laser
+MOST_AT_ONCE = 2  # of a kind: each takes up to 20 ms, in which nobody watches the robot
+LOOKED_AT = 200  # newest decisions that a call without an id may mean
+REPEAT_NS = 60 * 1_000_000_000  # a call without an id is repeated within
+DONE = {  # what a repeated decision finds
+    ACCEPT: State.IN_FORCE,
+    REJECT: State.REJECTED,
+    ROLLBACK: State.IN_FORCE,
+}
+
+
+class Decider:
+    """Accepts, rejects and rolls back in the history that the other nodes follow."""
+
+    def __init__(self, nominal: SerialArm, history: History, config: MaintenanceConfig) -> None:
+        self._nominal, self._history, self._config = nominal, history, config
+
+    def _waiting(self, kind: str) -> list[Entry]:
+        """Candidates that can be accepted now, newest first, one more than is decided at once."""
+        found = self._history.pending(kind, MOST_AT_ONCE + 1)
+        return [entry for entry in found if not self._outdated(entry)]
+
+    def newest(self, kind: str) -> Entry | None:
+        """The first of them, however many there are; None where nothing waits.
+
+        Where the newest tool is outdated, those measured before it are too: revisions only grow.
+        """
+        found = self._history.pending(kind, 1)
+        return found[0] if found and not self._outdated(found[0]) else None
+
+    def _outdated(self, entry: Entry) -> str:
+        """Why it is STALE although its own kind's revision is in force; else empty."""
+        try:
+            self._require_beside(entry)
+        except StaleError as error:
+            return str(error)
+        return ""
+
+    def _require_beside(self, entry: Entry) -> None:
+        needed = measured_with(self._history, entry)
+        require_measured_with(f"{entry.kind} {entry.id}", needed, self.revision)
+
+    def head(self, kind: str) -> Head:
+        """What is in force."""
+        return self._history.head(kind)
+
+    def revision(self, kind: str) -> int:
+        """Of what is in force."""
+        return self.head(kind).revision
+
+    def thermal_id(self) -> int:
+        """The thermal model in force; 0: the nominal one."""
+        return self.head(THERMAL).calibration_id or 0
+
+    def in_force(self, kind: str, calibration_id: int) -> bool:
+        """Whether it is this one."""
+        return self.head(kind).calibration_id == calibration_id
+
+    def accepted_here(self, calibration_id: int) -> bool:
+        """Whether it is in force since it was accepted without a person."""
+        entry = self._history.get(calibration_id)
+        return entry.state is State.IN_FORCE and entry.decisions[-1].by == BY
+
+    def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
+        """Carry out a decision about one calibration; one that was made before is its answer again.
+
+        Raises
+        ------
+        RobocalError
+            As the history refuses: STALE where it was solved against a revision that is no longer
+            in force.
+        """
+        entry = self._history.get(calibration_id)
+        command = Command(name, {"id": calibration_id, "by": by, "reason": why})
+        if entry.kind not in KINDS:
+            raise InputError(
+                f"calibration {calibration_id} is of kind {entry.kind}: decide elsewhere"
+            )
+        head = self.head(entry.kind)
+        if name in DONE and entry.state is DONE[name]:
+            words = f"calibration {calibration_id} is {entry.state.value.replace('_', ' ')} already"
+            return Outcome(
+                command, Code.ACCEPT, words, None, calibration_id, head.revision, repeated=True
+            )
+        if name == ACCEPT and entry.state is State.STALE:
+            raise StaleError(
+                f"calibration {calibration_id} was solved against revision {entry.based_on}, in "
+                f"force is {head.revision}: measure again"
+            )
+        if name == ACCEPT:
+            self._require_beside(entry)
+        return self._carried_out(command, entry.kind, head.revision, wall_ns)
+
+    def roll_back(self, kind: str, revision: int, by: str, why: str, wall_ns: int) -> Outcome:
+        """Return to what was in force before ``revision``; CONFLICT where that is not any more."""
+        command = Command(ROLLBACK, {"previous": True, "by": by, "reason": why})
+        return self._carried_out(command, kind, revision, wall_ns)
+
+    def only_pending(self) -> Entry:
+        """The newest candidate, where they are of one kind.
+
+        Raises
+        ------
+        ConflictError
+            When nothing waits, or candidates of both kinds.
+        """
+        newest = [found for kind in KINDS if (found := self.newest(kind))]
+        if len(newest) != 1:
+            words = ", ".join(f"{entry.id} ({entry.kind})" for entry in newest) or "none"
+            raise ConflictError(f"one candidate must wait, found {words}: decide by id")
+        return newest[0]
+
+    def decide_only(self, name: str, by: str, wall_ns: int) -> Iterator[Outcome]:
+        """A decision without an id; each outcome as soon as it is made.
+
+        Accept: the one candidate that waits. Reject: what waits, the newest first, two of a kind
+        in a call. Rollback: take the last acceptance back. Each may come twice: nothing more is
+        done.
+
+        Raises
+        ------
+        RobocalError
+            As `decide`, `only_pending`; BAD_INPUT where nothing was accepted lately.
+        """
+        if name == ROLLBACK:
+            yield self._take_back(by, wall_ns)
+            return
+        if name == ACCEPT:
+            yield self.decide(name, self._meant(by, wall_ns), by, "", wall_ns)
+            return
+        found = [self._waiting(kind) for kind in KINDS]
+        waiting = [entry.id for entries in found for entry in entries[:MOST_AT_ONCE]]
+        if not waiting:
+            yield _nothing_to_do(Command(name, {"by": by}), "nothing waits for a decision")
+        for number in waiting:
+            try:
+                outcome = self.decide(name, number, by, "", wall_ns)
+            except RobocalError as error:  # those before it stay rejected, and are told
+                command = Command(name, {"id": number, "by": by, "reason": ""})
+                outcome = Outcome(command, error.code, str(error))
+            yield outcome
+            if outcome.status is Code.STORAGE_FAILED:
+                return  # each further one would wait for the history as long
+        if any(len(entries) > MOST_AT_ONCE for entries in found):
+            yield _nothing_to_do(Command(name, {"by": by}), "more wait: call again")
+
+    def _meant(self, by: str, wall_ns: int) -> int:
+        """The candidate to accept; where none waits, what the same caller accepted just before."""
+        waits = any(self.newest(kind) for kind in KINDS)
+        made = [] if waits else self._made()
+        last = made[-1] if made else None
+        if (
+            last
+            and last.action is Action.ACCEPT
+            and last.by == by
+            and 0 <= wall_ns - last.wall_ns <= REPEAT_NS
+        ):
+            return last.calibration_id or 0
+        return self.only_pending().id
+
+    def _made(self) -> list[Decision]:
+        """The newest decisions about kinds of this node, oldest first."""
+        return [d for d in self._history.decisions(newest=LOOKED_AT) if d.kind in KINDS]
+
+    def _take_back(self, by: str, wall_ns: int) -> Outcome:
+        made = self._made()
+        accepted = [d for d in made if d.action is Action.ACCEPT]
+        if not accepted:
+            raise InputError("nothing was accepted lately: there is nothing to roll back")
+        last = accepted[-1]
+        since = [d for d in made if d.seq > last.seq and d.kind == last.kind]
+        again = self.head(last.kind).calibration_id == last.calibration_id  # by a rollback to it
+        if again or not any(d.action is Action.ROLLBACK for d in since):
+            return self.roll_back(last.kind, self.revision(last.kind), by, "", wall_ns)
+        command = Command(ROLLBACK, {"previous": True, "by": by})
+        return _nothing_to_do(command, f"calibration {last.calibration_id} is taken back already")
+
+    def _carried_out(self, command: Command, kind: str, revision: int, wall_ns: int) -> Outcome:
+        """Nothing is read after it: a decision that was made must not look like one that failed."""
+        outcome = decide(self._history, command, revision, wall_ns, kind)
+        return replace(outcome, revision=outcome.revision or revision)
+
+    # ---- without a person -----------------------------------------------------------------------
+
+    def withheld(self, calibration_id: int) -> str:
+        """Why a candidate waits for a person; empty where it may be accepted without one."""
+        bounds = self._config.bounds
+        if not bounds.automatic:
+            return "auto_accept is off"
+        entry = self._history.get(calibration_id)
+        if entry.state is not State.PENDING:
+            return f"it is {entry.state.value}"
+        if entry.kind == THERMAL:
+            return self._shift_withheld(calibration_id)
+        return self._outdated(entry) or self._tool_withheld(calibration_id)
+
+    def _shift_withheld(self, calibration_id: int) -> str:
+        allowed_m, shift_m = self._config.bounds.thermal_m, self.thermal_shift_m(calibration_id)
+        if not shift_m <= allowed_m:
+            return (
+                f"the tool centre point would be {shift_m * 1e3:.2f} mm from where it was at "
+                f"commissioning (allowed without a person {allowed_m * 1e3:.2f} mm)"
+            )
+        return ""
+
+    def _tool_withheld(self, calibration_id: int) -> str:
+        bounds, config = self._config.bounds, self._config
+        model = self._history.model(calibration_id)
+        if what := self._other_reference(model["made_with"]):
+            return f"it was measured with another {what} than this node's: give both nodes the same"
+        found = KnownTool.of_document(model).T_flange_tool
+        change = change_between(config.T_flange_tool, found)
+        if not (change.tip_m <= bounds.tool_m and change.axis_rad <= bounds.tool_rad):
+            return (
+                f"the tool is {change.tip_m * 1e3:.2f} mm and {np.degrees(change.axis_rad):.2f} "
+                f"deg from the taught one (allowed without a person {bounds.tool_m * 1e3:.2f} mm, "
+                f"{np.degrees(bounds.tool_rad):.2f} deg)"
+            )
+        if model.get("cause") != "tool":
+            return (
+                "nothing proves that the tool has changed and not the beam station: look at both, "
+                "then accept or reject it"
+            )
+        return ""
+
+    def _other_reference(self, made_with: Mapping[str, Any]) -> str:
+        """What the tool node was given differently, so that bounds would mean something else."""
+        taught = np.array(made_with["taught"])
+        if not np.max(np.abs(taught - self._config.T_flange_tool)) <= SAME:
+            return "'taught' tool"
+        laser, T_base_laser = LaserFrame(np.array(made_with["points_m"])), self._config.T_base_laser
+        if T_base_laser is None or not np.max(np.abs(laser.T_base_laser - T_base_laser)) <= SAME:
+            return "'laser'"
+        return ""
+
+    def thermal_shift_m(self, calibration_id: int) -> float:
+        """Largest shift of the tip since commissioning at home and measuring poses."""
+        reference = self._history.head(REFERENCE).model
+        cold = self._nominal
+        if reference is not None:
+            cold = commissioned_of(reference, self._nominal)
+        arm = arm_of(self._history.model(calibration_id), self._nominal)
+        q = np.vstack([self._config.home, self._config.poses])
+        tip = np.append(self._config.T_flange_tool[:3, 3], 1.0)
+        shift = (arm.fk(q) @ tip - cold.fk(q) @ tip)[:, :3]
+        return float(np.max(np.linalg.norm(shift, axis=1)))
+
+
+def _nothing_to_do(command: Command, words: str) -> Outcome:
+    return Outcome(command, Code.ACCEPT, words, repeated=True)
+
+
+def withholding(kind: str, calibration_id: int, why: str) -> Outcome:
+    """A candidate is left to a person, for the record."""
+    words = f"{kind} candidate {calibration_id} waits for a decision: {why}"
+    return Outcome(Command(WITHHOLD, {"id": calibration_id, "kind": kind}), Code.ACCEPT, words)

@@ -1,0 +1,298 @@
+"""What the script of a run does with robot and nodes. Each thing waits from tick to tick."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import LimitError
+from robocal_ros.maintenance import requests as asked
+from robocal_ros.maintenance.asking import Asking, Script
+from robocal_ros.maintenance.config import MaintenanceConfig
+from robocal_ros.maintenance.disarming import SENT, Disarming
+from robocal_ros.maintenance.mover import FaultError, Mover
+from robocal_ros.maintenance.requests import Answer
+from robocal_ros.maintenance.ways import HOME, STATION, Route, Ways
+from robocal_ros.motion.gap import Gap
+from robocal_ros.tool.phases import SETTLED_S, STANDS_S
+from robocal_ros.tool.results import QUICK
+
+DEAF_S = 0.1  # a driver that has not confirmed a disarm by then may not be stopping the robot
+
+Array = NDArray[np.float64]
+
+
+class Hands(Asking):
+    """Robot, gap and the requests to other nodes; times of a steady clock.
+
+    Attributes
+    ----------
+    tool : whether the tool's driver may move the robot.
+    left_home : whether something may have moved the robot since the run began.
+    measured : stamps of measurements of the flange's target, on the joints' clock, newest last.
+    doing : what goes on, in words.
+    tool_home_s : for the way home from the beams; the longest so far where that took longer.
+    """
+
+    def __init__(self, config: MaintenanceConfig, ways: Ways) -> None:
+        super().__init__()
+        self.config, self.ways = config, ways
+        self.robot = Mover(config, ways)
+        self.gap = Gap(config.times.stale_s)
+        self.tool = Disarming()
+        self.left_home = False
+        self.measured: list[float] = []
+        self.doing = ""
+        self.tool_home_s = config.times.tool_home_s
+        self._deaf_s = np.inf  # from when on the robot is stopped in the driver's place
+        self._told_s = -np.inf  # newest reading at the last confirmation, or stop in its place
+        self._failed = ""  # of the last stop, as it was acted upon
+        self._measuring = 0  # number of the measurement that the driver has not answered
+
+    # ---- time -----------------------------------------------------------------------------------
+
+    def fits(self, worst_s: float) -> bool:
+        """Whether something that lasts so long at the most, way home included, fits the gap."""
+        lasts_s = self.robot.lasts_s(worst_s)
+        return lasts_s + self.config.times.reserve_s <= self.gap.left_s(self.now_s)
+
+    def tool_worst_s(self, mode: str) -> float:
+        """A tool measurement from home and back, with everything that may go wrong."""
+        times = self.config.times
+        limit_s = times.check_s if mode == QUICK else times.full_s
+        # Stand, arm, run, its end after a cancel, disarm, stand twice, way home, rest.
+        return limit_s + 3.0 * times.answer_s + 4.0 * times.rest_s + self.tool_home_s
+
+    def may_wait(self) -> bool:
+        """Whether nothing moves, and a heartbeat from after the own pause is yet to come."""
+        return not (self.robot.moving or self.tool.armed) and self.gap.waits(self.now_s)
+
+    def begin(self, gap_s: float) -> None:
+        """A run is to begin, with the robot at home."""
+        self.gap.begin(gap_s, self.now_s)
+        self.robot.place, self.left_home = (HOME, HOME), False
+
+    def not_handed_over(self) -> bool:
+        """Whether the robot is not at rest at home with nobody who may move it."""
+        robot = self.robot
+        rests = robot.resting(STANDS_S) is not None and not robot.moving
+        return self.tool.doubted or not rests or bool(robot.beside_home())
+
+    # ---- the tool's driver ----------------------------------------------------------------------
+
+    def doubt(self) -> None:
+        """Nobody knows whether the tool's driver is armed; without a station there is none."""
+        if self.config.T_base_laser is not None:
+            self.tool.doubt()
+
+    def answered(self, number: int, answer: Answer) -> None:
+        """An answer came; one that nobody waits for is none."""
+        doubted = self.tool.engaged
+        self.tool.answered(number, answer, self.now_s)
+        if doubted and not self.tool.engaged:
+            self._told_s = self.robot.newest_s
+        if number == self._measuring:
+            self._measuring = 0
+        super().answered(number, answer)
+
+    def arm(self) -> Script[Answer]:
+        """Arm the tool's driver; from now on it may have the robot anywhere at the station."""
+        self.doubt()
+        self.tool.armed, self._deaf_s, self.left_home = True, np.inf, True
+        self.robot.place = STATION
+        answer = yield from self.ask(self.config.times.answer_s, "tool node, arm", asked.Arm)
+        self.tool.armed = not answer.absent
+        return answer
+
+    def disengage(self) -> None:
+        """Break its run off and disarm it, at once; again and again until it is confirmed."""
+        self.request(asked.CancelMeasure)
+        self._ask_disarm()
+
+    def look_after_tool(self) -> None:
+        """Stop what its driver does not; do not wait for one that is gone, see `disarming`.
+
+        Who has not answered its measurement may be another one: a robot that stands may then be at
+        a corner of what was sent before, where plans rest for a while, and is held.
+        """
+        tool, robot = self.tool, self.robot
+        self._look_after_stop()
+        rests = robot.resting(STANDS_S) is not None
+        self._told_s = min(self._told_s, robot.newest_s)  # their clock may have begun anew
+        since_s = robot.newest_s - self._told_s  # readings that are late do not count against it
+        if tool.armed and tool.engaged:
+            if self.now_s >= self._deaf_s:
+                self._stop_measured()
+        elif tool.armed:
+            tool.armed = not rests or since_s < STANDS_S or self._measuring > 0
+            moves = robot.resting(SETTLED_S) is None or self._measuring > 0
+            if moves and since_s >= robot.stops_within_s:
+                self._stop_measured()
+        if tool.gone(self.now_s) and not robot.beside_home():
+            tool.engaged &= not rests
+
+    def _look_after_stop(self) -> None:
+        """Send it again where the robot does not obey; then stop it by other means."""
+        stopping = self.robot.stopping
+        if (plan := stopping.look(self.robot.watch, self.now_s)) is not None:
+            self.request(asked.Stop, plan)
+        if stopping.failed != self._failed:
+            self._failed = stopping.failed
+            if self._failed:
+                self.request(asked.HardStop, self._failed)
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the stop of what the tool's driver moves may still be this node's to send."""
+        return self.tool.armed and (not self.tool.engaged or self._deaf_s < np.inf)
+
+    def keep_disarming(self) -> None:
+        """Ask again where nobody confirmed."""
+        if self.tool.again(self.now_s):
+            self._ask_disarm()
+
+    def disarmed(self) -> Script[None]:
+        """Wait until it is confirmed.
+
+        Raises
+        ------
+        FaultError
+            When it is not: then the robot must not be moved from here.
+        """
+        self._ask_disarm()
+        until_s = self.now_s + self.config.times.answer_s
+        while self.tool.engaged:
+            if self.now_s >= until_s:
+                words = f"the tool node does not confirm that it disarmed; {self.tool.words()}"
+                raise FaultError(Code.CONFLICT, words)
+            yield
+
+    def _ask_disarm(self) -> None:
+        self.tool.asked(self.request(asked.Disarm), self.now_s)
+
+    def measure(self, mode: str, cycle_id: str, limit_s: float) -> Script[Answer]:
+        """Let the armed driver measure, for a limited time; a longer run is broken off.
+
+        Raises
+        ------
+        SilentError
+            When it did not end in time, and not after it was broken off either.
+        """
+        number = self._measuring = self.expect(asked.Measure, mode, cycle_id)
+        until_s = self.now_s + limit_s
+        while self._waiting[number] is None and self.now_s < until_s:
+            yield
+        if self._waiting[number] is None:
+            self.disengage()
+        return (yield from self.waited_for(number, self.config.times.answer_s, f"tool, {mode}"))
+
+    # ---- motions --------------------------------------------------------------------------------
+
+    def stand(self, span_s: float = SETTLED_S) -> Script[Array]:
+        """Wait until the robot rests, and nothing that this node armed moves it; its joints (n,).
+
+        Raises
+        ------
+        FaultError
+            When joint states are silent, it does not come to rest, or is not handed over.
+        """
+        until_s = self.now_s + self.config.times.rest_s
+        while (q := self.robot.resting(span_s)) is None or self.tool.armed:
+            if self.now_s >= until_s:
+                self.robot.require_heard("so that nobody knows whether the robot rests")
+                moves = "the robot does not come to rest"
+                words = moves if q is None else f"the robot rests, but {SENT}"
+                raise FaultError(Code.CONFLICT, words)
+            yield
+        return q
+
+    def drive(self, route: Route, worst_s: float) -> Script[None]:
+        """Send a route and wait until it is over; supervised by the session.
+
+        Raises
+        ------
+        FaultError
+            When the robot does not rest where the route begins, on a taught way.
+        LimitError
+            When the robot is so slow or so late that the step does not fit the gap any more.
+        """
+        self.robot.require_heard("where the way of the robot begins")
+        q = self.robot.resting(SETTLED_S)
+        if q is None:
+            raise FaultError(Code.CONFLICT, "the robot does not rest where its way begins")
+        self.robot.require_at(route.plan.q[0])
+        self.robot.require_taught(q)
+        self.robot.start(route, self.now_s)
+        self.left_home = True
+        self.request(asked.Move, route.plan, worst_s)
+        while not self.robot.arrived(self.now_s):
+            if self.robot.worst_left_s(worst_s, self.now_s) > self.gap.left_s(self.now_s):
+                raise LimitError("the robot is slower than planned: this step does not fit the gap")
+            yield
+
+    def halt(self, at_once: bool = False) -> None:
+        """Stop what this node moves; what the tool's driver moves only where that is deaf.
+
+        A driver that hears stops by itself, from its own plan. The readings lag behind that, so
+        that a stop from them steps back. ``at_once``: nobody will be there to see it deaf.
+        """
+        if (plan := self.robot.stop(self.now_s)) is not None:
+            self.request(asked.Stop, plan)
+        elif self.tool.armed and at_once:
+            self._stop_measured()
+        elif self.tool.engaged and self.tool.armed:
+            self._deaf_s = self.now_s + DEAF_S
+
+    def _stop_measured(self) -> None:
+        if (plan := self.robot.stop_measured(self.now_s)) is not None:
+            self._deaf_s, self._told_s, self._measuring = np.inf, self.robot.newest_s, 0
+            self.request(asked.Stop, plan)
+
+    def go_home(self) -> Script[None]:
+        """Bring the robot home, from wherever this run may have left it; one that never left stays.
+
+        Raises
+        ------
+        FaultError
+            When there is no way, or it does not fit any more.
+        """
+        robot = self.robot
+        near = not robot.beside_home()
+        if near:
+            robot.place = (HOME, HOME)
+            if not self.left_home:
+                return
+        self.doing = "on its way home"
+        q = yield from self.stand()
+        if robot.exactly_home(q):
+            return
+        try:
+            route = self.ways.home(robot.place, q)
+        except LimitError as error:
+            raise FaultError(error.code, f"no way home: {error}") from error
+        duration_s, left_s = self.robot.lasts_s(route.plan.duration_s), self.gap.left_s(self.now_s)
+        if robot.place == STATION:
+            self.tool_home_s = max(self.tool_home_s, route.plan.duration_s)
+        if duration_s >= left_s and near:
+            return  # the next run begins from here
+        if duration_s >= left_s:
+            words = f"the way home takes {duration_s:.1f} s, {max(left_s, 0.0):.1f} s are left"
+            words = "; ".join(filter(None, (words, self.home_told())))
+            raise FaultError(Code.LIMIT_EXCEEDED, words)
+        yield from self.drive(route, route.plan.duration_s)
+
+    def home_told(self) -> str:
+        """That the way home from the beams took longer than was set, and what to set; or empty."""
+        set_s = self.config.times.tool_home_s
+        if self.tool_home_s <= set_s:
+            return ""
+        took = f"the way home from the beams takes {self.tool_home_s:.1f} s"
+        return f"tool_home_s = {set_s:g} s: {took}; set {np.ceil(self.tool_home_s + 0.5):g} s"
+
+    def after_break(self) -> Script[None]:
+        """Stop everything, wait until it stands and is disarmed, then bring the robot home."""
+        self.halt()
+        if self.tool.engaged:
+            self.disengage()
+            yield from self.disarmed()
+        yield from self.stand(STANDS_S)
+        yield from self.go_home()

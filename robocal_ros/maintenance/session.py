@@ -1,0 +1,300 @@
+"""The maintenance of a cell, without clock and ROS: what the PLC asks in, requests to others out.
+
+Whoever drives it gives what happens (`gap`, `reading`, `measured`, `answered`, `drift`,
+`correction`) and calls `tick` often, at least every 20 ms; `tick` gives the requests that are to be
+carried out at once, in their order. Times ``now_s`` are of one steady clock, which goes on while
+the host is suspended; ``wall_ns`` is the wall clock, for records.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.correction.status import ToldCorrection
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, InputError, LimitError
+from robocal_ros.ground.proposals import THERMAL, TOOL
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.maintenance.accuracy import Accuracy, Drift, accuracy_of
+from robocal_ros.maintenance.conductor import Conductor
+from robocal_ros.maintenance.config import MaintenanceConfig
+from robocal_ros.maintenance.deciding import Decider
+from robocal_ros.maintenance.hands import Hands
+from robocal_ros.maintenance.heard import Heard
+from robocal_ros.maintenance.memory import CycleResult, Keeper, Memory
+from robocal_ros.maintenance.requests import Answer, Request
+from robocal_ros.maintenance.run import Run
+from robocal_ros.maintenance.status import State, Status, status_of
+from robocal_ros.maintenance.thermal_part import CycleBook, ThermalPart
+from robocal_ros.maintenance.ways import Ways
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.history import History
+from robocal_ros.tool.results import FULL, QUICK
+
+Array = NDArray[np.float64]
+
+RUN, ACKNOWLEDGE = "run_maintenance", "acknowledge"
+MOST_ID = 100  # characters of a cycle's name
+
+
+class MaintenanceSession:
+    """Keeps one robot accurate in the gaps that the PLC gives.
+
+    Parameters
+    ----------
+    record : takes each command with what came of it.
+
+    Attributes
+    ----------
+    ways : the ways that the robot may take.
+    memory : what outlives a restart; read it only.
+    robot : where it is, and what its controller says (`Mover.reported`, `Mover.watch`).
+    """
+
+    def __init__(
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: MaintenanceConfig,
+        keeper: Keeper,
+        record: Callable[[Command, Outcome], None] = lambda command, outcome: None,
+    ) -> None:
+        self.config, self.ways = config, Ways(nominal, config)
+        self.memory = Memory.load(keeper)
+        self._decider = Decider(nominal, history, config)
+        self._hands = Hands(config, self.ways)
+        self.robot = self._hands.robot
+        self._hands.doubt()  # whoever ran before may have left the tool's driver armed
+        self._book = CycleBook()
+        self._record = record
+        self._conductor = Conductor(self._hands, self.memory, self._tell)
+        self._heard = Heard(config)
+        self._second = ""
+
+    # ---- what happens ---------------------------------------------------------------------------
+
+    def beat(self, now_s: float) -> int:
+        """The next beat, to be published now; 5 Hz. A heartbeat echoes it."""
+        return self._hands.gap.count(now_s)
+
+    def gap(self, is_open: bool, echo: int | None, now_s: float) -> None:
+        """Take a heartbeat of ``gap_open``, with the beat that it echoes (None: it has none)."""
+        self._hands.gap.heard(is_open, echo, now_s)
+
+    def doubt_gap(self, why: str) -> None:
+        """The heartbeats do not count, and why; empty: they do."""
+        self._hands.gap.doubt(why)
+
+    def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
+        """Take joints (n,), in the arm's order; ``stamp_s`` on their own clock."""
+        self.robot.reading(stamp_s, q, now_s)
+
+    def slept(self, for_s: float) -> None:
+        """The host was suspended; call it before anything else with a time of afterwards."""
+        self.robot.slept(for_s)
+
+    def sent(self, now_s: float) -> None:
+        """The motion that `tick` gave goes out now: its time begins then, not when planned."""
+        self.robot.sent(now_s)
+
+    def second(self, why: str, now_s: float) -> None:
+        """Somebody else commands this robot, a second maintenance node too; empty: nobody."""
+        self._second, self._hands.now_s = why, now_s
+        self._conductor.give_up(why) if why else None
+
+    def measured(self, stamp_s: float) -> None:
+        """A measurement of the flange's target has arrived; its stamp, on the joints' clock."""
+        self._hands.measured.append(stamp_s)
+        del self._hands.measured[:-1000]
+
+    def drift(self, drift: Drift, now_s: float) -> None:
+        """What the thermal part believes of the accuracy."""
+        self._heard.take_drift(drift, now_s)
+
+    def correction(self, told: ToldCorrection, now_s: float) -> None:
+        """What the joint correction says of itself."""
+        self._heard.take_correction(told, now_s)
+
+    def answered(self, number: int, answer: Answer) -> None:
+        """What came of a request."""
+        self._hands.answered(number, answer)
+
+    # ---- what is asked --------------------------------------------------------------------------
+
+    def run(self, cycle_id: str, gap_s: float, now_s: float, wall_ns: int) -> CycleResult:
+        """Begin a cycle; one that runs or has ended gives what it has, and nothing runs twice.
+
+        Raises
+        ------
+        RobocalError
+            When it cannot begin: CONFLICT in a fault, while another one runs, or while the gap is
+            not open; TOO_FEW_SAMPLES while joint states are silent; LIMIT_EXCEEDED, and a fault,
+            where the robot is not at home; STORAGE_FAILED.
+        """
+        if not 0 < len(cycle_id) <= MOST_ID:
+            raise InputError(f"cycle id of {len(cycle_id)} characters: 1 to {MOST_ID} are wanted")
+        if (known := self.result(cycle_id)) is not None:
+            return known
+        hands, memory = self._hands, self.memory
+        hands.now_s = now_s
+        if memory.fault:
+            raise ConflictError(f"fault: {memory.fault}; acknowledge it first")
+        if (open_run := self._conductor.run) is not None:
+            raise ConflictError(f"cycle '{open_run.result.cycle_id}' runs: let it end")
+        hands.tool.require_disarmed()
+        if why := self._second or hands.gap.closed(now_s):
+            raise ConflictError(f"{why}: the robot is not moved")
+        hands.begin(gap_s)
+        try:
+            self.robot.require_home()
+        except LimitError as error:
+            self._conductor.fault(error.code, str(error))
+            raise
+        run = Run(
+            memory.begin(cycle_id, wall_ns),
+            hands,
+            self._book,
+            self._decider,
+            memory,
+            self._decided,
+            lambda: self._heard.drift(hands.now_s),
+        )
+        run.at(wall_ns)
+        self._conductor.begin(run)
+        words = f"cycle '{cycle_id}' begins"
+        self._tell(RUN, {"cycle_id": cycle_id, "gap_s": gap_s}, Code.ACCEPT, words)
+        return run.result
+
+    def cancel(self, reason: str) -> bool:
+        """Break the cycle off: the robot stops and is brought home; whether one ran."""
+        if self._conductor.run is None:
+            return False
+        if self._conductor.broken is None:
+            self._conductor.break_off(Code.CONFLICT, reason)
+        return True
+
+    def decide(self, name: str, calibration_id: int, by: str, why: str, wall_ns: int) -> Outcome:
+        """Accept, reject or roll back a calibration.
+
+        Raises
+        ------
+        RobocalError
+            When it is refused; `StaleError` where another revision is in force by now.
+        """
+        outcome = self._decider.decide(name, calibration_id, by, why, wall_ns)
+        self._decided(outcome)
+        return outcome
+
+    def decide_only(self, name: str, by: str, wall_ns: int) -> Outcome:
+        """The same without an id, see `Decider.decide_only`.
+
+        Raises
+        ------
+        RobocalError
+            When there is nothing to decide about; as `decide`.
+        """
+        outcomes = []
+        for outcome in self._decider.decide_only(name, by, wall_ns):
+            self._decided(outcome)
+            outcomes.append(outcome)
+        answer = next((outcome for outcome in outcomes if not outcome.done), outcomes[-1])
+        return replace(answer, message="; ".join(outcome.message for outcome in outcomes))
+
+    def acknowledge(self, by: str) -> str:
+        """End a fault, in words; without one nothing happens.
+
+        Raises
+        ------
+        ConflictError
+            While the tool node has not confirmed that it is disarmed, and is not gone, or what
+            it sent may still be driven.
+        TooFewSamplesError
+            While joint states are silent.
+        LimitError
+            While the robot is not at home.
+        StorageError
+            When it cannot be kept; the fault stays.
+        """
+        if not self.memory.fault:
+            return "there is no fault"
+        self._hands.tool.require_disarmed()
+        self.robot.require_home()
+        words = f"acknowledged: {self.memory.fault}"
+        self.memory.clear_fault()
+        self._hands.doing = ""
+        self._tell(ACKNOWLEDGE, {"by": by}, Code.ACCEPT, words)
+        return words
+
+    def tick(self, now_s: float, wall_ns: int) -> list[Request]:
+        """Look at everything, and go on; what is to be carried out now, in this order."""
+        hands, self._hands.now_s = self._hands, now_s
+        hands.gap.look(now_s)
+        hands.robot.look(now_s)
+        self._conductor.tick(wall_ns)
+        return hands.handed_out()
+
+    def give_up(self, reason: str, now_s: float) -> list[Request]:
+        """The driver goes: stop and disarm, to be carried out at once; a fault unless at home.
+
+        Then call `close`.
+        """
+        self._hands.now_s = now_s
+        self._conductor.give_up(reason, at_once=True)
+        return self._hands.handed_out()
+
+    def close(self) -> None:
+        """Write what waited until the robot was told to stop."""
+        self._conductor.keep()
+
+    # ---- what is said ---------------------------------------------------------------------------
+
+    def worst_cases(self) -> dict[str, float]:
+        """How long each step may take at the most, its way home included, s."""
+        thermal = ThermalPart(self._hands, self._book)
+        found = {"the first measuring pose": thermal.worst_s()} if self.ways.count else {}
+        if self.config.T_base_laser is not None:
+            worst_s = self._hands.tool_worst_s
+            found |= {f"tool measurement ({mode})": worst_s(mode) for mode in (QUICK, FULL)}
+        return found
+
+    def result(self, cycle_id: str) -> CycleResult | None:
+        """How a cycle ended, or how far it is; None where it is not known."""
+        if (running := self.running) is not None and running.cycle_id == cycle_id:
+            return running
+        return self.memory.cycles.get(cycle_id)
+
+    @property
+    def running(self) -> CycleResult | None:
+        """The cycle that runs, as far as it has come."""
+        run = self._conductor.run
+        return None if run is None else run.result
+
+    @property
+    def state(self) -> State:
+        """What it is at."""
+        if self.memory.fault:
+            return State.FAULT
+        if self._conductor.run is None:
+            return State.IDLE
+        return State.RUNNING if self._conductor.broken is None else State.BREAKING_OFF
+
+    def status(self, now_s: float) -> Status:
+        """Everything at once."""
+        return status_of(self.state, self.running, self.memory, self._hands, self._decider, now_s)
+
+    def accuracy(self, now_s: float, wall_ns: int) -> Accuracy:
+        """How accurate the robot is believed to be with model and tool in force."""
+        thermal, tool, heard = self._decider.head(THERMAL), self._decider.head(TOOL), self._heard
+        told = heard.drift(now_s), heard.uncorrected(thermal, tool, now_s)
+        number = thermal.calibration_id or 0
+        return accuracy_of(self.config, *told, self.memory, tool, number, wall_ns)
+
+    def _decided(self, outcome: Outcome) -> None:
+        if not outcome.repeated:
+            self._record(outcome.command, outcome)
+
+    def _tell(self, name: str, arguments: dict[str, object], code: Code, words: str) -> None:
+        command = Command(name, arguments)
+        self._record(command, Outcome(command, code, words))

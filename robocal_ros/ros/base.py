@@ -1,0 +1,189 @@
+"""The house node: a lifecycle node that starts by itself, reports its faults and ends cleanly.
+
+A node names its parameters in ``SETTINGS`` and fills in four hooks:
+
+- ``configure``: read ``self.settings``, open what is needed, create inputs, outputs, services;
+- ``activate`` and ``deactivate``: start and stop acting (inputs are ignored while inactive);
+- ``cleanup``: release what ``configure`` opened; also called when ``configure`` failed half-way
+  and when the process ends.
+
+Attributes of a subclass must not be named ``_parameters``, ``_clock``, ``_logger``, ``_timers``,
+``_services``, ``_callbacks`` or ``_context``: those are rclpy's own.
+"""
+
+import sys
+import traceback
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from lifecycle_msgs.msg import State
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ros.diagnostics import ERROR, Diagnostics, Health
+from robocal_ros.ros.endpoints import EndpointNode
+from robocal_ros.ros.parameters import ParameterTable, Setting
+
+NO_SERIAL = "unset"  # the history's name where none is set
+POLL_S = 0.5  # between two looks at what others decided in the history
+AUTOSTART = Setting("autostart", True, "Configure and activate at the start")
+SERIAL = Setting("serial", "", "Serial number of the robot; its history is kept under this name")
+
+
+class HouseNode(EndpointNode):
+    """Base of all nodes; see the module's text.
+
+    ``options`` go to rclpy: ``context``, ``namespace``, ``parameter_overrides``, ``cli_args`` …
+    """
+
+    NAME: ClassVar[str]
+    SETTINGS: ClassVar[tuple[Setting, ...]] = ()
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(self.NAME, **options)
+        self.settings: dict[str, Any] = {}
+        self._failure = ""
+        self._table = ParameterTable(self, (AUTOSTART, SERIAL, *self.SETTINGS))
+        self._table.changed = self._settings_changed
+        self._diagnostics = Diagnostics(self, self._full_health, self._serial)
+
+    # ---- what a node fills in -------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open what is needed, from ``self.settings``; raise to refuse."""
+
+    def activate(self) -> None:
+        """Start acting; raise to refuse."""
+
+    def deactivate(self) -> None:
+        """Stop acting."""
+
+    def cleanup(self) -> None:
+        """Release what `configure` opened, even when it did so only in part."""
+
+    def settings_changed(self) -> None:
+        """Use new values of the ``live`` settings."""
+
+    def health(self) -> Health:
+        """Say how an active node is."""
+        return Health()
+
+    # ---- what starts and ends it ----------------------------------------------------------------
+
+    def autostart(self) -> None:
+        """Configure and activate, where the parameter says so; a failure is logged and shown."""
+        if not self.get_parameter(AUTOSTART.name).value:
+            return
+        if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def close(self) -> None:
+        """Release everything at the end of the process, without a transition."""
+        if self.is_active:
+            self._stop_acting()
+        self._clean_up()
+        self.destroy_node()
+
+    # ---- lifecycle ------------------------------------------------------------------------------
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Validate the parameters, then `configure`; undone when it fails."""
+        result = self._attempt("configure", self._configure)
+        if result != TransitionCallbackReturn.SUCCESS:
+            self._clean_up()
+        return result
+
+    def _configure(self) -> None:
+        self.settings = self._table.read()
+        self._table.locked = True
+        compiled = sys.modules.get("robocal_ros.ground.compiled")  # of nodes that have kernels
+        if compiled is not None and compiled.is_cold():
+            self.get_logger().info(
+                "no machine code of the kernels is kept for this software and processor: they are "
+                "compiled now, which takes up to two minutes once"
+            )
+        self.configure()
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the outputs, then `activate`."""
+        super().on_activate(state)
+        result = self._attempt("activate", self.activate)
+        if result != TransitionCallbackReturn.SUCCESS:
+            super().on_deactivate(state)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """`deactivate`, then close the outputs."""
+        result = self._attempt("deactivate", self.deactivate)
+        if result == TransitionCallbackReturn.SUCCESS:
+            super().on_deactivate(state)
+        return result
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release everything; parameters may change again."""
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop acting and release everything, for good."""
+        if state.state_id == State.PRIMARY_STATE_ACTIVE:
+            self._stop_acting()
+        self._clean_up()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _attempt(self, what: str, step: Callable[[], None]) -> TransitionCallbackReturn:
+        # rclpy swallows what is raised in a transition: say it here, in log and diagnostics.
+        try:
+            step()
+        except RobocalError as error:
+            return self._fail(f"cannot {what}: {error}")
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc())
+            return self._fail(f"cannot {what}: {type(error).__name__}: {error}")
+        self._failure = ""
+        return TransitionCallbackReturn.SUCCESS
+
+    def _fail(self, message: str) -> TransitionCallbackReturn:
+        self._failure = message
+        self.get_logger().error(message)
+        self._diagnostics.publish()
+        return TransitionCallbackReturn.FAILURE
+
+    def _stop_acting(self) -> None:
+        try:
+            self.deactivate()
+        except Exception as error:
+            self.get_logger().error(f"deactivate: {error}\n{traceback.format_exc()}")
+
+    def _clean_up(self) -> None:
+        try:
+            self.cleanup()
+        except Exception as error:
+            self.get_logger().error(f"cleanup: {error}\n{traceback.format_exc()}")
+        self.release_endpoints()
+        self._table.locked = False
+
+    # ---- small parts ----------------------------------------------------------------------------
+
+    def _settings_changed(self) -> None:
+        self.settings.update(self._table.read())
+        self.settings_changed()
+
+    def _serial(self) -> str:
+        return str(self.get_parameter(SERIAL.name).value)
+
+    def _full_health(self) -> Health:
+        if self._failure:
+            health = Health(ERROR, self._failure)
+        elif self.is_active:
+            health = self.health()
+        else:
+            health = Health(message=self.state)
+        values: dict[str, object] = {"state": self.state}
+        for topic, count in self.inputs.items():
+            values[f"{topic} received"] = count.received
+            values[f"{topic} ignored while inactive"] = count.ignored
+            values[f"{topic} invalid"] = count.invalid
+            values[f"{topic} lost"] = count.lost
+        health.values = values | health.values
+        return health

@@ -1,0 +1,177 @@
+"""Documents and history entries as messages: pure mapping. A number that is not finite stays."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose, Transform
+from robocal_msgs.msg import (
+    CalibrationQuality,
+    CalibrationSummary,
+    KinematicModel,
+)
+from std_msgs.msg import Header
+
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import InputError
+from robocal_ros.ground.proposals import Entry
+from robocal_ros.kinematics.parameters import COLUMNS
+
+if TYPE_CHECKING:  # most nodes have no thermal session
+    from robocal_ros.session.events import Outcome
+
+NS = 1_000_000_000
+_ERRORS = ("mean_mm", "rms_mm", "p95_mm", "max_mm")
+
+
+def time_message(stamp_ns: int) -> Time:
+    """A stamp; one before the epoch or too late for the message becomes zero."""
+    sec, nanosec = divmod(stamp_ns, NS)
+    return Time(sec=sec, nanosec=nanosec) if 0 <= sec < 2**31 else Time()
+
+
+def header(stamp_ns: int, frame: str) -> Header:
+    """A header."""
+    return Header(stamp=time_message(stamp_ns), frame_id=frame)
+
+
+def transform_message(T: Any) -> Transform:
+    """A pose (4, 4), m."""
+    matrix = np.array(T, dtype=np.float64)
+    message = Transform()
+    t, r = message.translation, message.rotation
+    t.x, t.y, t.z = matrix[:3, 3].tolist()
+    r.x, r.y, r.z, r.w = frames.quat_xyzw(matrix).tolist()
+    return message
+
+
+def kinematic_model(
+    model: Mapping[str, Any],
+    *,
+    serial: str,
+    model_hash: str,
+    robot_file_hash: str = "",
+    revision: int,
+    state: int,
+    stamp: Header,
+) -> KinematicModel:
+    """A model document (``model_document``) as a message.
+
+    Raises
+    ------
+    InputError
+        When a number is not finite.
+    """
+    mdh = np.array(model["mdh"], dtype=np.float64)
+    covariance = np.array(model.get("covariance", []), dtype=np.float64)
+    _require_finite("model", [*mdh.ravel(), *covariance.ravel(), *np.ravel(model["T_base_root"])])
+    message = KinematicModel(
+        header=stamp,
+        robot=model["robot"],
+        serial=serial,
+        model_hash=model_hash,
+        robot_file_hash=robot_file_hash,
+        revision=revision,
+        joint_names=list(model["joint_names"]),
+        prismatic=list(model["prismatic"]),
+        sign=list(model["sign"]),
+        base_root=transform_message(model["T_base_root"]),
+        parameter_names=[name.rsplit("_", 1)[0] for name in model.get("parameters", [])],
+        covariance=covariance.ravel().tolist(),
+        state=state,
+    )
+    for column, name in enumerate(COLUMNS):
+        setattr(message, name, mdh[:, column].tolist())
+    return message
+
+
+def verdict_message(
+    outcome: "Outcome", *, robot: str, serial: str, stamp: Header, cycle_id: str = ""
+) -> CalibrationQuality:
+    """A verdict and why; of a candidate the errors are -1, until they are told, else 0."""
+    message = CalibrationQuality(
+        header=stamp,
+        robot=robot,
+        serial=serial,
+        candidate_id=outcome.calibration_id,
+        code=int(outcome.status),
+        accept=outcome.done,
+        reason=outcome.message,
+        cycle_id=cycle_id,
+        samples=outcome.samples,
+    )
+    if outcome.calibration_id:
+        errors = [f"{whose}_{name}" for whose in ("current", "candidate") for name in _ERRORS]
+        for name in (*errors, "predicted_rms_mm", "condition"):
+            setattr(message, name, -1.0)
+    return message
+
+
+def quality_message(outcome: "Outcome", *, robot: str, serial: str, stamp: Header) -> Any:
+    """The verdict on a thermal model; without one the figures are 0 and the reason says why.
+
+    Raises
+    ------
+    InputError
+        When a figure is not finite.
+    """
+    cycle_id = str(outcome.command.arguments.get("cycle_id", ""))
+    message = verdict_message(outcome, robot=robot, serial=serial, stamp=stamp, cycle_id=cycle_id)
+    document = outcome.document
+    if document is None:
+        return message
+    set_errors(message, "current", document["in_force"]["held_out"])
+    set_errors(message, "candidate", document["calibrated"]["held_out"])
+    message.predicted_rms_mm = document["calibrated"]["predicted"]["model_rms_mm"]
+    message.held_out = document["calibrated"]["held_out"]["n"]
+    message.rank = document["rank"]
+    message.condition = document["condition"]
+    message.unobservable = list(document["unobservable"])
+    message.rejected = list(document["rejected"])
+    _require_finite("quality", [message.predicted_rms_mm, message.condition])
+    return message
+
+
+def set_errors(message: CalibrationQuality, whose: str, errors: Mapping[str, float]) -> None:
+    """Tell errors, mm, by the names ``mean_mm``, ``rms_mm``, ``p95_mm`` and ``max_mm``.
+
+    Raises
+    ------
+    InputError
+        When one is not finite.
+    """
+    for name in _ERRORS:
+        _require_finite(f"{whose}_{name}", [errors[name]])
+        setattr(message, f"{whose}_{name}", float(errors[name]))
+
+
+def summary_message(entry: Entry) -> CalibrationSummary:
+    """A line of the history; an error that was not judged is 0."""
+    last = entry.decisions[-1] if entry.decisions else None
+    return CalibrationSummary(
+        id=entry.id,
+        revision=entry.revision,
+        kind=entry.kind,
+        state=entry.state.value,
+        code=int(entry.code),
+        stamp=time_message(entry.stamp_ns),
+        cycle_id=entry.cycle_id,
+        by=last.by if last else "",
+        reason=last.reason if last else "",
+        candidate_rms_mm=entry.candidate_rms_mm or 0.0,
+    )
+
+
+def _require_finite(what: str, values: Sequence[float]) -> None:
+    if not all(math.isfinite(value) for value in values):
+        raise InputError(f"the {what} holds a number that is not finite: it is not sent")
+
+
+def pose_message(T: Any) -> Pose:
+    """A pose (4, 4), m."""
+    moved = transform_message(T)
+    message = Pose(orientation=moved.rotation)
+    message.position.x, message.position.y, message.position.z = T[:3, 3].tolist()
+    return message

@@ -1,0 +1,266 @@
+"""Inputs, outputs, services and timers of a lifecycle node, with the manners of this house."""
+
+import inspect
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from lifecycle_msgs.msg import State
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from std_srvs.srv import Trigger
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ros import qos
+from robocal_ros.session.ignored import MOST_REASONS, kind_of
+
+LOG_EVERY_S = 5.0
+MOST_WAITING = 10_000  # messages of an input that are taken at once
+
+
+def trigger_text(number: int, status: Code, message: str) -> str:
+    """The answer of a Trigger twin: id, code and words, in this order, one blank between."""
+    return f"{number} {status.name} {message}"
+
+
+class NotActiveError(RobocalError):
+    """A service was called while its node is not active."""
+
+    code = Code.CONFLICT
+
+
+@dataclass
+class InputCount:
+    """Messages of one input: all, ignored while inactive, refused as invalid, lost on the way."""
+
+    received: int = 0
+    ignored: int = 0
+    invalid: int = 0
+    lost: int = 0
+
+
+class LogLimit:
+    """One log line per topic and reason in `LOG_EVERY_S`: a flood hides no other reason."""
+
+    def __init__(self) -> None:
+        self._next_s: dict[str, dict[str, float]] = {}
+
+    def allows(self, topic: str, reason: str, now_s: float) -> bool:
+        """Whether to log this reason now (monotonic time); beyond 30 a topic's reasons share."""
+        times = self._next_s.setdefault(topic, {})
+        kind = kind_of(reason)
+        kind = kind if kind in times or len(times) < MOST_REASONS else "other"
+        if now_s < times.get(kind, now_s):
+            return False
+        times[kind] = now_s + LOG_EVERY_S
+        return True
+
+
+class EndpointNode(LifecycleNode):
+    """A lifecycle node whose endpoints act only while it is active and go at its cleanup."""
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self.inputs: dict[str, InputCount] = {}
+        self._log_limit = LogLimit()
+        self.async_group = ReentrantCallbackGroup()
+        self._release: list[Callable[[], object]] = []
+        self._takers: list[tuple[Subscription, Callable[[Any], None]]] = []
+
+    @property
+    def state(self) -> str:
+        """Label of the lifecycle state."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_active(self) -> bool:
+        """True while the node acts."""
+        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+
+    def now_ns(self) -> int:
+        """ROS time, ns (simulated when ``use_sim_time``)."""
+        # of the clock below rclpy's, which makes an object of each: it takes four times as long
+        return int(self.get_clock().handle.get_now().nanoseconds)
+
+    def add_input(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        profile: QoSProfile,
+        *,
+        raw: bool = False,
+    ) -> Subscription:
+        """Subscribe until cleanup. A `RobocalError` of the callback counts the message invalid.
+
+        A defect in the callback counts it too and is logged; it does not end the node. ``raw``:
+        the callback is given the serialized message.
+        """
+        count = self.inputs.setdefault(topic, InputCount())
+
+        def receive(message: Any) -> None:
+            count.received += 1
+            if not self.is_active:
+                count.ignored += 1
+                return
+            try:
+                callback(message)
+            except Exception as error:
+                count.invalid += 1
+                self._log(topic, error)
+
+        def lose(event: Any) -> None:
+            count.lost += event.total_count_change
+
+        subscription = self.create_subscription(
+            kind,
+            topic,
+            receive,
+            qos.own(profile),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=lose),
+            qos_overriding_options=qos.overridable(),
+            raw=raw,
+        )
+        self._takers.append((subscription, receive))
+        self._release.append(lambda: self.destroy_subscription(subscription))
+        return subscription
+
+    def take_waiting(self) -> None:
+        """Take now what the inputs have received, in place of one message of each in its turn.
+
+        So a call comes after all that was there before it, however long the node was busy.
+        """
+        for subscription, receive in self._takers:
+            for _ in range(MOST_WAITING):
+                with subscription.handle:
+                    taken = subscription.handle.take_message(
+                        subscription.msg_type, subscription.raw
+                    )
+                if taken is None:
+                    break
+                receive(taken[0])
+
+    def add_output(self, kind: type, topic: str, profile: QoSProfile) -> Any:
+        """Return a publisher that is silent while the node is inactive, until cleanup."""
+        publisher = self.create_lifecycle_publisher(
+            kind, topic, qos.own(profile), qos_overriding_options=qos.overridable()
+        )
+        self._release.append(lambda: self.destroy_lifecycle_publisher(publisher))
+        return publisher
+
+    def add_service(
+        self,
+        kind: type,
+        name: str,
+        callback: Callable[[Any, Any], Any],
+        *,
+        inactive: bool = False,
+    ) -> None:
+        """Serve until cleanup; ``callback(request, response)`` may be ``async``.
+
+        While inactive, and when the callback raises a `RobocalError`, the answer is
+        ``success = False`` with the reason in ``message`` and its code in ``status``; of a Trigger
+        ``message`` is `trigger_text`. A defect in the callback is logged and answered too: it does
+        not end the node. An async callback may await other services; the node must then run in the
+        plain executor.
+
+        ``inactive``: the callback answers while inactive too.
+        """
+        ready = (lambda: None) if inactive else (lambda: self._require_active(name))
+        if inspect.iscoroutinefunction(callback):
+
+            async def serve(request: Any, response: Any) -> Any:
+                try:
+                    ready()
+                    return await callback(request, response)
+                except Exception as error:
+                    return self._refuse(name, response, error)
+
+            service = self.create_service(kind, name, serve, callback_group=self.async_group)
+        else:
+
+            def answer(request: Any, response: Any) -> Any:
+                try:
+                    ready()
+                    return callback(request, response)
+                except Exception as error:
+                    return self._refuse(name, response, error)
+
+            service = self.create_service(kind, name, answer)
+        self._release.append(lambda: self.destroy_service(service))
+
+    def add_client(self, kind: type, name: str) -> Any:
+        """Return a client of another node's service, until cleanup."""
+        client = self.create_client(kind, name)
+        self._release.append(lambda: self.destroy_client(client))
+        return client
+
+    def add_timer(
+        self, period_s: float, callback: Callable[[], None], *, steady: bool = False
+    ) -> Timer:
+        """Call back every ``period_s`` of ROS time while active, until cleanup.
+
+        A defect in the callback is logged; it does not end the node. ``steady``: of the steady
+        clock, which runs on when a simulation stops.
+        """
+
+        def tick() -> None:
+            if not self.is_active:
+                return
+            try:
+                callback()
+            except Exception as error:
+                self._log("timer", error)
+
+        clock = Clock(clock_type=ClockType.STEADY_TIME) if steady else None
+        timer = self.create_timer(period_s, tick, clock=clock)
+        self._release.append(lambda: self.destroy_timer(timer))
+        return timer
+
+    def release_endpoints(self) -> None:
+        """Take down all of them, the last one first."""
+        self._takers.clear()
+        while self._release:
+            self._release.pop()()
+
+    def _log(self, where: str, error: Exception) -> None:
+        """Why something was refused, or a defect; not all of a flood."""
+        refused = isinstance(error, RobocalError)
+        words = str(error) if refused else "".join(traceback.format_exception(error))
+        if not self._log_limit.allows(where, words, time.monotonic()):
+            return
+        if refused:
+            self.get_logger().warning(f"{where}: {words}")
+        else:
+            self.get_logger().error(f"{where}: a defect of this software, please report:\n{words}")
+
+    def _require_active(self, name: str) -> None:
+        if not self.is_active:
+            raise NotActiveError(f"{self.get_name()} is {self.state}: activate it to use {name}")
+
+    def _refuse(self, name: str, response: Any, error: Exception) -> Any:
+        code = Code.BAD_INPUT
+        if isinstance(error, RobocalError):
+            code = error.code
+            self.get_logger().warning(f"{name}: {error}")
+        else:
+            self.get_logger().error(f"{name}:\n{''.join(traceback.format_exception(error))}")
+        response.success = False
+        words = str(error) if isinstance(error, RobocalError) else _defect(error)
+        trigger = isinstance(response, Trigger.Response)
+        response.message = trigger_text(0, code, words) if trigger else words
+        if hasattr(response, "status"):
+            response.status = int(code)
+        return response
+
+
+def _defect(error: Exception) -> str:
+    return f"a defect of this software, please report it: {type(error).__name__}: {error}"

@@ -1,0 +1,200 @@
+"""Node parameters as a table: what each means, its unit, its bounds, when it may change."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from robocal_ros.ground.errors import InputError
+
+Value = bool | int | float | str | list[bool] | list[int] | list[float] | list[str]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One parameter.
+
+    Attributes
+    ----------
+    name, default, description : the type is the default's. An optional list of strings has the
+        default ``[""]`` (ROS has no typed empty list); empty strings are dropped when read.
+    unit : "" when it has none.
+    low, high : inclusive bounds of a number, or of each number of a list.
+    choices : the allowed strings.
+    check : says what is wrong with a value of the right type and within the bounds, or None.
+    live : may change at any time; others only while the node is unconfigured.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    check: Callable[[Any], str | None] | None = None
+    live: bool = False
+
+    def accept(self, value: object) -> Value:
+        """Return ``value`` as this parameter's type.
+
+        Raises
+        ------
+        InputError
+            When the type is wrong, a number is out of bounds or not finite, or a check fails.
+        """
+        typed = _typed(value, self.default)
+        if typed is None:
+            wanted = _type_name(self.default)
+            raise InputError(f"{self.name} = {value!r} is not {wanted}")
+        for item in typed if isinstance(typed, list) else [typed]:
+            self._check_item(item)
+        fault = self.check(typed) if self.check else None
+        if fault:
+            raise InputError(f"{self.name} = {value!r}: {fault}")
+        return typed
+
+    def _check_item(self, item: bool | int | float | str) -> None:
+        if isinstance(item, float) and not math.isfinite(item):
+            raise InputError(f"{self.name} = {item} is not finite")
+        if isinstance(item, str):
+            if self.choices and item not in self.choices:
+                raise InputError(f"{self.name} = '{item}' is not one of {', '.join(self.choices)}")
+        elif (self.low is not None and item < self.low) or (
+            self.high is not None and item > self.high
+        ):
+            raise InputError(f"{self.name} = {item:g} is out of bounds: {self.bounds}")
+
+    @property
+    def bounds(self) -> str:
+        """The allowed values in words."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        low = "" if self.low is None else f"at least {self.low:g}"
+        high = "" if self.high is None else f"at most {self.high:g}"
+        limits = " and ".join(part for part in (low, high) if part)
+        return f"{limits} {self.unit}".strip() if limits else ""
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Describe the parameter to ``ros2 param describe`` and to graphical tools."""
+        when = "may change at any time" if self.live else "may change while unconfigured"
+        unit = f" [{self.unit}]" if self.unit else ""
+        descriptor = ParameterDescriptor(
+            description=self.description + unit,
+            additional_constraints="; ".join(part for part in (self.bounds, when) if part),
+        )
+        if self.low is not None and self.high is not None:
+            if isinstance(self.default, float):
+                limits = FloatingPointRange(from_value=float(self.low), to_value=float(self.high))
+                descriptor.floating_point_range = [limits]
+            elif isinstance(self.default, int):
+                whole = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)
+                descriptor.integer_range = [whole]
+        return descriptor
+
+
+def _type_name(default: Value) -> str:
+    names = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+    if isinstance(default, list):
+        return f"a list, each {names[type(default[0])]}"
+    return names[type(default)]
+
+
+def _typed(value: object, like: Value) -> Value | None:
+    """Return value in the type of ``like``; a whole number may stand for a float."""
+    if isinstance(like, list):
+        if isinstance(value, str | bytes) or not hasattr(value, "__iter__"):
+            return None
+        items = [_typed(item, like[0]) for item in value]
+        return None if any(item is None for item in items) else items  # type: ignore[return-value]
+    if isinstance(like, float) and type(value) is int:
+        return float(value)
+    return value if type(value) is type(like) else None
+
+
+def length(name: str, default: float, what: str, low: float, high: float) -> Setting:
+    """A length in mm."""
+    return Setting(name, default, what, unit="mm", low=low, high=high)
+
+
+class ParameterTable:
+    """The declared parameters of one node.
+
+    A bad value given at the start does not stop the process: the default is declared in its
+    place, and `read` names the fault until the parameter is set to something valid.
+    """
+
+    def __init__(self, node: Node, settings: Sequence[Setting]) -> None:
+        self._node = node
+        self._settings = {setting.name: setting for setting in settings}
+        self._faults: dict[str, str] = {}
+        self.locked = False
+        self.changed: Callable[[], None] | None = None
+        for setting in settings:
+            self._declare(setting)
+        node.add_on_set_parameters_callback(self._validate)
+        node.add_post_set_parameters_callback(self._after_set)
+
+    def _declare(self, setting: Setting) -> None:
+        # Declared without a type first, to see what was given before rclpy judges it.
+        given = self._node.declare_parameter(
+            setting.name, setting.default, ParameterDescriptor(dynamic_typing=True)
+        ).value
+        self._node.undeclare_parameter(setting.name)
+        try:
+            value = setting.accept(given)
+        except InputError as error:
+            self._faults[setting.name] = str(error)
+            value = setting.default
+        self._node.declare_parameter(
+            setting.name, value, setting.descriptor(), ignore_override=True
+        )
+
+    def read(self) -> dict[str, Any]:
+        """Return every value by name.
+
+        Raises
+        ------
+        InputError
+            When a parameter was given a bad value at the start; names all of them.
+        """
+        if self._faults:
+            raise InputError("; ".join(self._faults.values()))
+        values = {name: self._node.get_parameter(name).value for name in self._settings}
+        return {name: _without_blanks(value) for name, value in values.items()}
+
+    def _validate(self, parameters: list[Parameter]) -> SetParametersResult:
+        for parameter in parameters:
+            setting = self._settings.get(parameter.name)
+            if setting is None:
+                continue
+            if self.locked and not setting.live:
+                reason = f"{setting.name} may change only while the node is unconfigured"
+                return SetParametersResult(successful=False, reason=reason)
+            try:
+                setting.accept(parameter.value)
+            except InputError as error:
+                return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _after_set(self, parameters: list[Parameter]) -> None:
+        ours = [parameter.name for parameter in parameters if parameter.name in self._settings]
+        for name in ours:
+            self._faults.pop(name, None)
+        if ours and self.locked and self.changed is not None:
+            self.changed()
+
+
+def _without_blanks(value: Any) -> Any:
+    if isinstance(value, str) or not hasattr(value, "__iter__"):
+        return value
+    return [item for item in value if item != ""]

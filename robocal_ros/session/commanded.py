@@ -1,0 +1,152 @@
+"""A session's commands in their turn, and the joint readings whose stamps they go by."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from robocal_ros import __version__
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.proposals import THERMAL, Head
+from robocal_ros.ground.samples import JOINTS, JUMPS, JointBlock, JointSample
+from robocal_ros.ground.streams import JointStream
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.session import events
+from robocal_ros.session.decisions import decide, outside_decision
+from robocal_ros.session.events import Command, Outcome, joints_awaited_ns, reached
+from robocal_ros.session.followed import Followed
+from robocal_ros.session.history import BY, History, bring_into_force
+from robocal_ros.session.ignored import Ignored
+
+WHILE = "in force while this was recorded"
+GAP_NS = 250_000_000
+Handler = Callable[[Command, int], Outcome]
+
+
+class Commanded:
+    """Base of the sessions that carry out a command as soon as it is given.
+
+    A subclass gives its handlers. A recorded command waits for its marks.
+
+    Parameters
+    ----------
+    kind : of the calibrations that it decides about.
+    current : follows what is in force.
+
+    Attributes
+    ----------
+    stream : the joint readings.
+    received, ignored : samples by topic, and those that were not used.
+    newest_ns : newest stamp of each topic.
+    """
+
+    def __init__(self, nominal: SerialArm, history: History, kind: str, current: Followed) -> None:
+        self.nominal, self._history, self._kind = nominal, history, kind
+        self._followed = current
+        self._queue: list[Command] = []
+        self._jumps = 0
+        self.stream = JointStream(nominal.joint_names)
+        self.newest_ns: dict[str, int] = {}
+        self.received: Counter[str] = Counter()
+        self.ignored = Ignored()
+
+    def _handlers(self) -> Mapping[str, Handler]:
+        """What carries out each command beside the decisions."""
+        raise NotImplementedError
+
+    @property
+    def in_force(self) -> Head:
+        """Head of its kind as the session last saw it."""
+        return self._followed.head
+
+    @property
+    def marks(self) -> dict[str, int]:
+        """How far the samples have come: newest stamps, and jumps of the clock."""
+        return self.newest_ns | {JUMPS: self._jumps}
+
+    @property
+    def newest_joints_ns(self) -> int:
+        """Stamp of the newest joint reading; 0 before any."""
+        return self.newest_ns.get(JOINTS, 0)
+
+    def _take_joints(self, sample: JointSample) -> bool:
+        """Take a reading; tells whether the clock jumped back, which begins everything anew."""
+        began = self.stream.add(sample, GAP_NS).began_ns
+        newest = self.stream.newest_ns
+        if newest is None:
+            return False
+        before = self.newest_ns.get(JOINTS, newest)
+        self.received[JOINTS] += 1
+        self.newest_ns[JOINTS] = newest
+        if began is None or newest >= before:
+            return False
+        self._jumps += 1
+        self.newest_ns = {JOINTS: newest}
+        return True
+
+    def take_plain(self, block: JointBlock, start: int) -> int:
+        """Take the joint readings from ``start`` on that decide nothing: how many these are.
+
+        As `add` of each, many times faster. The reading after them is for `add`.
+        """
+        if self._watches_joints():
+            return 0
+        marks = self._queue[0].marks if self._queue else None
+        awaited_ns = joints_awaited_ns(marks or {}, self.newest_ns)
+        count = self.stream.extend(block, start, awaited_ns, GAP_NS)
+        if count:
+            self.received[JOINTS] += count
+            self.newest_ns[JOINTS] = int(block.stamp_ns[start + count - 1])
+        return count
+
+    def _watches_joints(self) -> bool:
+        """Whether each joint reading may decide something now."""
+        raise NotImplementedError
+
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command; ``step`` carries it out when its samples are complete.
+
+        A command without a stamp gets the newest stamp of the joints, where there is one, so that
+        a clock that is off does not matter.
+        """
+        if command.stamp_ns is None:
+            command = replace(command, stamp_ns=self.newest_joints_ns or clock_ns or 0)
+        self._queue.append(command)
+
+    @property
+    def waiting(self) -> int:
+        """Number of commands not yet carried out."""
+        return len(self._queue)
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command: what was decided outside before it, and it."""
+        if not self._queue or not (force or self._ready(self._queue[0])):
+            return []
+        command = self._queue.pop(0)
+        outside = self.poll()
+        if command.marks is None:
+            command = replace(command, marks=self.marks)
+        decisions = dict.fromkeys((events.ACCEPT, events.REJECT, events.ROLLBACK), self._decide)
+        common = {**decisions, events.CONFIGURE: self._reconfigured}
+        outcome = events.carried_out({**self._handlers(), **common}, command, wall_ns)
+        outside += [outside_decision(d, self.marks) for d in self._followed.look(wall_ns)]
+        return [*outside, replace(outcome, revision=self.in_force.revision)]
+
+    def poll(self) -> list[Outcome]:
+        """Take over what another process decided in the history since the last look."""
+        return [outside_decision(d, self.marks) for d in self._followed.look()]
+
+    def _ready(self, command: Command) -> bool:
+        return command.marks is None or reached(command.marks, self.newest_ns, self._jumps)
+
+    def _decide(self, command: Command, wall_ns: int) -> Outcome:
+        return decide(self._history, command, self.in_force.revision, wall_ns, self._kind)
+
+    def _reconfigured(self, command: Command, wall_ns: int) -> Outcome:
+        """A thermal model that another node brought into force while this was recorded."""
+        model = command.arguments["model"]
+        if model is None:
+            why = {"by": BY, "reason": WHILE}
+            self._history.rollback(to=0, kind=THERMAL, **why, expected_head=None, wall_ns=wall_ns)
+        else:
+            bring_into_force(self._history, THERMAL, self.nominal, model, __version__, WHILE)
+        return Outcome(command, Code.ACCEPT, f"thermal model {WHILE}")

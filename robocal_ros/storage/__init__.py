@@ -1,1 +1,0 @@
-"""Files: calibration history, bags, tables and robot descriptions."""

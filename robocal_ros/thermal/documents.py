@@ -1,0 +1,125 @@
+"""Thermal results as plain documents (JSON), in the units people read."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.estimation.assessment import (
+    Judgement,
+    errors_document,
+    judged_errors_document,
+    summarise,
+    verdict_document,
+)
+from robocal_ros.ground import frames
+from robocal_ros.ground.frame_texts import transform_document
+from robocal_ros.identification.documents import cell_document
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.kinematics.documents import parameters_document
+from robocal_ros.thermal.flange_identification import JudgedFlangeSensor
+from robocal_ros.thermal.identification import CycleDrift
+from robocal_ros.thermal.sensor_calibration import NAMES, SensorCalibration, sensor_verdict
+from robocal_ros.thermal.spots import ColdSpots
+
+Array = NDArray[np.float64]
+Document = dict[str, Any]
+
+
+def sensor_document(found: SensorCalibration, arm: SerialArm) -> Document:
+    """A placed sensor: where, how well, and whether to trust it.
+
+    ``covariance`` is in SI, of ``covariance_of``.
+    """
+    covariance, sigma = found.covariance, found.sigma
+    to_display = np.array([1e3 if name.endswith("_mm") else np.degrees(1.0) for name in NAMES])
+    fitted = np.linalg.norm(found.residual, axis=1)
+    judged = found.left_out[np.isfinite(found.left_out)]
+    return {
+        "robot": arm.name,
+        "model_hash": arm.model_hash,
+        "method": found.method,
+        "T_sensor_base": transform_document(found.T_sensor_base),
+        "sphere_in_flange_mm": (found.sphere_in_flange * 1e3).tolist(),
+        "covariance_of": list(NAMES),
+        "covariance": None if covariance is None else covariance.tolist(),
+        "sigma": None
+        if sigma is None
+        else dict(zip(NAMES, (sigma * to_display).tolist(), strict=True)),
+        "residual": errors_document(summarise(fitted)),
+        "left_out": errors_document(summarise(judged)) if len(judged) else None,
+        "samples": len(fitted),
+        "rejected": list(found.rejected),
+        "verdict": verdict_document(sensor_verdict(found)),
+    }
+
+
+def placed_of(document: Mapping[str, Any]) -> tuple[Array, Array]:
+    """T_sensor_base (4, 4) and the sphere in the flange's frame (3,), m, of a sensor's document."""
+    pose = document["T_sensor_base"]
+    xyz = np.array(pose["xyz_mm"]) * 1e-3
+    T_sensor_base = frames.transform_from_quat(xyz, pose["quat_xyzw"])
+    return T_sensor_base, np.array(document["sphere_in_flange_mm"]) * 1e-3
+
+
+def cycle_document(
+    found: CycleDrift, judged: Judgement, spots: ColdSpots, nominal: SerialArm, method: str
+) -> Document:
+    """A cycle's drift in the form of ``identify``; the nominal model is the cold one here."""
+    names = nominal.parameters.names
+    sigma = dict(zip(names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+    solved = {name: value for name, value in sigma.items() if value > 0.0}
+    held = [name for name in names if name not in solved]
+    return {
+        "robot": nominal.name,
+        "model_hash": nominal.model_hash,
+        "method": method,
+        **judged_errors_document(judged),
+        "parameters": parameters_document(nominal, found.arm, solved),
+        **cell_document(spots.cell),
+        "noise_mm": found.noise_m * 1e3,
+        "samples": len(found.warm),
+        "cold_visits": int(spots.visits.sum()),
+        "rank": found.seen.rank,
+        "unknowns": len(names) - len(held),
+        "condition": found.seen.condition,
+        "unobservable": list(found.unobservable),
+        "held": held,
+        "rejected": [found.warm.sample[i] for i in np.flatnonzero(found.rejected)],
+        "held_out_rejected": list(judged.held_out_rejected),
+        "converged": True,
+        "verdict": verdict_document(judged.verdict),
+    }
+
+
+def flange_sensor_document(judged: JudgedFlangeSensor) -> Document:
+    """A measuring robot in the form of ``identify``, with hand-eye pose and spheres."""
+    result = judged.identification
+    problem, seen = result.problem, result.estimate.observability
+    sigma = dict(
+        zip(problem.names, np.sqrt(np.diag(result.estimate.covariance)).tolist(), strict=True)
+    )
+    return {
+        "robot": result.nominal.name,
+        "model_hash": result.nominal.model_hash,
+        "method": "map",
+        **judged_errors_document(judged),
+        "parameters": parameters_document(result.nominal, result.cell.arm, sigma),
+        "T_flange_sensor": transform_document(result.cell.T_flange_sensor),
+        "spheres": {
+            name: {"xyz_mm": (centre * 1e3).tolist()}
+            for name, centre in zip(result.cell.spheres, result.cell.centres, strict=True)
+        },
+        "noise_mm": result.noise_m * 1e3,
+        "samples": len(result.problem.data),
+        "rank": seen.rank,
+        "unknowns": len(problem.names),
+        "condition": seen.condition,
+        "unobservable": list(result.unobservable),
+        "held": [],
+        "rejected": list(result.rejected),
+        "held_out_rejected": list(judged.held_out_rejected),
+        "converged": result.estimate.converged,
+        "verdict": verdict_document(judged.verdict),
+    }

@@ -1,0 +1,245 @@
+"""The thermal node: measurements in, judged models out, decisions kept (docs/thermal_node.md)."""
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PointStamped, PoseStamped
+from numpy.typing import NDArray
+from sensor_msgs.msg import JointState, PointCloud2, Temperature
+
+from robocal_ros import __version__
+from robocal_ros.ground import frames
+from robocal_ros.ground.errors import RobocalError
+from robocal_ros.ground.samples import (
+    JOINTS,
+    MEASURED_POINT,
+    MEASURED_POSE,
+    REFERENCE_SPHERE,
+    SPHERE_CENTER,
+    SPHERE_CLOUD,
+    TEMPERATURES,
+)
+from robocal_ros.history.calibrations import CalibrationHistory
+from robocal_ros.kinematics.documents import model_document
+from robocal_ros.kinematics.robots import load_robot, robot_file_hash
+from robocal_ros.motion.source_guard import SourceGuard
+from robocal_ros.ros import qos
+from robocal_ros.ros.base import POLL_S, HouseNode
+from robocal_ros.ros.command_desk import CommandDesk
+from robocal_ros.ros.data_clock import DataClock
+from robocal_ros.ros.diagnostics import ERROR, WARN, Health
+from robocal_ros.ros.endpoints import NotActiveError
+from robocal_ros.ros.history_settings import open_history, warn_of_history
+from robocal_ros.ros.run import run
+from robocal_ros.ros.stamp_watch import StampWatch
+from robocal_ros.session.events import CYCLE, Outcome
+from robocal_ros.thermal.documents import placed_of
+from robocal_ros.thermal.identification import require_parameters
+from robocal_ros.thermal.inputs import take_message
+from robocal_ros.thermal.outputs import ThermalOutputs
+from robocal_ros.thermal.seeding import configuration
+from robocal_ros.thermal.services import ThermalServices
+from robocal_ros.thermal.session import ThermalSession
+from robocal_ros.thermal.set_up_services import SetUpServices
+from robocal_ros.thermal.setting_up import SENSOR
+from robocal_ros.thermal.settings import SETTINGS, session_config
+
+Array = NDArray[np.float64]
+
+ACCURACY_S = 1.0
+INPUTS = {
+    JOINTS: JointState,
+    MEASURED_POINT: PointStamped,
+    SPHERE_CENTER: PointStamped,
+    SPHERE_CLOUD: PointCloud2,
+    REFERENCE_SPHERE: PointStamped,
+    MEASURED_POSE: PoseStamped,
+    TEMPERATURES: Temperature,
+}
+
+
+class ThermalNode(HouseNode):
+    """Drives a `ThermalSession` with live messages and calls."""
+
+    NAME = "thermal_node"
+    SETTINGS = SETTINGS
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._session: ThermalSession | None = None
+        self._history: CalibrationHistory | None = None
+
+    def configure(self) -> None:
+        """Open the history, then the topics and services."""
+        self._shown: tuple[Any, ...] = ()
+        settings = self.settings
+        self._nominal = load_robot(settings["robot"])
+        require_parameters(self._nominal, settings["drift_parameters"])
+        self._config = session_config(settings, self._nominal)
+        self._serial_in_use, self._history = open_history(settings, self._nominal, self.NAME)
+        self._outputs = ThermalOutputs(
+            self.add_output,
+            self._nominal,
+            self._serial_in_use,
+            robot_file_hash(settings["robot"]),
+            settings["base_frame"],
+        )
+        self._data_clock = DataClock()
+        self._guard = SourceGuard(self, JOINTS)
+        self._stamps = StampWatch(self, JOINTS)
+        self._topics = {kind: self.resolve_topic_name(kind) for kind in INPUTS}
+        for kind, message_type in INPUTS.items():
+            self.add_input(message_type, kind, self._taker(kind), qos.STREAM)
+        self._desk = CommandDesk(self, settings["command_timeout_s"], self._show)
+        ThermalServices(self.add_service, self._desk.ask, self._history)
+        SetUpServices(
+            self.add_service, self._desk.ask, self._history, self._nominal, settings, self._prior
+        )
+        self.add_timer(POLL_S, self._poll, steady=True)
+        self.add_timer(ACCURACY_S, self._show_accuracy, steady=True)
+
+    def activate(self) -> None:
+        """Begin a session; it knows nothing of what was measured before."""
+        if self._history is None:
+            raise ValueError("activated before it was configured")
+        self._session = ThermalSession(self._nominal, self._history, self._config, __version__)
+        self._desk.session = self._session
+        self._shown = ()
+        self._show_in_force()
+
+    def deactivate(self) -> None:
+        """End the session; calls that wait are answered."""
+        self._session = None
+        self._desk.close()
+
+    def cleanup(self) -> None:
+        """Close the history."""
+        self._session = None
+        if self._history is not None:
+            self._history.close()
+        self._history = None
+
+    # ---- samples and commands -------------------------------------------------------------------
+
+    def _taker(self, kind: str) -> Any:
+        def take(message: Any) -> None:
+            session = self._session
+            if session is None:
+                return
+            self._stamps.note(kind, message)
+            desk = session.desk
+            if kind == JOINTS and (fault := self._guard.fault_at(desk.received[JOINTS])):
+                desk.ignored.add(JOINTS, fault)
+                return
+            take_message(session, kind, message)
+            if session.waiting:
+                self._desk.step()
+
+        return take
+
+    def _prior(self) -> Array:
+        if self._session is None:
+            raise NotActiveError("no session: activate the node")
+        return self._session.expected_drift()
+
+    def _poll(self) -> None:
+        self._guard.look()
+        session = self._session
+        if session is None:
+            return
+        try:
+            for outcome in session.poll():
+                self._show(outcome)
+            self._show_in_force()
+            if (command := session.overdue()) is not None:
+                self._desk.ask(command)
+        except RobocalError as error:  # the history cannot be read: tried again at the next poll
+            self.get_logger().error(str(error), throttle_duration_sec=5.0)
+
+    # ---- outputs --------------------------------------------------------------------------------
+
+    def _show(self, outcome: Outcome) -> None:
+        words = f"{outcome.command.name}: {outcome.status.name} {outcome.message}"
+        if outcome.done:
+            self.get_logger().info(words)
+        else:
+            self.get_logger().warning(words)
+        try:
+            if not outcome.repeated:
+                self._outputs.events.tell(outcome.command, outcome)
+                if outcome.command.name in CYCLE:
+                    self._show_candidate(outcome)
+            self._show_in_force()
+        except (RobocalError, ValueError) as error:  # what is done stays done
+            self.get_logger().error(f"{outcome.command.name} was done but not published: {error}")
+
+    def _show_candidate(self, outcome: Outcome) -> None:
+        if self._session is None or self._history is None:
+            return
+        self._outputs.quality(outcome, self._session.desk.frame or "")
+        if outcome.calibration_id:
+            model = self._history.model(outcome.calibration_id)
+            self._outputs.candidate(model, outcome.command.stamp_ns or 0)
+
+    def _show_in_force(self) -> None:
+        """Publish the model in force and record the new state, when either changed."""
+        session, history = self._session, self._history
+        if session is None or history is None:
+            return
+        head, follower = session.in_force, session.follower
+        cycles = 0 if follower is None else follower.state.cycles
+        sensor = history.head(SENSOR)
+        shown = (head.revision, session.reference_id, cycles, sensor.revision)
+        if self._shown == shown and not self._outputs.events.need_configuration:
+            return
+        if self._shown[:1] != shown[:1]:
+            stamp = history.get(head.calibration_id).stamp_ns if head.calibration_id else 0
+            model = model_document(self._nominal) if head.model is None else head.model
+            self._outputs.model(model, head.revision, stamp)
+        if sensor.model is not None and sensor.calibration_id and self._shown[3:] != shown[3:]:
+            T_sensor_base, _ = placed_of(sensor.model)
+            stamp = history.get(sensor.calibration_id).stamp_ns
+            self._outputs.sensor(frames.invert(T_sensor_base), sensor.model["frame"], stamp)
+        self._shown = shown
+        self._outputs.events.tell(configuration(session, self._topics), None)
+
+    def _show_accuracy(self) -> None:
+        if self._session is None:
+            return
+        newest = self._session.desk.newest_ns.get(JOINTS)
+        stamp_ns = self._data_clock.at(newest, self.now_ns())
+        found = self._session.accuracy(stamp_ns)
+        self._outputs.accuracy(found, self._session.config.tolerance_m, stamp_ns)
+
+    def health(self) -> Health:
+        """Tell what is in force, what waits, what was lost or ignored, what is wrong."""
+        session, history, health = self._session, self._history, Health()
+        if session is None or history is None:
+            return health
+        values: dict[str, object] = {"revision in force": session.in_force.revision}
+        try:
+            pending = [entry.id for entry in history.pending()]
+            values["pending candidates"] = ", ".join(map(str, pending)) or "none"
+        except RobocalError as error:
+            health.worsen(ERROR, str(error))
+        values["cold reference"] = "captured" if session.reference_id else "none"
+        visited, poses = session.windows.progress()
+        named = f"'{session.cycle.id}' open, " if session.cycle.id else ""
+        values["cycle"] = f"{named}{visited} of {poses} poses measured"
+        values["joint gaps"] = session.desk.stream.gap_count
+        values |= session.desk.ignored.listed() | self._stamps.judge(health)
+        if self._guard.fault:
+            health.worsen(ERROR, self._guard.fault)
+        if session.fault:
+            health.worsen(ERROR, session.fault)
+        lost = [topic for topic, count in self.inputs.items() if count.lost]
+        if lost:
+            health.worsen(WARN, f"messages lost on {', '.join(lost)}")
+        warn_of_history(health, history)
+        health.values = values
+        return health
+
+
+def main() -> None:
+    """Run the node."""
+    run(ThermalNode)

@@ -1,0 +1,291 @@
+"""The thermal session: samples and commands in, judged proposals out. No clock, no ROS."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, RobocalError, StorageError
+from robocal_ros.ground.proposals import Head
+from robocal_ros.ground.samples import (
+    JOINTS,
+    TEMPERATURES,
+    JointBlock,
+    JointSample,
+    Measurements,
+    PointSample,
+    PoseSample,
+    TemperatureSample,
+)
+from robocal_ros.kinematics import SerialArm
+from robocal_ros.session import events
+from robocal_ros.session.decisions import decide, outside_decision
+from robocal_ros.session.events import Command, Outcome
+from robocal_ros.session.history import History
+from robocal_ros.thermal.accuracy_state import Accuracy, accuracy_of
+from robocal_ros.thermal.bounds import Bounds
+from robocal_ros.thermal.config import ThermalConfig
+from robocal_ros.thermal.cycles import TIME_OUT, CycleBook, ended
+from robocal_ros.thermal.drift_following import DriftFollower, Following
+from robocal_ros.thermal.in_force import InForce
+from robocal_ros.thermal.keeping import Keeper
+from robocal_ros.thermal.observations import ObservationDesk
+from robocal_ros.thermal.proposing import Proposer
+from robocal_ros.thermal.reference import ColdReference
+from robocal_ros.thermal.setting_up import SetUp
+from robocal_ros.thermal.temperatures import MotorTemperatures
+from robocal_ros.thermal.windows import Beside, Windows
+
+__all__ = ["ThermalConfig", "ThermalSession"]
+
+Array = NDArray[np.float64]
+
+_NO_REFERENCE = "no cold reference: capture it before the first cycle"
+
+
+class ThermalSession:
+    """Identifies the model of one arm from measurements at standstill.
+
+    Without a cold reference, ``identify`` calibrates base, targets and model from all poses and
+    judges on held-out ones; with one, it identifies the drift since then.
+
+    Attributes
+    ----------
+    temperatures : of the motors.
+    cycle : the measuring cycle that is open.
+    windows : which measurements belong to a cycle.
+    """
+
+    def __init__(
+        self,
+        nominal: SerialArm,
+        history: History,
+        config: ThermalConfig,
+        software: str,
+    ) -> None:
+        self.nominal = nominal
+        self.config = config
+        self.desk = ObservationDesk(
+            nominal.joint_names, config.standstill, config.measuring_frame or None
+        )
+        self._history = history
+        self._queue: list[Command] = []
+        self._current = InForce(history, nominal)
+        self.temperatures = MotorTemperatures(nominal.joint_names)
+        self.cycle = CycleBook()
+        self.windows = Windows(self.desk, self.cycle, self._current, config)
+        self._bounds = Bounds(self.desk, self.cycle, self.windows, config)
+        self._following = Following(history, self._current, config.sigma_m, config.work)
+        keeper = Keeper(nominal, history, software, self._current)
+        self._set_up = SetUp(nominal, history, config, self._current, keeper)
+        self._proposer = Proposer(nominal, config, self._current, self._following, keeper)
+
+    @property
+    def in_force(self) -> Head:
+        """Head of the history as the session last saw it."""
+        return self._current.head
+
+    @property
+    def reference(self) -> ColdReference | None:
+        """The cold reference, or None."""
+        return self._current.reference
+
+    @property
+    def reference_id(self) -> int | None:
+        """Calibration that is the cold reference, or None."""
+        return self._current.reference_id
+
+    @property
+    def fault(self) -> str:
+        """Why the history could not be read at the last look; empty when it could."""
+        return self._current.fault
+
+    @property
+    def newest_joints_ns(self) -> int:
+        """Stamp of the newest joint reading; 0 before any."""
+        return self.desk.newest_ns.get(JOINTS, 0)
+
+    @property
+    def arm(self) -> SerialArm:
+        """The arm with the model in force."""
+        return self._current.arm
+
+    @property
+    def reference_model(self) -> dict[str, Any] | None:
+        """The cold reference as it is kept, or None."""
+        return self._current.reference_model
+
+    def expected_drift(self) -> Array:
+        """Covariance (k, k), SI, of the drift that a shift may bring."""
+        if self.follower is not None:
+            return self.follower.expected_drift()
+        return self._following.expected.process.covariance
+
+    def add(self, sample: JointSample | PointSample | PoseSample | TemperatureSample) -> None:
+        """Take a sample."""
+        if isinstance(sample, JointSample):
+            jumps = self.desk.jumps
+            self.desk.add_joints(sample)
+            if self.desk.jumps > jumps:
+                self._clock_jumped(sample.stamp_ns)
+        elif isinstance(sample, TemperatureSample):
+            self.temperatures.add(sample)
+            self.desk.newest_ns[TEMPERATURES] = self.temperatures.newest_ns or 0
+        else:
+            self.desk.add_measurement(sample)
+
+    def take_plain(self, block: JointBlock, start: int) -> int:
+        """Take the joint readings from ``start`` on that decide nothing: how many these are.
+
+        As `add` of each, many times faster. The reading after them is for `add`.
+        """
+        awaited_ns = self._bounds.joints_awaited_ns(self._queue[0]) if self._queue else None
+        return self.desk.take_plain(block, start, awaited_ns)
+
+    def _clock_jumped(self, stamp_ns: int) -> None:
+        """Nothing that an earlier clock stamped can be compared any more."""
+        self.temperatures = MotorTemperatures(self.nominal.joint_names)
+        self.cycle.begun_ns = stamp_ns
+        with suppress(RobocalError):  # said by `accuracy`
+            if self.follower is not None:
+                self.follower.clock_jumped(stamp_ns)
+
+    def submit(self, command: Command, clock_ns: int | None = None) -> None:
+        """Queue a command; ``advance`` carries it out when its samples are complete.
+
+        A command without a stamp gets ``clock_ns`` where that is on the samples' clock (within
+        a second after the newest of them), else the newest stamp known.
+        """
+        self._queue.append(self._bounds.stamped(command, clock_ns))
+
+    @property
+    def waiting(self) -> int:
+        """Number of commands not yet carried out."""
+        return len(self._queue)
+
+    def advance(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out the commands whose samples are complete.
+
+        ``wall_ns`` enters the history's records only; ``force`` carries out all with what is
+        there (no more samples will come, or a caller's deadline has passed).
+        """
+        outcomes: list[Outcome] = []
+        while done := self.step(wall_ns=wall_ns, force=force):
+            outcomes += done
+        return outcomes
+
+    def step(self, *, wall_ns: int, force: bool = False) -> list[Outcome]:
+        """Carry out one command, as ``advance``: what was decided outside before it, and it."""
+        if not self._queue or not (force or self._bounds.ready(self._queue[0])):
+            return []
+        command = self._bounds.named(self._queue.pop(0))
+        outside = self.poll()
+        if command.marks is None:
+            command = self._bounds.marked(command)
+        outcome = self._carry_out(command, wall_ns)
+        outside += [
+            outside_decision(decision, self.desk.marks) for decision in self._current.look(wall_ns)
+        ]
+        return [*outside, replace(outcome, revision=self.in_force.revision)]
+
+    def _carry_out(self, command: Command, wall_ns: int) -> Outcome:
+        handlers: dict[str, Callable[[Command, int], Outcome]] = {
+            events.CALIBRATE_SENSOR: self._calibrate_sensor,
+            events.CAPTURE_REFERENCE: self._capture_reference,
+            events.IDENTIFY: self._identify,
+            events.BEGIN_CYCLE: self._begin_cycle,
+            events.END_CYCLE: self._end_cycle,
+            events.ACCEPT: self._decide,
+            events.REJECT: self._decide,
+            events.ROLLBACK: self._decide,
+        }
+        return events.carried_out(handlers, command, wall_ns)
+
+    def _calibrate_sensor(self, command: Command, wall_ns: int) -> Outcome:
+        """Place the sensor; the samples stay, for the cold reference."""
+        data, _ = self.windows.of(command)
+        return self._set_up.place_sensor(command, data, self.desk.frame or "", wall_ns)
+
+    def _capture_reference(self, command: Command, wall_ns: int) -> Outcome:
+        data, fixed = self.windows.of(command)
+        reference = self._beside(command, data, fixed)
+        outcome = self._set_up.capture(command, data, reference, wall_ns)
+        self._close_cycle(command)
+        return outcome
+
+    def _identify(self, command: Command, wall_ns: int) -> Outcome:
+        method = self._proposer.method(command)
+        data, fixed = self.windows.of(command)
+        beside = self._beside(command, data, fixed)
+        outcome = self._proposer.identify(command, data, beside, method, wall_ns)
+        self._close_cycle(command)
+        return outcome
+
+    def _beside(self, command: Command, data: Measurements, fixed: Array) -> Beside:
+        """With the motor temperatures up to the middle of what was measured."""
+        newest = (command.marks or {}).get(TEMPERATURES, -1)
+        until_ns = min(data.middle_ns, newest)
+        follower = self.follower
+        after_ns = 0 if follower is None else follower.read_ns
+        readings = self.temperatures.between(after_ns, until_ns)
+        return Beside(fixed, readings, self.temperatures.at(until_ns))
+
+    def _close_cycle(self, command: Command) -> None:
+        self.cycle.close()
+        self.desk.use(command.stamp_ns or 0)
+
+    def _begin_cycle(self, command: Command, wall_ns: int) -> Outcome:
+        if self.reference is None:
+            raise ConflictError(_NO_REFERENCE)
+        cycle_id, stamp_ns = str(command.arguments["cycle_id"]), command.stamp_ns or 0
+        going_on = self.cycle.id == cycle_id
+        message = self.cycle.begin(cycle_id, stamp_ns, self._history)
+        if not going_on:
+            self.desk.use(stamp_ns)
+        return Outcome(command, Code.ACCEPT, message, repeated=going_on)
+
+    def _end_cycle(self, command: Command, wall_ns: int) -> Outcome:
+        """Identify from the cycle; when that fails it stays open, unless its time has run out."""
+        cycle_id = str(command.arguments["cycle_id"])
+        if self.cycle.id != cycle_id:
+            if (before := ended(cycle_id, self._history)) is not None:
+                message = f"cycle '{cycle_id}' has ended already: {before.reason}"
+                return Outcome(command, before.code, message, None, before.id, repeated=True)
+            if self.cycle.id:
+                raise ConflictError(f"cycle '{self.cycle.id}' is open, not '{cycle_id}'")
+        if self.reference is None:
+            raise ConflictError(_NO_REFERENCE)
+        try:
+            return self._identify(command, wall_ns)
+        except StorageError:
+            self.cycle.postponed_ns = self.desk.newest_ns.get(JOINTS, 0)
+            raise
+        except Exception:
+            if command.arguments.get("by") == TIME_OUT:
+                self._close_cycle(command)
+            raise
+
+    def overdue(self) -> Command | None:
+        """The command that ends a cycle whose time has run out; None while there is none."""
+        idle = not self._queue and self.reference is not None
+        return self.windows.overdue() if idle else None
+
+    def _decide(self, command: Command, wall_ns: int) -> Outcome:
+        return decide(self._history, command, self.in_force.revision, wall_ns)
+
+    @property
+    def follower(self) -> DriftFollower | None:
+        """What follows the drift since the cold reference; None without one."""
+        return self._following.follower
+
+    def accuracy(self, stamp_ns: int) -> Accuracy:
+        """How far the tool may be off at a stamp with the model in force."""
+        return accuracy_of(self._following, self._current, self.config, self.temperatures, stamp_ns)
+
+    def poll(self) -> list[Outcome]:
+        """Take over what another process decided in the history since the last look."""
+        return [outside_decision(decision, self.desk.marks) for decision in self._current.look()]

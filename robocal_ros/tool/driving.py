@@ -1,0 +1,299 @@
+"""Drives a robot through the steps of a tool session; whatever is odd ends in a stop. No ROS.
+Nothing is sent unless it was armed. Each motion is planned from where the robot stands, and sent
+only when the one before has ended there.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from robocal_ros.ground.codes import Code
+from robocal_ros.ground.errors import ConflictError, RobocalError
+from robocal_ros.motion.cell import MotionCell
+from robocal_ros.motion.driving_config import DrivingConfig
+from robocal_ros.motion.plan import JointPlan
+from robocal_ros.motion.robot_watch import LeftPlanError, MotionReport, RobotWatch
+from robocal_ros.motion.stopping import stop
+from robocal_ros.motion.watched_stop import WatchedStop
+from robocal_ros.session.events import BREAK_OFF, LEFT_PLAN, STEP_BEGINS, Command
+from robocal_ros.tool.measuring_motion import approach, measuring
+from robocal_ros.tool.phases import (
+    MOST_EDGES,
+    NO_RUN,
+    REST_WITHIN_S,
+    SETTLED_S,
+    SILENT_ARMED_S,
+    STANDS_S,
+    Phase,
+    StopError,
+    station_cell,
+)
+from robocal_ros.tool.session import ToolSession
+
+Array = NDArray[np.float64]
+
+
+class ToolDriver:
+    """Turns the awaited steps of a session into joint motions; times are of a steady clock.
+
+    Parameters
+    ----------
+    send : publishes a plan, and whether it is a stop; returns when, where that is not now.
+    ask : gives a command to the session.
+    closed : why nothing may move at a time, empty: it may; asked before anything begins.
+    hard_stop : stops a robot that does not obey, by other means; takes why.
+
+    Attributes
+    ----------
+    robot : where it is, and how fast its controller's clock runs.
+    phase : what the robot does now.
+    armed : whether motions may be sent.
+    told : why it disarmed itself last.
+    """
+
+    def __init__(
+        self,
+        session: ToolSession,
+        config: DrivingConfig,
+        send: Callable[[JointPlan, bool], float | None],
+        ask: Callable[[Command], object],
+        closed: Callable[[float], str] = lambda now_s: "",
+        hard_stop: Callable[[str], None] = lambda why: None,
+    ) -> None:
+        self._session, self._config = session, config
+        self._send, self._ask, self._closed = send, ask, closed
+        self.phase, self.armed, self.told = Phase.IDLE, False, ""
+        self._armed_at_s = 0.0
+        self._hard_stop = hard_stop
+        self.robot = RobotWatch(session.nominal, config)
+        self._stopping = WatchedStop(session.nominal, config.limits)
+        self._cell: MotionCell | None = None
+        self._beams: Counter[bool] = Counter()
+        self._kind = ""  # of the last step that was driven
+        self._driven = NO_RUN
+        self._failed = ""  # of the last stop, as it was acted upon
+
+    # ---- arming ---------------------------------------------------------------------------------
+
+    def arm(self, now_s: float) -> None:
+        """Allow motions, until the run ends.
+
+        Raises
+        ------
+        ConflictError
+            While nothing may move, joint states are missing, a run is open, or the robot moves.
+        """
+        if why := self._closed(now_s):
+            raise ConflictError(f"{why}: nothing may move")
+        if self.robot.silent_s > self._config.silence_s:
+            raise ConflictError("joint states are missing: nothing can be armed without them")
+        if self.phase is not Phase.IDLE:
+            raise ConflictError(f"the robot is {self.phase.value}: arm it when it stands")
+        if self._session.run is not None:
+            raise ConflictError("a run is open: cancel it, then arm, then measure")
+        if self._resting(STANDS_S) is None or self._stopping.under_way:
+            raise ConflictError("the robot moves: arm it when it stands")
+        self.armed, self._armed_at_s, self.told = True, now_s, ""
+
+    def disarm(self, reason: str, now_s: float) -> None:
+        """Forbid motions; one that is under way is stopped, and an open run ends."""
+        if self.phase is not Phase.IDLE or self._session.run is not None:
+            self._fault(Code.CONFLICT, reason, now_s)
+        self.armed, self.told = False, reason
+
+    def require_ready(self) -> None:
+        """Refuse a run while nothing may move, or while something else moves the robot."""
+        if not self.armed:
+            why = f" ({self.told})" if self.told else ""
+            raise ConflictError(f"not armed{why}: call arm before the measurement")
+        if self._resting(STANDS_S) is None:
+            raise ConflictError("the robot moves, or its joint states are missing: let it stand")
+
+    def words(self) -> str:
+        """For people: whether it is armed, what the robot does, why it disarmed itself."""
+        state = "armed" if self.armed else "disarmed"
+        return f"{state}, {self.phase.value}" + (f" ({self.told})" if self.told else "")
+
+    def trouble(self, now_s: float) -> str:
+        """A robot that does not stop, or that is late; empty: neither."""
+        return self._stopping.failed or self.robot.late(now_s)
+
+    def on_its_way(self, now_s: float) -> bool:
+        """Whether a step is being driven: a robot that rests then only pauses."""
+        return self.phase is Phase.MEASURE and not self.robot.at_end(now_s)
+
+    @property
+    def moves(self) -> bool:
+        """Whether it moves the robot, or may at once."""
+        return self.armed or self.phase is not Phase.IDLE or self._stopping.under_way
+
+    # ---- what happens ---------------------------------------------------------------------------
+
+    def reading(self, stamp_s: float, q: Array, now_s: float) -> None:
+        """Take joints (n,), in the arm's order, as they arrive; ``stamp_s`` on their own clock."""
+        self.robot.reading(stamp_s, q, now_s)
+        self.tick(now_s)
+
+    def slept(self, for_s: float) -> None:
+        """The host was suspended; call it before anything else with a time of afterwards."""
+        self.robot.slept(for_s)
+
+    def beam(self, broken: bool) -> None:
+        """A beam has said something, usable or not."""
+        self._beams[broken] += 1
+
+    def run_failed(self, reason: str, now_s: float) -> None:
+        """Stop, and disarm, because the run ended without a result."""
+        self._fault(Code.CONFLICT, reason, now_s)
+
+    def reported(self, report: MotionReport, now_s: float) -> None:
+        """What the controller says of what it was sent last."""
+        if self._stopping.under_way:
+            if report.failed:
+                self._stopping.rejected(report.words)
+        elif self.phase is not Phase.IDLE and report.failed:
+            self._fault(Code.CONFLICT, report.words, now_s, lost=True)
+        elif report.ended:
+            self.robot.ended()
+
+    def tick(self, now_s: float) -> None:
+        """Look at everything; call it often, also when nothing arrives."""
+        self.robot.silence.look(now_s)
+        if (plan := self._stopping.look(self.robot, now_s)) is not None:
+            self._send(plan, True)
+        if (why := self._stopping.failed) != self._failed:
+            self._failed = why
+            self._hard_stop(why) if why else None
+        busy = self.armed or self.phase is not Phase.IDLE
+        if busy and (why := self._closed(now_s)):
+            self.disarm(why, now_s)
+        try:
+            self._tick(now_s)
+        except LeftPlanError as error:
+            self._fault(error.code, str(error), now_s, left_plan=True)
+        except RobocalError as error:
+            self._fault(error.code, str(error), now_s)
+
+    def _tick(self, now_s: float) -> None:
+        if self._session.run is None:
+            self._without_run(now_s)
+            return
+        if self.phase is not Phase.IDLE:
+            self._supervise(now_s)
+        at_end = self.robot.at_end(now_s)
+        if self.phase is Phase.APPROACH and at_end:
+            self._measure(now_s)
+        elif self.phase is Phase.MEASURE and at_end and self._number() != self._driven:
+            self.phase = Phase.IDLE
+        if self.phase is Phase.IDLE and self.armed and self._number() != self._driven:
+            self._begin(now_s)
+
+    def _without_run(self, now_s: float) -> None:
+        """Let the last motion end, or an arming that nobody used."""
+        if self.phase is not Phase.IDLE:
+            self.armed, self.told = False, "the run has ended"
+            self._supervise(now_s)
+            if self.robot.at_end(now_s):
+                self._settle("the run has ended")
+        elif self._driven != NO_RUN:
+            self._settle("the run has ended")
+        elif self.armed and self.robot.silent_s > SILENT_ARMED_S:
+            self._settle("joint states are silent")
+        elif self.armed and now_s - self._armed_at_s > self._config.armed_s:
+            self._settle(f"no run within {self._config.armed_s:g} s")
+
+    def _settle(self, reason: str) -> None:
+        self.phase, self.armed, self.told = Phase.IDLE, False, reason
+        self._driven, self._kind = NO_RUN, ""
+        self.robot.forget()
+
+    def _number(self) -> tuple[int, int]:
+        run = self._session.run
+        return NO_RUN if run is None else (run.number, len(run.steps) + 1)
+
+    def _resting(self, span_s: float) -> Array | None:
+        silent = self.robot.silent_s > self._config.silence_s
+        return None if silent else self.robot.resting(span_s)
+
+    def _begin(self, now_s: float) -> None:
+        """Send the way to the awaited step, once the robot rests."""
+        q = self._resting(STANDS_S if self._driven == NO_RUN else SETTLED_S)
+        step = self._session.awaited
+        if q is None or step is None:
+            return
+        self._driven = self._number()
+        if self._session.run is None:
+            raise ConflictError("no run is open")
+        self._cell = station_cell(self._session.run, self._config)
+        plan = approach(self._cell, step, q, after_circle=self._kind == "circle")
+        self._start(plan, self._cell, Phase.APPROACH, now_s)
+
+    def _measure(self, now_s: float) -> None:
+        q, step = self._resting(SETTLED_S), self._session.awaited
+        if q is None or step is None or self._cell is None:
+            return
+        plan = measuring(self._cell, step, q)
+        self._kind = step.kind
+        self._ask(Command(STEP_BEGINS, {"step": step.name, "number": step.number}))
+        self._start(plan, self._cell, Phase.MEASURE, now_s)
+
+    def _start(self, plan: JointPlan, cell: MotionCell, phase: Phase, now_s: float) -> None:
+        self._beams.clear()
+        self._stopping.forget()
+        self.phase = phase
+        self.robot.follow(plan, cell, now_s)
+        sent_s = self._send(plan, False)  # making the plan may have taken long
+        if sent_s is not None:
+            self.robot.sent(sent_s)
+
+    # ---- supervision ----------------------------------------------------------------------------
+
+    def _supervise(self, now_s: float) -> None:
+        """Raise what must stop the robot."""
+        silent_s = self.robot.silent_s
+        if silent_s > self._config.silence_s:
+            raise StopError(Code.TOO_FEW_SAMPLES, f"joint states are silent for {silent_s:.2f} s")
+        if self.phase is Phase.APPROACH and self._beams[True]:
+            raise StopError(
+                Code.BEAM_EDGES_WRONG,
+                "a beam was broken on the way to a step: the tool is bent beyond the circle, or "
+                "something is in the way",
+            )
+        if self.phase is Phase.MEASURE and self._beams.total() > MOST_EDGES[self._kind]:
+            raise StopError(Code.BEAM_EDGES_WRONG, "more edges than a tool makes: look for it")
+        self.robot.require_on_plan(now_s, REST_WITHIN_S)
+        if self.robot.ended_for_s(now_s) > REST_WITHIN_S:
+            self._stop_overdue()
+
+    def _stop_overdue(self) -> None:
+        """Raise why a motion that ended long ago is not over."""
+        ended = f"the motion ended {REST_WITHIN_S:g} s ago, but"
+        if self.phase is not Phase.MEASURE:
+            raise LeftPlanError(f"{ended} the robot does not rest where it ends")
+        missing = "edges are missing" if self._beams.total() else "no edge came"
+        raise StopError(
+            Code.BEAM_EDGES_WRONG,
+            f"{ended} {missing}: there is no tool, it is far too short, or beams are dead",
+        )
+
+    def _fault(
+        self, code: Code, reason: str, now_s: float, *, left_plan: bool = False, lost: bool = False
+    ) -> None:
+        """Stop the robot where it moves, disarm, and end the run.
+
+        ``lost``: the controller does not drive the plan any more.
+        """
+        robot = self.robot
+        moving = self.phase is not Phase.IDLE and robot.heard
+        keeps = not lost and robot.keeps(*robot.away())
+        state = robot.state(now_s, keeps=keeps) if moving else None
+        self._settle(reason)
+        if state is not None:
+            plan = stop(self._session.nominal, self._config.limits, *state)
+            self._stopping.begin(plan, now_s)
+            self._send(plan, True)
+        if self._session.run is not None:
+            told = {"code": int(code), "reason": reason}
+            self._ask(Command(BREAK_OFF, {**told, LEFT_PLAN: True} if left_plan else told))
